@@ -79,10 +79,10 @@ def test_budget_of_key_exchanges_refills_and_responses_have_their_own() -> None:
     """Fifty messages at once may cost key exchanges, then fifty a second. A flood leaves our own handshakes alone."""
     pair = established(PLAIN)
     forged = [repaired(flipped(made_initiation(), 60), KEY_B.public) for _ in range(3)]
-    for _ in range(c.INITIATIONS_BURST):
+    for _ in range(c.INITIATIONS.burst):
         assert reasons(pair.b.receive(forged[0], 9.0)) == [DropReason.BAD_HANDSHAKE]
     assert reasons(pair.b.receive(forged[1], 9.0)) == [DropReason.COOKIE_REQUIRED]
-    refilled = 9.0 + 1.001 / c.INITIATIONS_PER_S
+    refilled = 9.0 + 1.001 / c.INITIATIONS.per_s
     assert reasons(pair.b.receive(forged[2], refilled)) == [DropReason.BAD_HANDSHAKE]
     pair = Pair(PLAIN, PLAIN)
     response = only(datagrams(pair.b.receive(pair.initiation(0.0), 0.0)))
@@ -99,9 +99,9 @@ def test_one_source_has_its_share_under_load() -> None:
     for place in (AT_A, Path(0, (host, port + 2))):
         fates = [
             reasons(initiation(pair, place, 1.0, PLAIN, KEY_C, cookie=True))
-            for _ in range(c.COOKIED_PER_SOURCE_BURST + 1)
+            for _ in range(c.COOKIED_PER_SOURCE.burst + 1)
         ]
-        assert fates == [[DropReason.UNKNOWN_PEER]] * c.COOKIED_PER_SOURCE_BURST + [[DropReason.RATE_LIMITED]]
+        assert fates == [[DropReason.UNKNOWN_PEER]] * c.COOKIED_PER_SOURCE.burst + [[DropReason.RATE_LIMITED]]
     for place in (Path(0, (host, port + 1)), ELSEWHERE):
         assert datagrams(initiation(pair, place, 1.0, PLAIN, cookie=True), wire.RESPONSE)
 
@@ -139,10 +139,10 @@ def test_answers_to_one_peer_are_bounded(is_up: bool) -> None:
     Recorded initiations may use them up: the peer itself gets one with a cookie, and not without bound.
     """
     pair = established(PLAIN) if is_up else Pair(link_a=PLAIN, link_b=PLAIN)
-    rate = c.ANSWERS_WHILE_UP_PER_S if is_up else c.ANSWERS_PER_S
+    rate = c.ANSWERS_WHILE_UP.per_s if is_up else c.ANSWERS.per_s
     assert rate == (2.0 if is_up else 4.0)
     now = 10.0
-    for _ in range(c.ANSWERS_BURST):
+    for _ in range(c.ANSWERS.burst):
         assert datagrams(pair.b.receive(made_initiation(), now), wire.RESPONSE)
     for moment in (now, now + 1 / rate - 0.001):
         outputs = pair.b.receive(made_initiation(), moment)
@@ -162,11 +162,11 @@ def test_a_network_gets_so_many_cookies() -> None:
     pair = established()
     exhaust(pair.b, 1.0)
     sent = [reasons(pair.b.receive(flooding(n), 1.0, Path(0, (f"10.0.0.{n}", 9)))) for n in range(30)]
-    assert sent.count([DropReason.COOKIE_REQUIRED]) == c.COOKIE_REPLIES_PER_PREFIX_BURST
-    assert sent.count([DropReason.RATE_LIMITED]) == 30 - c.COOKIE_REPLIES_PER_PREFIX_BURST
+    assert sent.count([DropReason.COOKIE_REQUIRED]) == c.COOKIE_REPLIES_PER_PREFIX.burst
+    assert sent.count([DropReason.RATE_LIMITED]) == 30 - c.COOKIE_REPLIES_PER_PREFIX.burst
     assert reasons(pair.b.receive(flooding(99), 1.0, Path(0, ("10.0.1.1", 9)))) == [DropReason.COOKIE_REQUIRED]
     known = [pair.b.receive(flooding(n), 1.0, AT_A) for n in range(80)]
-    expected = c.COOKIE_REPLIES_PER_KNOWN_BURST + c.COOKIE_REPLIES_PER_PREFIX_BURST
+    expected = c.COOKIE_REPLIES_PER_KNOWN.burst + c.COOKIE_REPLIES_PER_PREFIX.burst
     assert sum(len(datagrams(outputs, wire.COOKIE)) for outputs in known) == expected
 
 
@@ -182,7 +182,7 @@ def test_a_flood_from_ten_thousand_networks_leaves_a_known_peer_its_cookie(known
     fates = [reasons(pair.b.receive(flooding(n), 1.0 + n / 10_000, prefix(n))) for n in range(10_000)]
     # The flood had the first second's budget too, and one more of the messages that need no cookie.
     assert fates.count([DropReason.COOKIE_REQUIRED]) <= 2 * c.COOKIE_REPLIES_PER_S
-    assert fates.count([DropReason.BAD_HANDSHAKE]) <= c.INITIATIONS_PER_S
+    assert fates.count([DropReason.BAD_HANDSHAKE]) <= c.INITIATIONS.per_s
     exhaust(pair.b, 2.0)
     spend(pair.b.node._handshakes.admission._cookie_replies, 2.0)
     assert reasons(initiation(pair, Path(0, ("10.99.0.1", 9)), 2.0)) == [DropReason.RATE_LIMITED]
@@ -196,11 +196,11 @@ def test_only_so_many_initiations_are_read() -> None:
     """What is beyond is dropped before mac1, unless it comes from where a peer is known to be."""
     pair = established()
     unsealed = flooding(1)[: -wire.MACS_BYTES] + bytes(wire.MACS_BYTES)
-    for number in range(c.INITIATIONS_READ_BURST):
+    for number in range(c.INITIATIONS_READ.burst):
         assert reasons(pair.b.receive(unsealed, 1.0, prefix(number))) == [DropReason.BAD_MAC1]
     assert reasons(pair.b.receive(unsealed, 1.0, ELSEWHERE)) == [DropReason.RATE_LIMITED]
     assert datagrams(initiation(pair, AT_A, 1.0), wire.RESPONSE)
-    for _ in range(c.INITIATIONS_READ_PER_KNOWN_BURST - 1):
+    for _ in range(c.INITIATIONS_READ_PER_KNOWN.burst - 1):
         assert reasons(pair.b.receive(unsealed, 1.0, AT_A)) == [DropReason.BAD_MAC1]
     assert reasons(pair.b.receive(unsealed, 1.0, AT_A)) == [DropReason.RATE_LIMITED]
 
@@ -211,17 +211,16 @@ def test_only_so_many_initiations_are_read() -> None:
 def test_a_peer_that_proves_where_it_is_has_a_bounded_reserve() -> None:
     """With a cookie for where it is known to be, it is answered; elsewhere no cookie helps. X25519 needs none."""
     pair = established()
-    share = pair.b.peer.group_share
-    spend(share.anywhere, 9.0, UNITS)
+    spend(pair.b.peer.group_work, 9.0, UNITS)
     assert reasons(initiation(pair, AT_A, 9.0)) == [DropReason.COOKIE_REQUIRED]
     assert reasons(initiation(pair, ELSEWHERE, 9.0, cookie=True)) == [DropReason.GROUP_BUDGET_SPENT]
     assert datagrams(initiation(pair, AT_A, 9.0, cookie=True), wire.RESPONSE)
-    spend(share.proven, 9.0, UNITS)
+    spend(pair.b.peer.proven_group_work, 9.0, UNITS)
     assert reasons(initiation(pair, AT_A, 9.0, cookie=True)) == [DropReason.GROUP_BUDGET_SPENT]
-    refilled = 9.0 + UNITS / c.GROUP_WORK_PER_PEER_PER_S
+    refilled = 9.0 + UNITS / c.GROUP_WORK_PER_PEER.per_s
     assert datagrams(initiation(pair, AT_A, refilled, cookie=True), wire.RESPONSE)
     pair = established(PLAIN)
-    spend(pair.b.peer.group_share.anywhere, 1.0, UNITS)
+    spend(pair.b.peer.group_work, 1.0, UNITS)
     assert datagrams(initiation(pair, ELSEWHERE, 1.0, PLAIN), wire.RESPONSE)
 
 
@@ -257,4 +256,4 @@ def test_burst_grows_with_the_peers_and_is_bounded(peers: int, expected: int) ->
     assert not bucket.has(0.0, expected + 1)
     for peer in added:
         node.remove_peer(peer, 0.0)
-    assert not bucket.has(0.0, c.INITIATIONS_BURST + 1)
+    assert not bucket.has(0.0, c.INITIATIONS.burst + 1)

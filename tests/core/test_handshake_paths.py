@@ -51,7 +51,7 @@ def dead(radios: int) -> Radios:
 def test_copies_of_an_initiation_get_the_same_response_once_along_each_path() -> None:
     """Without a key exchange, and each copy counts as a duplicate. They spend no answer of the peer."""
     radios = Radios()
-    for number in range(c.ANSWERS_BURST):
+    for number in range(c.ANSWERS.burst):
         message = initiation(radios, 2.0 * number)
         assert message[0] == message[1]
         (first,) = radios.b.node.receive(message[0], at_a(0), 0.0)

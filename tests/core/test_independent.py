@@ -163,7 +163,7 @@ def test_no_envelope_is_longer_than_agreed() -> None:
 def test_cookie_lets_an_initiation_through() -> None:
     """Under load the Node answers with a cookie, and then takes the initiation that proves to have it."""
     pair = Pair()
-    for number in range(int(constants.INITIATIONS_BURST)):
+    for number in range(int(constants.INITIATIONS.burst)):
         junk = with_mac1(pair.node.public_key, bytes([1, 0, 0, 1]) + bytes([number]) * 111)
         assert pair.node.receive(junk, ELSEWHERE, 1.0)[-1] != Dropped(DropReason.BAD_MAC1, None, ELSEWHERE)
     initiator = pair.initiator()

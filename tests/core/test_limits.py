@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from uavlinkd.core import constants as c
-from uavlinkd.core.limits import GroupBudget, GroupShare, SourceLimiter, TokenBucket, prefix_of, source_of
+from uavlinkd.core.limits import GroupBudget, SourceLimiter, TokenBucket, prefix_of, source_of
 
 DEAREST = 100
 
@@ -38,9 +38,10 @@ def test_bucket_gives_all_that_is_asked_or_nothing() -> None:
     assert not bucket.has(0.0, 0.1)
 
 
-def test_sources_have_their_own_buckets_in_bounded_memory() -> None:
+def test_sources_have_their_own_buckets_in_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """The longest silent source is forgotten: one that goes on sending cannot win a fresh burst by a crowd."""
-    limiter = SourceLimiter(1.0, 2, 3)
+    monkeypatch.setattr(c, "SOURCES_TRACKED", 3)
+    limiter = SourceLimiter(1.0, 2)
     assert [limiter.take("loud", 0.0) for _ in range(4)] == [True, True, False, False]
     for crowd in range(50):
         assert limiter.take(crowd, 0.0)
@@ -73,7 +74,12 @@ def test_source_is_what_one_machine_may_own(one: str, other: str, is_same: bool)
 # Group work.
 
 
-def spent(budget: GroupBudget, share: GroupShare, source: str, now: float = 0.0) -> int:
+def share_of_a_peer() -> TokenBucket:
+    """Unspent."""
+    return TokenBucket(*c.GROUP_WORK_PER_PEER, 0.0)
+
+
+def spent(budget: GroupBudget, share: TokenBucket, source: str, now: float = 0.0) -> int:
     """How many handshakes of the dearest suite are admitted at once."""
     count = 0
     while budget.take(share, source, DEAREST, now):
@@ -83,31 +89,33 @@ def spent(budget: GroupBudget, share: GroupShare, source: str, now: float = 0.0)
 
 def test_shares_of_group_work() -> None:
     """A peer has two at once and one in five seconds from all sources; a source half of the budget, of all peers."""
-    budget, share = GroupBudget(0.0), GroupShare(0.0)
+    budget, share = GroupBudget(0.0), share_of_a_peer()
     assert [spent(budget, share, source) for source in "abc"] == [2, 0, 0]
     assert [budget.take(share, "d", DEAREST, now) for now in (4.9, 5.0)] == [False, True]
     budget = GroupBudget(0.0)
-    assert sum(spent(budget, GroupShare(0.0), "loud") for _ in range(30)) == c.GROUP_WORK_PER_SOURCE_BURST // DEAREST
-    assert spent(budget, GroupShare(0.0), "quiet") == 2
+    assert (
+        sum(spent(budget, share_of_a_peer(), "loud") for _ in range(30)) == c.GROUP_WORK_PER_SOURCE.burst // DEAREST
+    )
+    assert spent(budget, share_of_a_peer(), "quiet") == 2
 
 
 def test_all_group_work_has_a_bound() -> None:
     """Many peers from many sources: the burst, then the rate."""
     budget = GroupBudget(0.0)
-    for now, expected in ((0.0, c.GROUP_WORK_BURST), (10.0, 10 * c.GROUP_WORK_PER_S)):
-        admitted = sum(spent(budget, GroupShare(0.0), f"host {number}", now) for number in range(50))
+    for now, expected in ((0.0, c.GROUP_WORK.burst), (10.0, 10 * c.GROUP_WORK.per_s)):
+        admitted = sum(spent(budget, share_of_a_peer(), f"host {number}", now) for number in range(50))
         assert admitted == expected // DEAREST
 
 
 def test_what_is_refused_spends_nothing() -> None:
     """A refusal by one share leaves the others as they were."""
-    budget, tired = GroupBudget(0.0), GroupShare(0.0)
+    budget, tired = GroupBudget(0.0), share_of_a_peer()
     spent(budget, tired, "a")
     total = budget._total._tokens
     assert [budget.take(tired, source, DEAREST, 0.0) for source in ("a", "b")] == [False, False]
     assert budget._total._tokens == total
     for _ in range(10):
-        spent(budget, GroupShare(0.0), "a")
-    unused, total = GroupShare(0.0), budget._total._tokens
+        spent(budget, share_of_a_peer(), "a")
+    unused, total = share_of_a_peer(), budget._total._tokens
     assert not budget.take(unused, "a", DEAREST, 0.0)
-    assert (budget._total._tokens, unused.anywhere._tokens) == (total, c.GROUP_WORK_PER_PEER_BURST)
+    assert (budget._total._tokens, unused._tokens) == (total, c.GROUP_WORK_PER_PEER.burst)

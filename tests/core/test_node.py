@@ -94,7 +94,7 @@ def rate_limited(pair: Pair, now: float) -> list[Output]:
     """More initiations with a cookie than one source may send under load."""
     exhaust(pair.b, now)
     outputs: list[Output] = []
-    for _ in range(c.COOKIED_PER_SOURCE_BURST + 1):
+    for _ in range(c.COOKIED_PER_SOURCE.burst + 1):
         outputs = pair.b.receive(with_cookie(pair.b, made_initiation(KEY_C), AT_A, now), now)
     return outputs
 
@@ -140,7 +140,7 @@ def no_free_index(pair: Pair, now: float) -> list[Output]:
 def group_budget_spent(pair: Pair, now: float) -> list[Output]:
     """An initiation with a group from somewhere new, after the peer's share is spent."""
     peer, costly = pair.b.peer, SUITES_BY_NAME["ffdhe2048"]
-    while peer.group_share.anywhere.take(now):
+    while peer.group_work.take(now):
         pass
     settings = peer.settings
     peer.settings = replace(settings, link=replace(settings.link, suites=(costly, *settings.link.suites)))
@@ -376,7 +376,7 @@ def test_forgeries_with_a_right_mac1_change_nothing(name: str, suite: Suite) -> 
     positions = sorted({*range(0, covered, 1 if covered < 200 else 23), 0, 1, 2, 3, 4, 5, covered - 1})
     now = 0.0
     for position in positions:
-        now += 1 / c.INITIATIONS_PER_S
+        now += 1 / c.INITIATIONS.per_s
         outputs = side.receive(repaired(flipped(at.message, position), side.node.public_key), now)
         assert len(reasons(outputs)) == len(outputs) == 1
         assert DropReason.COOKIE_REQUIRED not in reasons(outputs)

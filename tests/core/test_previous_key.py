@@ -58,7 +58,7 @@ def test_peer_is_linked_by_the_key_that_it_knows(known: bytes, name: str) -> Non
 def test_cookie_is_for_the_key_of_the_initiation(known: bytes, name: str) -> None:
     """Under load an initiator can open its cookie with either key, and is admitted with it."""
     node, peer = changing(), other(known)
-    for number in range(c.INITIATIONS_BURST):
+    for number in range(c.INITIATIONS.burst):
         node.receive(initiation(other(NEW, STRANGER, number)), Path(0, ("192.0.2.66", number)), 0.0)
     cookie = only(datagrams(node.receive(initiation(peer), AT_B, 0.0)))
     assert cookie[0] == wire.COOKIE

@@ -45,11 +45,12 @@ DOCUMENTED = {
     for name, value in zip(cells[0].split("; "), cells[1].split("; "), strict=True)
 }
 """A row has a constant, or several with their values in the same order."""
+_RATES = {name: value for name, value in vars(constants).items() if isinstance(value, constants.Rate)}
 DEFINED = {
     name: value
     for name, value in vars(constants).items()
     if name.isupper() and isinstance(value, int | float) and math.isfinite(value)
-}
+} | {f"{name}_{field.upper()}": value for name, rate in _RATES.items() for field, value in rate._asdict().items()}
 
 
 @pytest.mark.parametrize("name", sorted(DEFINED | DOCUMENTED))

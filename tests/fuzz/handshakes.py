@@ -19,7 +19,7 @@ from uavlinkd.core import handshake, noise, wire
 from uavlinkd.core.admission import Admission
 from uavlinkd.core.crypto import KeyPair
 from uavlinkd.core.drops import DropReason
-from uavlinkd.core.limits import GroupShare, TokenBucket
+from uavlinkd.core.limits import TokenBucket
 from uavlinkd.core.noise import HandshakeState
 from uavlinkd.core.outputs import Dropped, Output, SessionEstablished, Transmit
 
@@ -110,12 +110,13 @@ def expected(payload: bytes, header: bytes) -> DropReason | None:
 def _refill(pair: Pair, now: float) -> None:
     """An unlimited budget: the targets test the code behind it."""
     for pending in pair.a.peer.initiator.pending.values():
-        pending.__post_init__()
+        if (key := pending.initiated.state.e1) is not None:
+            key._computed = None
     for node in (pair.a.node, pair.b.node):
         node._handshakes.admission = Admission(node._is_known, now)
         for peer in node.peers.values():
-            peer.group_share = GroupShare(now)
-            peer.answers = peer.answers_while_up = TokenBucket(c.ANSWERS_PER_S, c.ANSWERS_BURST, now)
+            peer.group_work = peer.proven_group_work = TokenBucket(*c.GROUP_WORK_PER_PEER, now)
+            peer.answers = peer.answers_while_up = TokenBucket(*c.ANSWERS, now)
 
 
 def _refused(outputs: list[Output]) -> DropReason:

@@ -234,10 +234,8 @@ def _refill(node: Node, now: float) -> None:
     admission = node._handshakes.admission
     admission._initiations, admission._responses = TokenBucket(1.0, BUDGET, now), TokenBucket(1.0, BUDGET, now)
     # All scripts without a sequel share these: the clock stands still, and a fast machine runs many.
-    admission._read = TokenBucket(c.INITIATIONS_READ_PER_S, c.INITIATIONS_READ_BURST, now)
-    admission._known_read = SourceLimiter(
-        c.INITIATIONS_READ_PER_KNOWN_PER_S, c.INITIATIONS_READ_PER_KNOWN_BURST, c.SOURCES_TRACKED
-    )
+    admission._read = TokenBucket(*c.INITIATIONS_READ, now)
+    admission._known_read = SourceLimiter(*c.INITIATIONS_READ_PER_KNOWN)
     node.drops.clear()
     for peer in node.peers.values():
         peer.traffic.drops.clear()

@@ -49,31 +49,23 @@ class Admission:
     def __init__(self, is_known: Callable[[SocketAddress], bool], now: float) -> None:
         self._is_known = is_known
         # Two budgets: a flood of initiations must not keep our own handshakes from finishing.
-        self._initiations = TokenBucket(c.INITIATIONS_PER_S, c.INITIATIONS_BURST, now)
-        self._responses = TokenBucket(c.INITIATIONS_PER_S, c.INITIATIONS_BURST, now)
+        self._initiations = TokenBucket(*c.INITIATIONS, now)
+        self._responses = TokenBucket(*c.INITIATIONS, now)
         self._cookied = TokenBucket(c.COOKIED_PER_S, c.COOKIED_PER_S, now)
-        self._sources = SourceLimiter(c.COOKIED_PER_SOURCE_PER_S, c.COOKIED_PER_SOURCE_BURST, c.SOURCES_TRACKED)
-        self._read = TokenBucket(c.INITIATIONS_READ_PER_S, c.INITIATIONS_READ_BURST, now)
-        self._known_read = SourceLimiter(
-            c.INITIATIONS_READ_PER_KNOWN_PER_S, c.INITIATIONS_READ_PER_KNOWN_BURST, c.SOURCES_TRACKED
-        )
-        self._versions = TokenBucket(c.VERSION_CHECKS_PER_S, c.VERSION_CHECKS_BURST, now)
-        self._known_versions = SourceLimiter(
-            c.VERSION_CHECKS_PER_KNOWN_PER_S, c.VERSION_CHECKS_PER_KNOWN_BURST, c.SOURCES_TRACKED
-        )
+        self._sources = SourceLimiter(*c.COOKIED_PER_SOURCE)
+        self._read = TokenBucket(*c.INITIATIONS_READ, now)
+        self._known_read = SourceLimiter(*c.INITIATIONS_READ_PER_KNOWN)
+        self._versions = TokenBucket(*c.VERSION_CHECKS, now)
+        self._known_versions = SourceLimiter(*c.VERSION_CHECKS_PER_KNOWN)
         self._cookie_replies = TokenBucket(c.COOKIE_REPLIES_PER_S, c.COOKIE_REPLIES_PER_S, now)
-        self._prefixes = SourceLimiter(
-            c.COOKIE_REPLIES_PER_PREFIX_PER_S, c.COOKIE_REPLIES_PER_PREFIX_BURST, c.SOURCES_TRACKED
-        )
-        self._known = SourceLimiter(
-            c.COOKIE_REPLIES_PER_KNOWN_PER_S, c.COOKIE_REPLIES_PER_KNOWN_BURST, c.SOURCES_TRACKED
-        )
+        self._prefixes = SourceLimiter(*c.COOKIE_REPLIES_PER_PREFIX)
+        self._known = SourceLimiter(*c.COOKIE_REPLIES_PER_KNOWN)
         self._group = GroupBudget(now)
 
     def set_peers(self, count: int) -> None:
         """So many peers may initiate at once, when this daemon starts again. The rate afterwards stays as it is."""
         burst = min(c.INITIATIONS_BURST_PER_PEER * count, c.INITIATIONS_BURST_MOST)
-        self._initiations.set_burst(max(c.INITIATIONS_BURST, burst))
+        self._initiations.set_burst(max(c.INITIATIONS.burst, burst))
 
     def read(self, path: Path, now: float) -> None:
         """An initiation from there is to be read.
@@ -116,9 +108,9 @@ class Admission:
         # An attacker can send a recorded initiation under the peer's own address: only a cookie proves an address.
         is_there = peer.paths.find(message.path) is not None
         is_proven = is_there and message.has_cookie(now)
-        if is_proven and peer.group_share.proven.take(now, suite.work):
+        if is_proven and peer.proven_group_work.take(now, suite.work):
             return
-        if self._group.take(peer.group_share, source_of(message.path.host), suite.work, now):
+        if self._group.take(peer.group_work, source_of(message.path.host), suite.work, now):
             return
         if is_there and not is_proven:
             self._require_cookie(message, now)

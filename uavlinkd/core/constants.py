@@ -7,9 +7,18 @@ Durations are seconds on a monotonic clock. Timers that a configuration may chan
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 NEVER = math.inf
 """A moment that does not come."""
+
+
+class Rate(NamedTuple):
+    """So many a second on average, and ``burst`` at once after a quiet while."""
+
+    per_s: float
+    burst: int
+
 
 # Specification constants. Changing one makes another protocol.
 
@@ -97,14 +106,12 @@ UNCONFIRMED_LIFETIME_S = 10.0
 """How long they wait: several retries of the initiator, on a slow path."""
 PENDING_LIFETIME_S = 10.0
 """How long an own initiation may be answered."""
-ANSWERS_PER_S = 4.0
+ANSWERS = Rate(4.0, 8)
 """Responses a second to one peer without a cookie. With 16 places, an honest handshake has two seconds at least to
 confirm before replayed initiations could push it out."""
-ANSWERS_WHILE_UP_PER_S = 2.0
+ANSWERS_WHILE_UP = Rate(2.0, 8)
 """The same to one with which a link is up: on a slow radio they take room from its frames, with x25519 2 kbit/s.
 Enough for new keys every two seconds; who restarts and finds it used up by replays is given a cookie first."""
-ANSWERS_BURST = 8
-"""So many at once, after a quiet while."""
 PENDING_PER_PEER = 8
 """Own initiations that may still be answered, so a slow path's response finds its initiation."""
 USABLE_PER_PEER = 3
@@ -114,63 +121,43 @@ COOKIED_ANSWERS_PER_S = 20
 REMEMBERED_INITIATIONS = 1024
 """Ephemerals of a peer's authentic initiations: an exact replay costs a look-up, no key exchange. Some 200 bytes
 each: with 200 peers 40 MB, and not before 34 hours of flight."""
-INITIATIONS_PER_S = 50.0
+INITIATIONS = Rate(50.0, 50)
 """Messages a second that may reach a key exchange without a cookie. Beyond that we are under load."""
-INITIATIONS_BURST = 50
-"""So many at once, after a quiet while."""
 INITIATIONS_BURST_PER_PEER = 2
 """Or so many for each peer, if that is more: all of them initiate when this daemon starts again, some twice."""
 INITIATIONS_BURST_MOST = 2000
 """But no more than this: an attacker can use it up, which takes half a second of a desktop's core."""
-COOKIED_PER_SOURCE_PER_S = 10.0
+COOKIED_PER_SOURCE = Rate(10.0, 10)
 """Under load: initiations a second from one source that holds a cookie."""
-COOKIED_PER_SOURCE_BURST = 10
-"""So many at once, after a quiet while."""
 COOKIED_PER_S = 200
 """The same from all sources together: an attacker with many addresses still costs a bounded share of a core."""
-INITIATIONS_READ_PER_S = 2000
+INITIATIONS_READ = Rate(2000, 1000)
 """Initiations a second of which mac1 is checked. What is beyond costs a third, so a flood leaves time for frames."""
-INITIATIONS_READ_BURST = 1000
-"""So many at once, after a quiet while."""
-INITIATIONS_READ_PER_KNOWN_PER_S = 50
+INITIATIONS_READ_PER_KNOWN = Rate(50, 50)
 """The same from each address where a peer is known to be: twelve times what an honest initiator sends."""
-INITIATIONS_READ_PER_KNOWN_BURST = 50
-"""So many at once, after a quiet while."""
-VERSION_CHECKS_PER_S = 10
+VERSION_CHECKS = Rate(10, 20)
 """Initiations a second without a valid mac1 that are compared with the labels of other versions. A comparison costs
 at most fourteen HMACs: all together a fraction of a percent of what a flood of initiations may cost."""
-VERSION_CHECKS_BURST = 20
-"""So many at once, after a quiet while."""
-VERSION_CHECKS_PER_KNOWN_PER_S = 5
+VERSION_CHECKS_PER_KNOWN = Rate(5, 10)
 """The same from each address where a peer is known to be: more than a peer of another version sends."""
-VERSION_CHECKS_PER_KNOWN_BURST = 10
-"""So many at once, after a quiet while."""
 VERSION_CHECK_BYTES = 4096
 """Longer messages are not compared: twice the longest initiation of this version, and room for certificates."""
-COOKIE_REPLIES_PER_PREFIX_PER_S = 10
+COOKIE_REPLIES_PER_PREFIX = Rate(10, 10)
 """Cookie replies a second to one network: an IPv4 /24 or an IPv6 /64. A forger of addresses may choose any of its
 hosts, and one radio often leads to all of them. With IPv4 and UDP headers 6.4 kbit/s."""
-COOKIE_REPLIES_PER_PREFIX_BURST = 10
-"""So many at once, after a quiet while."""
 COOKIE_REPLIES_PER_S = 200
 """The same to all networks together: 0.4 % of a desktop's core."""
-COOKIE_REPLIES_PER_KNOWN_PER_S = 20
+COOKIE_REPLIES_PER_KNOWN = Rate(20, 20)
 """Cookie replies a second to an address where a peer is known to be; others cannot use them up. 13 kbit/s."""
-COOKIE_REPLIES_PER_KNOWN_BURST = 20
-"""So many at once, after a quiet while."""
-GROUP_WORK_PER_S = 40
+GROUP_WORK = Rate(40, 2000)
 """Encapsulations for all peers, in hundredths of one of ``ffdhe8192``: that takes 16 to 35 ms of a desktop's core and
-five times as long on a small computer. One in 2.5 s makes at most 5 % of the frames wait for more than 50 ms."""
-GROUP_WORK_BURST = 2000
-"""So much at once, after a quiet while: twenty peers that start together."""
-GROUP_WORK_PER_SOURCE_PER_S = 20
+five times as long on a small computer. One in 2.5 s makes at most 5 % of the frames wait for more than 50 ms. At once:
+twenty peers that start together."""
+GROUP_WORK_PER_SOURCE = Rate(20, 1000)
 """The same for one source: half."""
-GROUP_WORK_PER_SOURCE_BURST = 1000
-"""So much at once, after a quiet while."""
-GROUP_WORK_PER_PEER_PER_S = 20
-"""The same for one peer, and once more for one that proves by a cookie that it is where it is known to be."""
-GROUP_WORK_PER_PEER_BURST = 200
-"""So much at once, after a quiet while: a handshake of the dearest suite and a repeat of it."""
+GROUP_WORK_PER_PEER = Rate(20, 200)
+"""The same for one peer, and once more for one that proves by a cookie that it is where it is known to be. At once: a
+handshake of the dearest suite and a repeat of it."""
 SOURCES_TRACKED = 1024
 """Sources whose rate is remembered under load; the longest silent one is forgotten first."""
 COOKIE_SECRET_LIFETIME_S = 120.0

@@ -49,31 +49,20 @@ def prefix_of(host: str) -> Hashable:
 
 
 class SourceLimiter:
-    """A token bucket per source, for the ``capacity`` sources that were received last."""
+    """A token bucket per source, for the :data:`c.SOURCES_TRACKED` sources that were received last."""
 
-    def __init__(self, rate: float, burst: float, capacity: int) -> None:
+    def __init__(self, rate: float, burst: float) -> None:
         self._rate = rate
         self._burst = burst
-        self._capacity = capacity
         self._buckets: dict[Hashable, TokenBucket] = {}
 
     def take(self, source: Hashable, now: float, count: float = 1.0) -> bool:
         """Remove this many tokens of the source. With fewer, remove nothing and return False."""
         bucket = self._buckets.pop(source, None) or TokenBucket(self._rate, self._burst, now)
         self._buckets[source] = bucket  # a dict keeps order: the longest silent source comes first
-        if len(self._buckets) > self._capacity:
+        if len(self._buckets) > c.SOURCES_TRACKED:
             del self._buckets[next(iter(self._buckets))]
         return bucket.take(now, count)
-
-
-class GroupShare:
-    """What one peer may cause: from anywhere, and besides where it proves to be at its own address."""
-
-    __slots__ = ("anywhere", "proven")
-
-    def __init__(self, now: float) -> None:
-        self.anywhere = TokenBucket(c.GROUP_WORK_PER_PEER_PER_S, c.GROUP_WORK_PER_PEER_BURST, now)
-        self.proven = TokenBucket(c.GROUP_WORK_PER_PEER_PER_S, c.GROUP_WORK_PER_PEER_BURST, now)
 
 
 class GroupBudget:
@@ -83,13 +72,12 @@ class GroupBudget:
     """
 
     def __init__(self, now: float) -> None:
-        self._total = TokenBucket(c.GROUP_WORK_PER_S, c.GROUP_WORK_BURST, now)
-        self._sources = SourceLimiter(c.GROUP_WORK_PER_SOURCE_PER_S, c.GROUP_WORK_PER_SOURCE_BURST, c.SOURCES_TRACKED)
+        self._total = TokenBucket(*c.GROUP_WORK, now)
+        self._sources = SourceLimiter(*c.GROUP_WORK_PER_SOURCE)
 
-    def take(self, share: GroupShare, source: Hashable, work: int, now: float) -> bool:
-        """Spend ``work``; False, and nothing is spent, where the total, the peer or the source has less."""
-        if not self._total.has(now, work) or not share.anywhere.has(now, work):
+    def take(self, share: TokenBucket, source: Hashable, work: int, now: float) -> bool:
+        """Spend ``work``; False, and nothing is spent, where the total, the peer (``share``) or the source has less."""
+        budgets = self._total, share
+        if not all(budget.has(now, work) for budget in budgets) or not self._sources.take(source, now, work):
             return False
-        if not self._sources.take(source, now, work):
-            return False
-        return self._total.take(now, work) and share.anywhere.take(now, work)
+        return all(budget.take(now, work) for budget in budgets)

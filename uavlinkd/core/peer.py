@@ -15,7 +15,7 @@ from uavlinkd.core.constants import NEVER
 from uavlinkd.core.crypto import Entropy, KeyPair
 from uavlinkd.core.drops import Detail, DropReason
 from uavlinkd.core.initiator import Initiator, Pending
-from uavlinkd.core.limits import GroupShare, TokenBucket
+from uavlinkd.core.limits import TokenBucket
 from uavlinkd.core.outputs import Dropped, Output, PeerLost, PeerUp
 from uavlinkd.core.path import Path, SocketAddress, SocketFacts
 from uavlinkd.core.path_measures import MissingEnvelopes
@@ -91,15 +91,17 @@ class Peer:
         self.initiator = Initiator(settings, identity, shared.indices, shared.entropy, shared.facts, now)
         self.sessions = Sessions(shared.indices, self.name, has_smaller_key=identity.public < settings.public_key)
         self.echo_requests = EchoRequests(shared.entropy)
-        self.answers = TokenBucket(c.ANSWERS_PER_S, c.ANSWERS_BURST, now)
+        self.answers = TokenBucket(*c.ANSWERS, now)
         """Responses that it may get without a cookie."""
-        self.answers_while_up = TokenBucket(c.ANSWERS_WHILE_UP_PER_S, c.ANSWERS_BURST, now)
+        self.answers_while_up = TokenBucket(*c.ANSWERS_WHILE_UP, now)
         self.cookied_answers = TokenBucket(c.COOKIED_ANSWERS_PER_S, c.COOKIED_ANSWERS_PER_S, now)
         """Responses that it may get with cookies, at all addresses together."""
         self.candidate_questions = TokenBucket(c.CANDIDATE_QUESTIONS_PER_S, c.CANDIDATE_QUESTIONS, now)
         """Questions to addresses that it named and that never answered."""
-        self.group_share = GroupShare(now)
-        """Of the CPU time for the groups of its suites."""
+        self.group_work = TokenBucket(*c.GROUP_WORK_PER_PEER, now)
+        """CPU time for the groups of its suites that it may cause from anywhere."""
+        self.proven_group_work = TokenBucket(*c.GROUP_WORK_PER_PEER, now)
+        """The same in addition, where it proves to be at its own address."""
         self.remembered: deque[bytes] = deque()
         """Ephemerals of its initiations, the oldest first."""
         self.paths = PathSet(settings.link.redundancy, settings.link.idle_probe_s, shared.known, shared.facts)
