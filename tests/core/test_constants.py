@@ -15,7 +15,7 @@ def test_numbers_fit_together() -> None:
     assert 2 * c.REKEY_AFTER_ENVELOPES <= c.SESSION_ENVELOPE_LIMIT + 1, "room for retries"
     assert c.RETRY_MIN_S < c.RETRY_MAX_S < c.RETRY_MAX_S * (1 + c.RETRY_JITTER) < 2.0
     assert 0 < c.ECHO_AFTER_S < c.HANDSHAKE_AFTER_S < c.LOST_AFTER_S < 5.0, "before ArduPilot's failsafe"
-    assert c.UNCONFIRMED_PER_KIND >= c.ANSWERS.burst + 2 * c.ANSWERS.per_s, "two seconds to confirm"
+    assert c.ANSWERS.burst + 2 * c.ANSWERS.per_s <= c.UNCONFIRMED_PER_KIND, "two seconds to confirm"
     assert c.MIN_ENVELOPE_LIMIT - wire.LONG_HEADER_BYTES - max(wire.TAG_LENGTHS) >= 280, "the longest frame fits"
     assert c.MIN_ENVELOPE_LIMIT <= c.DEFAULT_ENVELOPE_LIMIT <= c.MAX_ENVELOPE_LIMIT <= 65507
     assert c.COOKIE_HELD_S <= c.COOKIE_SECRET_LIFETIME_S

@@ -151,13 +151,13 @@ COOKIE_REPLIES_PER_KNOWN = Rate(20, 20)
 """Cookie replies a second to an address where a peer is known to be; others cannot use them up. 13 kbit/s."""
 GROUP_WORK = Rate(40, 2000)
 """Encapsulations for all peers, in hundredths of one of ``ffdhe8192``: that takes 16 to 35 ms of a desktop's core and
-five times as long on a small computer. One in 2.5 s makes at most 5 % of the frames wait for more than 50 ms. At once:
-twenty peers that start together."""
+five times as long on a small computer. One in 2.5 s makes at most 5 % of the frames wait for more than 50 ms. At
+once: twenty peers that start together."""
 GROUP_WORK_PER_SOURCE = Rate(20, 1000)
 """The same for one source: half."""
 GROUP_WORK_PER_PEER = Rate(20, 200)
-"""The same for one peer, and once more for one that proves by a cookie that it is where it is known to be. At once: a
-handshake of the dearest suite and a repeat of it."""
+"""The same for one peer, and once more for one that proves by a cookie that it is where it is known to be. At
+once: a handshake of the dearest suite and a repeat of it."""
 SOURCES_TRACKED = 1024
 """Sources whose rate is remembered under load; the longest silent one is forgotten first."""
 COOKIE_SECRET_LIFETIME_S = 120.0

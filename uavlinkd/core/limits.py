@@ -76,7 +76,7 @@ class GroupBudget:
         self._sources = SourceLimiter(*c.GROUP_WORK_PER_SOURCE)
 
     def take(self, share: TokenBucket, source: Hashable, work: int, now: float) -> bool:
-        """Spend ``work``; False, and nothing is spent, where the total, the peer (``share``) or the source has less."""
+        """Spend ``work``. False, and nothing is spent, if the total, the peer (``share``) or the source has less."""
         budgets = self._total, share
         if not all(budget.has(now, work) for budget in budgets) or not self._sources.take(source, now, work):
             return False
