@@ -40,7 +40,7 @@ def ask(pair: Pair, now: float, *paths: Path) -> list[Transmit]:
 
 def ask_everywhere(pair: Pair, now: float, *paths: Path) -> list[Transmit]:
     """The same, with the question along the relay if one is due."""
-    pair.a.node.set_candidates(pair.a.peer, paths)
+    pair.a.peer.paths.set_candidates(paths)
     return of(pair.a.node.ask_candidates(pair.a.peer, now), Transmit)
 
 

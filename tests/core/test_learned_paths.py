@@ -265,7 +265,7 @@ def test_learned_paths_of_a_lost_peer_are_forgotten_too() -> None:
 def test_envelopes_along_a_slow_path_that_is_down_cause_few_questions() -> None:
     """They keep to their share of the network's budget: one in 7.4 s, not four a second."""
     radios = Radios(both_configured=True).run(3.0, 0.1)
-    radios.b.node.set_budgets({1: 4000})
+    radios.b.node.facts.set_budgets({1: 4000})
     asked: list[Transmit] = []
     for number in range(40):
         radios.state(radios.b, 1).condition = PathCondition.DOWN

@@ -218,9 +218,9 @@ def test_request_is_answered_along_each_path_by_which_it_comes() -> None:
         return [[out.path for out in of(outputs, Transmit)] for outputs in received]
 
     assert answers() == [[at_a(0)], [at_a(1)], [], []]
-    radios.b.node.set_budgets({1: 1600})
+    radios.b.node.facts.set_budgets({1: 1600})
     assert [answers(), answers()] == [[[at_a(0)], [at_a(1)], [], []], [[at_a(0)], [], [], []]]
-    radios.a.node.set_budgets({1: 1600})
+    radios.a.node.facts.set_budgets({1: 1600})
     requests = [ask_for_echo(radios.a.peer, radios.a.session, radios.now) for _ in range(2)]
     assert [len(of(outputs, Transmit)) for outputs in requests] == [2, 1]
 

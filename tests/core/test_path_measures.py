@@ -104,12 +104,12 @@ def test_repeat_is_counted_in_bytes_but_not_as_another_envelope() -> None:
         (ELSEWHERE, 2, envelope),
         (state.path, 2, old),
     ):
-        node.note_repeat(peer, path, number, datagram)
+        peer.note_repeat(path, number, datagram)
     assert state.repeats == counts(1, 1)
     assert (state.sent, state.datagrams_sent) == (sent, datagrams_sent + 3)
     assert state.bytes_sent == size + 2 * len(envelope) + len(old)
     node.close(radios.now)
-    node.note_repeat(peer, state.path, 2, old)
+    peer.note_repeat(state.path, 2, old)
     assert state.repeats == counts(1, 1)
     state.note_session()
     assert sum(state.repeats) == 0

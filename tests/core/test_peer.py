@@ -227,21 +227,21 @@ def test_traffic_is_counted(pair: Pair) -> None:
 def test_copy_that_is_not_sent_is_not_counted_and_one_that_waited_is_counted_later(pair: Pair) -> None:
     """In the totals of the path and of the peer, for which a budget is charged. They never go below zero."""
     pair.a.send(1.0)
-    node, peer, traffic = pair.a.node, pair.a.peer, pair.a.peer.traffic
+    peer, traffic = pair.a.peer, pair.a.peer.traffic
     state = peer.paths.by_path[AT_B]
 
     def totals() -> tuple[int, ...]:
         return state.sent, state.datagrams_sent, state.bytes_sent, traffic.datagrams_sent, traffic.bytes_sent
 
     before, size = totals(), len(FRAME)
-    node.recount(peer, AT_B, -1, -size)
-    node.recount(peer, ELSEWHERE, -1, -100)
+    peer.recount(AT_B, -1, -size)
+    peer.recount(ELSEWHERE, -1, -100)
     changes = (1, 1, size, 1, size)
     assert totals() == tuple(total - change for total, change in zip(before, changes, strict=True))
-    node.recount(peer, AT_B, 1, size)
+    peer.recount(AT_B, 1, size)
     assert totals() == before
     state.note_session()
-    node.recount(peer, AT_B, -1, -100)
+    peer.recount(AT_B, -1, -100)
     assert state.sent == 0
 
 

@@ -37,7 +37,7 @@ def slow(*delays_s: float, slow_sockets: tuple[int, ...] = (SIK,), dead: bool = 
     """Radios of which some have a budget at both ends."""
     radios = Radios(delays_s, link(), link(), both_configured=True)
     for side in (radios.a, radios.b):
-        side.node.set_budgets(dict.fromkeys(slow_sockets, BUDGET_BITS_S))
+        side.node.facts.set_budgets(dict.fromkeys(slow_sockets, BUDGET_BITS_S))
     for radio in radios.radios:
         radio.is_dead = dead
     return radios
@@ -104,7 +104,7 @@ def test_slow_tries_wait_longer_for_their_response() -> None:
     interval_s = facts(400).try_interval_s(PLACE, SUITES_BY_NAME["mlkem768"])
     assert interval_s == pytest.approx(c.TRY_AIRTIMES * 8 * (1347 + 1207 + 96) / 400)
     radios = slow(15.0, slow_sockets=(0,))
-    radios.a.node.set_budgets({0: 300.0})
+    radios.a.node.facts.set_budgets({0: 300.0})
     radios.run(0.1)
     (pending,) = radios.a.peer.initiator.pending.values()
     assert pending.expires_at == pytest.approx(c.TRY_AIRTIMES * 8 * (147 + 103 + 96) / 300)
@@ -165,14 +165,14 @@ def test_probes_use_at_most_a_twentieth_of_a_budget() -> None:
     free_s = paths.interval_s(state, 0.0)
     least_s = 8 * (c.PROBE_BYTES + 2 * c.IP_BYTES) / (c.PROBE_BUDGET_SHARE * BUDGET_BITS_S)
     assert free_s < least_s
-    node.set_budgets({AT_B.socket: BUDGET_BITS_S})
+    node.facts.set_budgets({AT_B.socket: BUDGET_BITS_S})
     assert paths.interval_s(state, 0.0) == pytest.approx(least_s)
     other = node.add_peer(PeerSettings("other", KEY_C.public), 0.0)
     assert paths.interval_s(state, 0.0) == pytest.approx(2 * least_s)
     node.remove_peer(other, 0.0)
     assert paths.interval_s(state, 0.0) == pytest.approx(least_s)
     for budgets in ({AT_B.socket + 1: BUDGET_BITS_S}, {AT_B.socket: 10_000_000}):
-        node.set_budgets(budgets)
+        node.facts.set_budgets(budgets)
         assert paths.interval_s(state, 0.0) == free_s
 
 
@@ -207,7 +207,7 @@ def two_radios(limits: dict[int, int]) -> Radios:
     """Both ends send along LTE and a slow radio, with these limits by socket."""
     radios = Radios((0.02, 0.2), link(), link(), both_configured=True)
     for side in (radios.a, radios.b):
-        side.node.set_envelope_limits(limits)
+        side.node.facts.envelope_limits = limits
     radios.run(8.0, 0.1, radios.sender(radios.a), radios.sender(radios.b))
     assert all(radios.state(radios.a, radio).works for radio in (LTE, SIK))
     return radios
@@ -261,10 +261,10 @@ def test_stream_that_is_too_long_for_the_slow_path_is_not_copied_there() -> None
 def test_the_only_path_has_its_limit_too() -> None:
     """Frames of all classes share its envelopes."""
     radios = Radios((0.2,), link(), link(), both_configured=True)
-    radios.a.node.set_envelope_limits({0: LIMIT})
+    radios.a.node.facts.envelope_limits = {0: LIMIT}
     radios.run(3.0, 0.1, radios.sender(radios.a))
     assert max(sent_lengths(radios, Class.STREAM, [FRAME] * 20)[0]) <= LIMIT
-    radios.a.node.set_envelope_limits({})
+    radios.a.node.facts.envelope_limits = {}
     assert len(sent_lengths(radios, Class.STREAM, [FRAME] * 20)[0]) == 1
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 
 from uavlinkd.core.node import Node
+from uavlinkd.core.path import SocketFacts
 
 
 class SocketStateLog(Node):
@@ -13,6 +14,7 @@ class SocketStateLog(Node):
     def __init__(self) -> None:  # without peers
         self.states: list[tuple[int, bool]] = []
         self.metered: list[int] = []
+        self.facts = SocketFacts()
 
     def set_socket_state(self, socket: int, now: float, *, is_up: bool) -> None:
         """As the core's."""
@@ -21,9 +23,3 @@ class SocketStateLog(Node):
     def set_metered(self, sockets: Iterable[int], now: float) -> None:
         """As the core's."""
         self.metered = list(sockets)
-
-    def set_budgets(self, budgets: Mapping[int, float]) -> None:
-        """As the core's."""
-
-    def set_envelope_limits(self, limits: Mapping[int, int]) -> None:
-        """As the core's."""

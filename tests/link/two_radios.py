@@ -59,7 +59,7 @@ class End:
             for number, radio in enumerate(network.radios)
             if radio.budget_bits_s
         }
-        self.node.set_budgets({number: budget.bits_s for number, budget in self.budgets.items()})
+        self.node.facts.set_budgets({number: budget.bits_s for number, budget in self.budgets.items()})
         self.link = PeerLink(
             config, Carriage(self.node, self.perform, budgets=self.budgets, waiting=self.schedule), 0.0
         )

@@ -117,9 +117,9 @@ class Drone:
         if self.node is None or not self.lines:
             return
         peers = self.node.peers
-        self.node.set_budgets(dict.fromkeys(self.lines, BUDGET_BITS_S))
-        self.node.set_envelope_limits(dict.fromkeys(self.lines, limit_at(BUDGET_BITS_S)))
-        self.node.set_point_to_point(
+        self.node.facts.set_budgets(dict.fromkeys(self.lines, BUDGET_BITS_S))
+        self.node.facts.envelope_limits = dict.fromkeys(self.lines, limit_at(BUDGET_BITS_S))
+        self.node.facts.set_point_to_point(
             {socket: [peers[name]] if name in peers else [] for socket, name in self.lines.items()}
         )
 

@@ -44,8 +44,8 @@ class SlowRadio(Network):
             budget, limit = end.budgets[self.slow], limit_at(SHARE * AIR_BITS_S)
             budget.all = Bucket(budget.bits_s, 0.0, limit + LINE_BYTES)
             budget.copies = Bucket(COPIES_SHARE * budget.bits_s, 0.0, limit + LINE_BYTES)
-            end.node.set_envelope_limits({self.slow: limit})
-            end.node.set_point_to_point({self.slow: [end.peer]})
+            end.node.facts.envelope_limits = {self.slow: limit}
+            end.node.facts.set_point_to_point({self.slow: [end.peer]})
             end.link.set_paths(paths, 0.0)
 
     @property

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 
+from uavlinkd.core import constants as c
 from uavlinkd.core import establish, probing, wire
 from uavlinkd.core.admission import Admission, CookieRequired
 from uavlinkd.core.crypto import Entropy, Secret
@@ -23,7 +24,7 @@ from uavlinkd.core.receive import receive_envelope
 from uavlinkd.core.receive_handshake import HandshakeReceiver, OwnKeys
 from uavlinkd.core.refusals import Refused
 from uavlinkd.core.relay_records import Record
-from uavlinkd.core.send import ask_for_echo, note_repeat, recount, report_refusals, send_frames, send_record
+from uavlinkd.core.send import ask_for_echo, seal, send_frames
 from uavlinkd.core.session import Session
 from uavlinkd.core.sessions import Indices
 from uavlinkd.core.settings import Class, PeerSettings, Screen, hold_all
@@ -56,12 +57,13 @@ class Node:
         self._indices = Indices[tuple[Peer, Session | Pending]](entropy)
         self._by_address: dict[SocketAddress, Peer] = {}
         self._last_seen: Counter[SocketAddress] = Counter()  # where peers have proved to be, and how many
-        self._facts = SocketFacts()
+        self.facts = SocketFacts()
+        """About the networks behind the sockets."""
         self._schedule = Schedule[Peer]()
         own = OwnKeys(private_key, entropy, now)
         previous = None if previous_private_key is None else OwnKeys(previous_private_key, entropy, now)
         admission = Admission(self._is_known, now)
-        self._handshakes = HandshakeReceiver(own, previous, self._indices, admission, self._facts, self._schedule)
+        self._handshakes = HandshakeReceiver(own, previous, self._indices, admission, self.facts, self._schedule)
         self.peers: dict[str, Peer] = {}
         """By name."""
         self.drops: Counter[DropReason] = Counter()
@@ -81,24 +83,20 @@ class Node:
         other has, so a peer is added once for each pair of keys that may be valid, by different names.
 
         Raises:
-            ValueError: the name or the pair of keys is there already, the peer's key is one of ours, or
-                ``by_previous_key`` without a previous key.
+            ValueError: the name or the pair of keys is there already, or the peer's key is one of ours.
         """
         handshakes = self._handshakes
-        identity, previous = handshakes.own.identity, handshakes.previous_identity
-        if by_previous_key:
-            if previous is None:
-                raise ValueError(f"peer {settings.name} cannot know a previous key: this node has only one")
-            identity = previous
-        keys = identity.public, settings.public_key
+        own = handshakes.previous if by_previous_key else handshakes.own
+        assert own is not None, "there is a previous key"
+        keys = own.identity.public, settings.public_key
         if settings.name in self.peers or keys in handshakes.peers:
             raise ValueError(f"peer {settings.name} is there already")
-        if settings.public_key in (self.public_key, None if previous is None else previous.public):
+        if settings.public_key in handshakes.public_keys:
             raise ValueError(f"peer {settings.name} has this daemon's own key")
-        shared = Shared(self._indices, self._entropy, self._screen, self._last_seen, self._facts)
-        peer = Peer(settings, identity, shared, now)
+        shared = Shared(self._indices, self._entropy, self._screen, self._last_seen, self.facts)
+        peer = Peer(settings, own.identity, shared, now)
         self.peers[settings.name] = handshakes.peers[keys] = peer
-        self._facts.share_budgets(len(self.peers))
+        self.facts.share_budgets(len(self.peers))
         self._handshakes.admission.set_peers(len(self.peers))
         return peer
 
@@ -109,7 +107,7 @@ class Node:
     def remove_peer(self, peer: Peer, now: float) -> list[Output]:
         """Cut this peer off at once: its keys are forgotten, and nothing from it is accepted any more."""
         del self.peers[peer.name]
-        self._facts.share_budgets(len(self.peers))
+        self.facts.share_budgets(len(self.peers))
         self._handshakes.admission.set_peers(len(self.peers))
         self._handshakes.forget(peer)
         self._forget_addresses(peer)
@@ -138,35 +136,16 @@ class Node:
 
     def set_metered(self, sockets: Iterable[int], now: float) -> None:
         """The sockets whose network is paid by the byte. This hastens no try."""
-        self._facts.metered = set(sockets)
+        self.facts.metered = set(sockets)
         for peer in self.peers.values():
             peer.paths.set_metered()
             self._revise_paths(peer, now)
 
-    def set_budgets(self, budgets: Mapping[int, float]) -> None:
-        """The bits a second that the networks of these sockets carry, of all peers together."""
-        self._facts.set_budgets(budgets)
-        self._facts.share_budgets(len(self.peers))
-
     def set_rates(self, rates: Mapping[int, float], now: float) -> None:
         """The bits a second that networks with a budget carry at present. Tries and probes follow them."""
-        self._facts.set_rates(rates)
+        self.facts.set_rates(rates)
         for peer in self.peers.values():
             self._revise_paths(peer, now)
-
-    def set_envelope_limits(self, limits: Mapping[int, int]) -> None:
-        """The longest envelopes for the networks of these sockets, in bytes: :func:`.path_measures.limit_at`.
-
-        Frames share an envelope up to there; a longer one holds a single frame. The limits of other sockets end.
-        """
-        self._facts.envelope_limits = dict(limits)
-
-    def set_point_to_point(self, peers: Mapping[int, Iterable[Peer]]) -> None:
-        """The peers at the other end of these sockets: one daemon, which may have several pairs of keys.
-
-        Datagrams of other peers that arrive there are dropped, as ``wrong_network``. Other sockets may have any peer.
-        """
-        self._facts.set_point_to_point(peers)
 
     def set_socket_state(self, socket: int, now: float, *, is_up: bool) -> None:
         """The network behind a socket disappeared; or it appeared or changed, and its paths have to prove themselves.
@@ -193,31 +172,26 @@ class Node:
             self._schedule.update(peer)
         return out
 
-    def recount(self, peer: Peer, path: Path, datagrams: int, size: int) -> None:
-        """A copy that :meth:`send` returned waits or is dropped (-1 datagram), or is sent after it waited (1).
-
-        Otherwise the path would seem to lose what was never sent along it. ``size``: in bytes, with the same sign.
-        """
-        recount(peer, path, datagrams, size)
-
-    def note_repeat(self, peer: Peer, path: Path, number: int, datagram: bytes) -> None:
-        """A datagram that :meth:`send` returned is sent along this path again.
-
-        ``number``: which transmission of the envelope it is along this path, 2 to :data:`c.TRANSMISSIONS`.
-        """
-        note_repeat(peer, path, number, datagram)
-
     def report_refusals(self, peer: Peer, changed: Iterable[Refused], now: float) -> list[Output]:
-        """Report to the peer which of its frames are refused here: totals that changed since the last call."""
-        return report_refusals(peer, changed, now)
+        """Report to the peer which of its frames are refused here: totals that changed since the last call.
+
+        It is sent if there is something new and the peer understands reports. A report expects no answer.
+        """
+        peer.own_refusals.update(changed)
+        session, route = peer.session_with(c.FEATURE_REFUSALS, now), peer.paths.routes[Class.BULK]
+        if session is None or not route or (report := peer.own_refusals.take(now)) is None:
+            return []
+        return seal(peer, session, report.encode(), route, now, is_answer=True)
 
     def send_record(self, peer: Peer, path: Path, record: Record, now: float) -> list[Output]:
-        """Send a record to a relay or to a member, along one path, which works; otherwise nothing is sent."""
-        return send_record(peer, path, record, now)
+        """Send a record to a relay or to a member along one path, encrypted. It expects no answer from the session.
 
-    def set_candidates(self, peer: Peer, paths: Iterable[Path]) -> None:
-        """Paths along which the peer may be reached directly. They get no slot before an authentic envelope came."""
-        peer.paths.set_candidates(paths)
+        Nothing is sent if the path is unknown or does not work and is not the best, or the session has no records.
+        """
+        session, state = peer.session_with(c.FEATURE_RECORDS, now), peer.paths.find(path)
+        if session is None or state is None or not (state.works or state is peer.paths.best):
+            return []
+        return seal(peer, session, session.sealed_record(record.encode()), (state,), now, is_answer=True)
 
     def ask_candidates(self, peer: Peer, now: float) -> list[Output]:
         """Send a question to each candidate without a slot; to fewer of them if that was done often.
@@ -248,8 +222,8 @@ class Node:
             peer, session = self._indices.owners.get(header[0], (None, None))
             if peer is None or not isinstance(session, Session):
                 return self._receive_stray(datagram, header[0], path, now)
-            if self._facts.peers_at:
-                self._facts.check_network(peer, path)
+            if self.facts.peers_at:
+                self.facts.check_network(peer, path)
             out = receive_envelope(peer, session, datagram, header, path, now)
             if peer.timers.next_at < peer.timers.scheduled_at:
                 self._schedule.update(peer)

@@ -91,14 +91,14 @@ class SocketFacts:
         self._rates: dict[int, float] = {}
         self._peers = 0
         self.envelope_limits: dict[int, int] = {}
-        """The longest envelopes that several frames share, in bytes."""
+        """The longest envelopes that several frames share, in bytes: :func:`.path_measures.limit_at`."""
         self.peers_at: dict[int, frozenset[Hashable]] = {}
         """The peers at the other end of each point-to-point network."""
 
     # Budgets.
 
     def set_budgets(self, budgets: Mapping[int, float]) -> None:
-        """In bits a second."""
+        """The bits a second that the networks of these sockets carry, of all peers together."""
         self._budgets = dict(budgets)
         self._rates = dict(budgets)
 
@@ -147,7 +147,10 @@ class SocketFacts:
     # Point-to-point networks.
 
     def set_point_to_point(self, peers: Mapping[int, Iterable[Hashable]]) -> None:
-        """The peers at the other end of each of these sockets; those of all other sockets may have any peer."""
+        """The peers at the other end of these sockets: one daemon, which may have several pairs of keys.
+
+        Datagrams of other peers that arrive there are dropped, as ``wrong_network``. Other sockets may have any peer.
+        """
         self.peers_at = {socket: frozenset(those) for socket, those in peers.items()}
 
     def check_network(self, peer: Hashable, path: Path) -> None:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from uavlinkd.core import constants as c
+from uavlinkd.core import wire
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.crypto import Entropy, KeyPair
 from uavlinkd.core.drops import Detail, DropReason
@@ -19,6 +20,7 @@ from uavlinkd.core.limits import TokenBucket
 from uavlinkd.core.outputs import Dropped, Output, PeerLost, PeerUp
 from uavlinkd.core.path import Path, SocketAddress, SocketFacts
 from uavlinkd.core.path_measures import MissingEnvelopes
+from uavlinkd.core.path_state import PathState
 from uavlinkd.core.paths import PathSet
 from uavlinkd.core.refusals import OwnRefusals, RefusalClaims
 from uavlinkd.core.session import Session
@@ -158,6 +160,43 @@ class Peer:
         self.initiator.cancel()
         self.paths.reports_single = bool(features & c.FEATURE_RECORDS)
         self.offered_at = now
+
+    def session_with(self, feature: int, now: float) -> Session | None:
+        """The current session, if both ends have this feature and the keys may still seal."""
+        session = self.sessions.current
+        if session is None or not session.is_usable(now) or not session.parameters.features & feature:
+            return None
+        return session
+
+    # What was sent.
+
+    def count_sent(self, state: PathState, datagrams: int, size: int) -> None:
+        """Datagrams with so many bytes together were sent along a path."""
+        state.datagrams_sent += datagrams
+        state.bytes_sent += size
+        self.traffic.datagrams_sent += datagrams
+        self.traffic.bytes_sent += size
+
+    def recount(self, path: Path, datagrams: int, size: int) -> None:
+        """A copy that :meth:`Node.send` returned waits or is dropped (-1 datagram), or is sent after it waited (1).
+
+        Otherwise the path would seem to lose what was never sent along it. ``size``: in bytes, with the same sign.
+        """
+        if (state := self.paths.find(path)) is not None:
+            state.sent = max(0, state.sent + datagrams)
+            self.count_sent(state, datagrams, size)
+
+    def note_repeat(self, path: Path, number: int, datagram: bytes) -> None:
+        """An envelope that :meth:`Node.send` returned is sent along this path again.
+
+        ``number``: which transmission it is along this path, 2 to :data:`c.TRANSMISSIONS`. The loss of a path is that
+        of the current session.
+        """
+        if (state := self.paths.find(path)) is not None:
+            session = self.sessions.current
+            if session is not None and wire.claimed_receiver_index(datagram) == session.remote_index:
+                state.note_repeat(number)
+            self.count_sent(state, 1, len(datagram))
 
     # Outputs.
 

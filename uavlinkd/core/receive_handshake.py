@@ -58,9 +58,9 @@ class HandshakeReceiver:
         self._schedule = schedule
 
     @property
-    def previous_identity(self) -> KeyPair | None:
-        """The previous key pair, while there is one."""
-        return None if self.previous is None else self.previous.identity
+    def public_keys(self) -> list[bytes]:
+        """Our public key, and the previous one while there is one."""
+        return [own.identity.public for own in (self.own, self.previous) if own is not None]
 
     def receive(self, datagram: bytes, path: Path, now: float) -> list[Output]:
         """What to do about a datagram that is not an envelope.
@@ -198,6 +198,5 @@ class HandshakeReceiver:
         """
         if reason not in _NOT_OUR_VERSION or not self.admission.may_compare_versions(path, now):
             return
-        identities = [self.own.identity] + ([] if self.previous is None else [self.previous.identity])
-        if (version := version_of(datagram, (identity.public for identity in identities))) is not None:
+        if (version := version_of(datagram, self.public_keys)) is not None:
             raise Drop(DropReason.OTHER_VERSION, version)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 from uavlinkd.core import constants as c
 from uavlinkd.core import wire
@@ -15,8 +15,6 @@ from uavlinkd.core.path_state import PathState
 from uavlinkd.core.paths import Route
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.probe import QUESTION_BYTES
-from uavlinkd.core.refusals import Refused
-from uavlinkd.core.relay_records import Record
 from uavlinkd.core.session import Session
 from uavlinkd.core.settings import Class
 from uavlinkd.core.timers import Timer
@@ -130,60 +128,8 @@ def transmit(peer: Peer, datagram: bytes, path: Path, *, is_copy: bool = False) 
     if state is None:
         peer.traffic.bytes_elsewhere += len(datagram)
     else:
-        _count(peer, state, 1, len(datagram))
+        peer.count_sent(state, 1, len(datagram))
     return [Transmit(datagram, path, is_copy)]
-
-
-def recount(peer: Peer, path: Path, datagrams: int, size: int) -> None:
-    """Count datagrams with so many bytes together as sent along a path after all, or as not sent (negative)."""
-    state = peer.paths.find(path)
-    if state is not None:
-        state.sent = max(0, state.sent + datagrams)
-        _count(peer, state, datagrams, size)
-
-
-def _count(peer: Peer, state: PathState, datagrams: int, size: int) -> None:
-    state.datagrams_sent += datagrams
-    state.bytes_sent += size
-    peer.traffic.datagrams_sent += datagrams
-    peer.traffic.bytes_sent += size
-
-
-def note_repeat(peer: Peer, path: Path, number: int, datagram: bytes) -> None:
-    """Count one more transmission of an envelope along a path. The loss of a path is that of the current session."""
-    state, session = peer.paths.find(path), peer.sessions.current
-    if state is not None:
-        if session is not None and wire.claimed_receiver_index(datagram) == session.remote_index:
-            state.note_repeat(number)
-        _count(peer, state, 1, len(datagram))
-
-
-def report_refusals(peer: Peer, changed: Iterable[Refused], now: float) -> list[Output]:
-    """Report what this end refuses of the peer's frames, if it has changed and the peer understands reports.
-
-    A report expects no answer. ``changed``: the totals that changed since the last call.
-    """
-    peer.own_refusals.update(changed)
-    session, route = peer.sessions.current, peer.paths.routes[Class.BULK]
-    if session is None or not route or not session.is_usable(now):
-        return []
-    if not session.parameters.features & c.FEATURE_REFUSALS:
-        return []
-    report = peer.own_refusals.take(now)
-    return [] if report is None else seal(peer, session, report.encode(), route, now, is_answer=True)
-
-
-def send_record(peer: Peer, path: Path, record: Record, now: float) -> list[Output]:
-    """Send a record along one path, encrypted. It expects no answer from the session.
-
-    Nothing is sent if the path is unknown or does not work and is not the best, or the session has no records.
-    """
-    session, state = peer.sessions.current, peer.paths.find(path)
-    if session is None or not session.is_usable(now) or not session.parameters.features & c.FEATURE_RECORDS:
-        return []
-    if state is None or not (state.works or state is peer.paths.best):
-        return []
-    return seal(peer, session, session.sealed_record(record.encode()), (state,), now, is_answer=True)
 
 
 def send_echo(peer: Peer, session: Session, echo: wire.Echo, route: Route, now: float) -> list[Output]:

@@ -170,7 +170,7 @@ class DirectSearch:
         }
         sockets = [sock for sock in self._sockets if sock.number not in connected]
         hosts = {host for sock in self._sockets for host, _ in sock.places}
-        self._node.set_candidates(self._peer, paths_to(self.theirs, sockets, self._relays, hosts))
+        self._peer.paths.set_candidates(paths_to(self.theirs, sockets, self._relays, hosts))
         out: list[Output] = []
         if self._own and (sockets or self._tries < c.CANDIDATE_TRIES) and self._lists.take(now):
             named = min(relayed, key=lambda state: state.srtt_s or NEVER)

@@ -86,9 +86,9 @@ class PeerOutput:
             released = self.copies.release(usable, now)
             for (datagram, path, _), number in released:
                 if number == 1:
-                    self._node.recount(peer, path, 1, len(datagram))
+                    peer.recount(path, 1, len(datagram))
                 else:
-                    self._node.note_repeat(peer, path, number, datagram)
+                    peer.note_repeat(path, number, datagram)
             self._on_sent([], [transmit for transmit, _ in released], now)
 
     def next_deadline(self, now: float) -> float:
@@ -221,7 +221,7 @@ class PeerOutput:
             if len(envelope) > 1:
                 left_out |= {*envelope} - {*self.copies.pick(envelope, frames, now)}
         for transmit in left_out:
-            self._node.recount(peer, transmit.path, -1, -len(transmit.datagram))
+            peer.recount(transmit.path, -1, -len(transmit.datagram))
         return [output for output in outputs if not isinstance(output, Transmit) or output not in left_out]
 
 

@@ -190,8 +190,8 @@ class PeerSockets:
             if network.config.budget_bits_s:
                 budget = NetworkBudget(network.config.budget_bits_s, now)
                 self.budgets.update({sock.number: budget for sock in network.sockets})
-        self._node.set_budgets({number: budget.bits_s for number, budget in self.budgets.items()})
-        self._node.set_envelope_limits({line.number: line.envelope_limit for line in self.serial.networks})
+        self._node.facts.set_budgets({number: budget.bits_s for number, budget in self.budgets.items()})
+        self._node.facts.envelope_limits = {line.number: line.envelope_limit for line in self.serial.networks}
         self._choose_senders()
 
     def use_relays(self) -> None:

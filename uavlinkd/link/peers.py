@@ -192,7 +192,7 @@ class Peers:
         parts = self._parts
         parts.link_of.clear()
         parts.link_of.update((peer, link) for link in parts.links.values() for peer in link.peers)
-        parts.node.set_point_to_point(parts.peer_sockets.serial.peers_at(parts.links.values()))
+        parts.node.facts.set_point_to_point(parts.peer_sockets.serial.peers_at(parts.links.values()))
         parts.relays.follow_links(monotonic())
 
     def _follow_members(self) -> None:
