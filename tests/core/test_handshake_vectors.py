@@ -15,7 +15,7 @@ from uavlinkd.core import crypto, handshake, wire
 from uavlinkd.core.cookie import MacKeys
 from uavlinkd.core.crypto import KeyPair, MacKey, Secret
 from uavlinkd.core.handshake import Keys
-from uavlinkd.core.session import Session, derive
+from uavlinkd.core.session import Session, envelope_keys
 from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.core.suites import SUITES
 from uavlinkd.core.wire import Parameters
@@ -53,14 +53,12 @@ def check_keys(keys: Keys, vector: dict[str, Any]) -> None:
     )
     for number, (side, other) in enumerate((("initiator", "responder"), ("responder", "initiator"))):
         index = int.from_bytes(bytes.fromhex(vector["entropy"][other][0]), "big")
-        transport, is_first = keys.transport[number], side == "initiator"
-        sender = Session(replace(keys, remote_index=index), 1, 0.0, 180.0, is_initiator=is_first)
+        sender = Session(replace(keys, remote_index=index), 1, 0.0, 180.0, is_initiator=side == "initiator")
         assert sender.tag_bytes == agreed.tag_bytes
         header = wire.envelope_header(index, 0)
         envelope = sender.seal(raw(vector, f"{side}_payload"), 0.0)
         assert envelope == raw(vector, f"{side}_envelope")
-        envelope_key = derive(keys.parameters, transport, keys.handshake_hash, from_initiator=is_first)
-        opened = unprotected(envelope_key, agreed.tag_bytes, envelope, len(header), 0)
+        opened = unprotected(envelope_keys(keys)[number], agreed.tag_bytes, envelope, len(header), 0)
         assert opened == raw(vector, f"{side}_payload")
         if not keys.parameters.confidential:
             tag = MacKey(raw(vector, f"{side}_envelope_key")).tag(envelope[: -agreed.tag_bytes])

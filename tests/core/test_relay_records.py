@@ -80,9 +80,9 @@ def test_filter_test_is_not_shorter_than_what_a_relay_sends_for_it(counter: int)
     """The token, with IP and UDP header of its own, and the record, whose envelope may have the longer header."""
     session = Pair(LINK, LINK).establish().a.session
     session.send_counter = 0
-    asked = session.seal_record(FilterTest(TOKEN).encode(), 0.0)
+    asked = session.seal(session.sealed_record(FilterTest(TOKEN).encode()), 0.0)
     session.send_counter = counter
-    answer = session.seal_record(FilterTested(TOKEN).encode(), 0.0)
+    answer = session.seal(session.sealed_record(FilterTested(TOKEN).encode()), 0.0)
     ipv6_and_udp = 40 + 8
     assert len(asked) >= len(answer) + len(token_datagram(TOKEN)) + ipv6_and_udp
 
@@ -211,7 +211,7 @@ def test_record_needs_both_ends_and_a_path_that_works(pair: Pair) -> None:
 
 def test_record_on_a_superseded_session_is_dropped(pair: Pair) -> None:
     """The peer has sent on newer keys for a while."""
-    late = pair.a.session.seal_record(BIND.encode(), 1.0)
+    late = pair.a.session.seal(pair.a.session.sealed_record(BIND.encode()), 1.0)
     pair.a.peer.initiator.retry_at = 0.0
     pair.establish(121.0)
     assert pair.carries(121.0)

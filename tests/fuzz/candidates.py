@@ -61,7 +61,7 @@ class Named(Insider):
             super().step(script)
         else:
             what = script.byte()
-            datagram = self.sessions[-1].seal_record(self._named(script), self.now)
+            datagram = self.sessions[-1].seal(self.sessions[-1].sealed_record(self._named(script)), self.now)
             self.recorded = [*self.recorded[-63:], datagram]
             self._offer(datagram, what)
             self._pass((what & 7) / 8)

@@ -81,7 +81,7 @@ class Assigned(Insider):
             if key in WANTED:
                 self._assigned.add(handle)
         record = Bound("192.0.2.7", script.word(), tuple(entries))
-        self._offer(self.sessions[-1].seal_record(record.encode(), self.now), what)
+        self._offer(self.sessions[-1].seal(self.sessions[-1].sealed_record(record.encode()), self.now), what)
         self._pass(0.01)
 
     def _test(self, script: Script) -> None:
@@ -95,7 +95,7 @@ class Assigned(Insider):
         token = true[0] if true and how & 8 else script.take(how & 31)
         if how & 3 == 1:
             record = FilterTested(token).encode()
-            self._offer(self.sessions[-1].seal_record(record, self.now), how)
+            self._offer(self.sessions[-1].seal(self.sessions[-1].sealed_record(record), self.now), how)
             return
         path = (AT_A, OTHER_PORT, ELSEWHERE, Path(1, OTHER_PORT.address))[how >> 4 & 3]
         may_be_taken = token in true and path == OTHER_PORT and self.peer.paths.find(path) is None

@@ -319,7 +319,7 @@ class FuzzedRelay:
         elif how & 0xF0 == 0xA0:
             record = FilterTested(script.take(c.FILTER_TOKEN_BYTES).ljust(c.FILTER_TOKEN_BYTES))
         path = member.homes[how >> 4 & 1] if how & 0x40 else self._source(script, is_member=True)
-        self.arrive(session.seal_record(record.encode(), self.now), path)
+        self.arrive(session.seal(session.sealed_record(record.encode()), self.now), path)
         if how & 0x20:
             self.settle()
 

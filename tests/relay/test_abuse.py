@@ -52,7 +52,7 @@ def sealed(relay: FuzzedRelay, number: int, record: Record) -> bytes:
     """The envelope of one member with this record."""
     session = relay.members[number].peer.sessions.current
     assert session is not None
-    return session.seal_record(record.encode(), relay.now)
+    return session.seal(session.sealed_record(record.encode()), relay.now)
 
 
 # Candidates.

@@ -148,7 +148,7 @@ class Peer:
     def sending_session(self) -> Session | None:
         """The current session, if it can still seal."""
         session = self.sessions.current
-        return None if session is None or session.is_used_up else session
+        return None if session is None or session.send_counter >= c.SESSION_ENVELOPE_LIMIT else session
 
     def offer(self, features: int, now: float) -> None:
         """Offer other features. A session keeps those that it began with, so new keys are wanted.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from uavlinkd.core import constants as c
+from uavlinkd.core.counters import Arrivals
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.outputs import Output
 from uavlinkd.core.path import Path
@@ -33,7 +34,7 @@ def follow_paths(peer: Peer, now: float) -> None:
     for session in peer.sessions.confirmed:
         session.set_pace(pace, peer.verify_interval_s, now)
         if has_several and session.arrivals is None:
-            session.begin_arrivals(now)
+            session.arrivals = Arrivals(now)
 
 
 def begin_session(peer: Peer, session: Session, path: Path, now: float) -> list[Output]:

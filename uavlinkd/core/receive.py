@@ -124,7 +124,7 @@ def _receive_copy(
     """
     out: list[Output] = []
     _, counter, header_bytes = header
-    is_recent = session.is_recent(counter, now)
+    is_recent = not session.is_late(counter, now)
     state = peer.paths.find(path)
     if not is_recent and (state is None or not state.is_validated):
         raise Drop(DropReason.REPLAYED)

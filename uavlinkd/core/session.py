@@ -6,13 +6,12 @@ from uavlinkd.core import constants as c
 from uavlinkd.core import wire
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.counters import Arrivals, CounterHistory, ReplayWindow
-from uavlinkd.core.crypto import AeadKey, MacKey, Secret, equal, hkdf_expand
+from uavlinkd.core.crypto import AeadKey, MacKey, equal, hkdf_expand
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.handshake import Keys
 from uavlinkd.core.path import Pace
 from uavlinkd.core.refusals import RefusalReport
 from uavlinkd.core.verification import HeldFrames, Verification
-from uavlinkd.core.wire import Parameters
 
 EnvelopeKey = MacKey | AeadKey
 """The key of one direction: of HMAC-SHA256, or in a confidential session of ChaCha20-Poly1305."""
@@ -21,30 +20,20 @@ EnvelopeKey = MacKey | AeadKey
 _DIRECTIONS = b" initiator to responder", b" responder to initiator"
 
 
-def derive(parameters: Parameters, transport: Secret, handshake_hash: bytes, *, from_initiator: bool) -> EnvelopeKey:
-    """The envelope key of one direction, from that direction's key of Noise ``Split()``.
+def _derived(keys: Keys, purpose: bytes, length: int) -> list[bytes]:
+    """A key for the initiator's envelopes and one for the responder's, each from its own key of Noise ``Split()``.
 
     The label names purpose and direction; the transcript hash behind it ties the key to every byte of the handshake.
     """
-    direction = _DIRECTIONS[not from_initiator]
-    purpose = b" confidential" if parameters.confidential else b" authenticated"
-    info = c.PROTOCOL_NAME + purpose + direction + handshake_hash
-    if parameters.confidential:
-        return AeadKey(hkdf_expand(transport.reveal(), info, c.KEY_BYTES))
-    return MacKey(hkdf_expand(transport.reveal(), info, parameters.mac_key_bits // 8))
+    labels = (c.PROTOCOL_NAME + purpose + direction + keys.handshake_hash for direction in _DIRECTIONS)
+    return [hkdf_expand(key.reveal(), label, length) for key, label in zip(keys.transport, labels, strict=True)]
 
 
-def _record_keys(keys: Keys, *, is_initiator: bool) -> tuple[AeadKey, AeadKey] | None:
-    """The keys of the records to the peer and from it; None if an end does not have records."""
-    if not keys.parameters.features & c.FEATURE_RECORDS:
-        return None
-    first, second = (
-        AeadKey(
-            hkdf_expand(key.reveal(), c.PROTOCOL_NAME + b" records" + direction + keys.handshake_hash, c.KEY_BYTES)
-        )
-        for key, direction in zip(keys.transport, _DIRECTIONS, strict=True)
-    )
-    return (first, second) if is_initiator else (second, first)
+def envelope_keys(keys: Keys) -> list[EnvelopeKey]:
+    """Those of the initiator and of the responder."""
+    if keys.parameters.confidential:
+        return [AeadKey(key) for key in _derived(keys, b" confidential", c.KEY_BYTES)]
+    return [MacKey(key) for key in _derived(keys, b" authenticated", keys.parameters.mac_key_bits // 8)]
 
 
 class Session:
@@ -63,10 +52,11 @@ class Session:
         *,
         is_initiator: bool,
     ) -> None:
-        first = derive(keys.parameters, keys.transport[0], keys.handshake_hash, from_initiator=True)
-        second = derive(keys.parameters, keys.transport[1], keys.handshake_hash, from_initiator=False)
-        self._send, self._receive = (first, second) if is_initiator else (second, first)
-        self._record_keys = _record_keys(keys, is_initiator=is_initiator)  # to the peer, and from it
+        order = 1 if is_initiator else -1
+        self._send, self._receive = envelope_keys(keys)[::order]
+        self._record_keys: list[AeadKey] | None = None  # to the peer, and from it
+        if keys.parameters.features & c.FEATURE_RECORDS:
+            self._record_keys = [AeadKey(key) for key in _derived(keys, b" records", c.KEY_BYTES)][::order]
         self.suite = keys.suite
         self.parameters = keys.parameters
         self.is_initiator = is_initiator
@@ -121,11 +111,6 @@ class Session:
         """Envelopes that the peer has sent, as far as is known here."""
         return self.window.highest + 1
 
-    @property
-    def is_used_up(self) -> bool:
-        """Whether the counter has reached its end: the keys can open, and seal no more."""
-        return self.send_counter >= c.SESSION_ENVELOPE_LIMIT
-
     def is_usable(self, now: float) -> bool:
         """Whether the keys may still seal."""
         return now < self.reject_at and self.send_counter < c.SESSION_ENVELOPE_LIMIT
@@ -147,7 +132,7 @@ class Session:
         return highest + 1 - received
 
     def seal(self, payload: bytes, now: float) -> bytes:
-        """The next envelope: header, payload, tag. A counter is never used twice: see :attr:`is_used_up`."""
+        """The next envelope: header, payload, tag. A counter is never used twice."""
         counter = self.send_counter
         assert counter < c.SESSION_ENVELOPE_LIMIT
         if now >= self._sent_history.next_at:
@@ -170,10 +155,6 @@ class Session:
         assert self._record_keys is not None
         return wire.SealedRecord(self._record_keys[0].seal(self.send_counter, record, b"")).encode()
 
-    def seal_record(self, record: bytes, now: float) -> bytes:
-        """The next envelope around a record."""
-        return self.seal(self.sealed_record(record), now)
-
     def open_record(self, counter: int, sealed: bytes) -> bytes:
         """The record in an authentic envelope with this counter.
 
@@ -191,13 +172,9 @@ class Session:
             self.held.pace = pace
             self.verification.set_pace(max(interval_s, pace.interval_s), pace.hold_s, now)
 
-    def begin_arrivals(self, now: float) -> None:
-        """The peer has several paths: remember when envelopes arrive."""
-        self.arrivals = Arrivals(now)
-
-    def is_recent(self, counter: int, now: float) -> bool:
-        """Whether this counter was accepted in the last :data:`c.LATE_AFTER_S`, if it was accepted."""
-        return not self._is_late(counter, now)
+    def is_late(self, counter: int, now: float) -> bool:
+        """Whether the peer overtook this counter longer than :data:`c.LATE_AFTER_S` ago."""
+        return counter <= self._received_history.past(self.window.highest, self.received, now)[0]
 
     def open(self, datagram: bytes, header_bytes: int, counter: int, now: float) -> bytes | None:
         """The payload of an envelope whose header says it is for this session. None for an authentic copy.
@@ -214,7 +191,7 @@ class Session:
         window = self.window
         is_overtaken = counter <= window.highest
         is_copy = is_overtaken and window.is_used(counter)  # a counter above the highest was never used
-        if not is_copy and (counter <= self._floor or (is_overtaken and self._is_late(counter, now))):
+        if not is_copy and (counter <= self._floor or (is_overtaken and self.is_late(counter, now))):
             raise Drop(DropReason.DELAYED)
 
         key, tag_at = self._receive, len(datagram) - self.tag_bytes
@@ -248,6 +225,3 @@ class Session:
             assert payload is not None
             return payload
         return datagram[header_bytes : len(datagram) - self.tag_bytes]
-
-    def _is_late(self, counter: int, now: float) -> bool:
-        return counter <= self._received_history.past(self.window.highest, self.received, now)[0]

@@ -154,11 +154,7 @@ def test_receiver_that_needs_no_answers_delivers_stretched_frames(
 
 def test_receiver_with_one_key_for_both_directions_takes_its_own_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     """If neither key nor index depends on the direction, a reflected envelope looks like the peer's."""
-
-    def derive(*facts: Any, from_initiator: bool) -> session.EnvelopeKey:
-        return genuine_derive(facts[0], facts[1], facts[2], from_initiator=from_initiator or True)
-
-    genuine_derive = session.derive
+    genuine = session.envelope_keys
 
     class OneKey(session.Session):
         def __init__(self, *facts: Any, **named: Any) -> None:
@@ -166,7 +162,7 @@ def test_receiver_with_one_key_for_both_directions_takes_its_own_frames(monkeypa
             self._receive = self._send if self.is_initiator else self._receive
             self._send = self._receive
 
-    monkeypatch.setattr(session, "derive", derive)
+    monkeypatch.setattr(session, "envelope_keys", lambda keys: 2 * genuine(keys)[:1])
     monkeypatch.setattr("uavlinkd.core.establish.Session", OneKey)
     monkeypatch.setattr(Indices, "pick", lambda _self, _now: 7)
     monkeypatch.setattr(ReplayWindow, "is_used", lambda _self, _counter: False)
