@@ -119,8 +119,8 @@ def test_echoes_show_the_loss_of_the_only_path() -> None:
     """The newest report counts, of a probe or of an echo reply."""
     state = PathState(AT_B, 1, 0.0, is_configured=True, is_metered=False)
     assert state.loss_to_repair() == (0.0, 0)
-    state.note_echo_counts(1.0, 10, NO_REPEATS, 10)
-    state.note_echo_counts(2.0, 20, NO_REPEATS, 17)
+    state.loss_by_echo.add(1.0, 10, 10)
+    state.loss_by_echo.add(2.0, 20, 17)
     assert state.loss_to_repair() == (0.3, 3)
     assert state.loss_out == 0.3
 

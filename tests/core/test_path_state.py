@@ -79,7 +79,7 @@ def test_questions_that_wait_are_limited_in_age_and_number() -> None:
         assert (state.receive_answer(question, 1, 1.0 + late_s) is not None) is is_valid
     state = fresh()
     questions = [ask(state, number / 1000) for number in range(c.QUESTIONS_PER_PATH + 1)]
-    assert state.waiting_questions == c.QUESTIONS_PER_PATH
+    assert len(state._waiting) == c.QUESTIONS_PER_PATH
     assert [state.receive_answer(question, 1, 0.1) is not None for question in questions[:2]] == [False, True]
 
 

@@ -68,7 +68,7 @@ def measure(node: Node) -> Sizes:
             "indices in use or quarantine": len(indices.owners) + len(indices._quarantine),
             "configured paths of a peer": max((len(peer.paths.configured) for peer in peers), default=0),
             "learned paths of a peer": max(learned, default=0),
-            "questions that wait on a path": max((state.waiting_questions for state in paths), default=0),
+            "questions that wait on a path": max((len(state._waiting) for state in paths), default=0),
             "reports of a path": max(reports, default=0),
             "lags of a path": max((len(state._lags) for state in paths), default=0),
             "paths that carried a response": max((len(response.paths) for response in waiting), default=0),

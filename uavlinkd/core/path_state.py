@@ -85,6 +85,8 @@ class PathState:
     """The last one that was measured. The others are smoothed."""
     srtt_s: float | None = None
     rttvar_s: float | None = None
+    loss_by_echo: PathLoss = field(default_factory=PathLoss)
+    """As the answers to echo requests say, if it is the only path."""
     envelope_limit: EnvelopeLimit = field(default_factory=EnvelopeLimit)
     answered_at: float = -NEVER
     answers: int = 0
@@ -101,7 +103,6 @@ class PathState:
     _recovering_answers: int = 0
     _loss_in: PathLoss = field(default_factory=PathLoss)
     _loss_out: PathLoss = field(default_factory=PathLoss)
-    _loss_by_echo: PathLoss = field(default_factory=PathLoss)
     _lags: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=c.LAG_SAMPLES))
     _reported_lag: tuple[float, float] | None = None  # when, seconds
     _reported_lost: int = 0  # of the peer's datagrams of the current session
@@ -131,11 +132,6 @@ class PathState:
         return self._recovering_since != NEVER
 
     @property
-    def waiting_questions(self) -> int:
-        """How many questions may still be answered."""
-        return len(self._waiting)
-
-    @property
     def loss_in(self) -> float:
         """The share of the peer's envelopes that this path lost recently, 0 to 1. A repeated one is lost with all
         its repeats.
@@ -154,7 +150,7 @@ class PathState:
 
     @property
     def _reported_loss(self) -> PathLoss:
-        by_echo, by_probe = self._loss_by_echo, self._loss_out
+        by_echo, by_probe = self.loss_by_echo, self._loss_out
         return by_echo if by_echo.reported_at > by_probe.reported_at else by_probe
 
     def lag_s(self, now: float) -> float | None:
@@ -193,7 +189,7 @@ class PathState:
         self.sent = self.received = self._reported_lost = 0
         self.repeats = NO_REPEATS
         self.questioned_at = -NEVER  # the peer knows no counts of this session yet
-        self._loss_in, self._loss_out, self._loss_by_echo = PathLoss(), PathLoss(), PathLoss()
+        self._loss_in, self._loss_out, self.loss_by_echo = PathLoss(), PathLoss(), PathLoss()
         self._waiting = {token: asked._replace(sent=0) for token, asked in self._waiting.items()}
 
     def note_repeat(self, number: int) -> None:
@@ -277,10 +273,6 @@ class PathState:
         self.answered_at = now
         self.is_proven = True
         self._add_round_trip(round_trip_s)
-
-    def note_echo_counts(self, asked_at: float, sent: int, repeats: Repeats, received: int) -> None:
-        """Of the ``sent`` envelopes of the session until an echo request along the only path, so many arrived."""
-        self._loss_by_echo.add(asked_at, sent, received, repeats)
 
     def _add_round_trip(self, round_trip_s: float) -> None:
         self.round_trip_s = round_trip_s

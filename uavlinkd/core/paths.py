@@ -202,7 +202,7 @@ class PathSet(PathSlots):
     def note_echo_counts(self, asked_at: float, sent: int, repeats: Repeats, received: int) -> None:
         """Of ``sent`` envelopes of the session until an echo request so many arrived: the loss of the only path."""
         if self.best is not None and len(self.by_path) == 1:
-            self.best.note_echo_counts(asked_at, sent, repeats, received)
+            self.best.loss_by_echo.add(asked_at, sent, received, repeats)
 
     # The election.
 

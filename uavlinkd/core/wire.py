@@ -6,6 +6,7 @@ All integers are big-endian. The README beside this file draws each message.
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -197,36 +198,33 @@ class CookieReply(NamedTuple):
     sealed: bytes
 
 
-def parse_initiation(datagram: bytes) -> Initiation:
-    """Cut message 1 into its fields. Any bytes give an Initiation or a Drop.
+def _cut(
+    datagram: bytes, header: struct.Struct, size: Callable[[Suite], int]
+) -> tuple[Suite, list[int], bytes, bytes]:
+    """Suite, indices, header and Noise message of a handshake message, whose ``size`` its suite gives.
 
     Raises:
         Drop: ``MALFORMED``.
     """
-    suite = SUITES.get(datagram[1]) if len(datagram) > _INITIATION_HEADER.size else None
-    if suite is None or len(datagram) != initiation_bytes(suite):
+    suite = SUITES.get(datagram[1]) if len(datagram) > header.size else None
+    if suite is None or len(datagram) != size(suite):
         raise Drop(DropReason.MALFORMED)
-    _, _, sender_index = _INITIATION_HEADER.unpack_from(datagram)
-    if not sender_index:
+    _, _, *indices = header.unpack_from(datagram)
+    if not all(indices):
         raise Drop(DropReason.MALFORMED)
-    size = _INITIATION_HEADER.size
-    return Initiation(suite, sender_index, datagram[:size], datagram[size:-MACS_BYTES])
+    return suite, indices, datagram[: header.size], datagram[header.size : -MACS_BYTES]
+
+
+def parse_initiation(datagram: bytes) -> Initiation:
+    """Cut message 1 into its fields. Any bytes give an Initiation, or a Drop with ``MALFORMED``."""
+    suite, (sender,), header, noise = _cut(datagram, _INITIATION_HEADER, initiation_bytes)
+    return Initiation(suite, sender, header, noise)
 
 
 def parse_response(datagram: bytes) -> Response:
-    """Cut message 2 into its fields. Any bytes give a Response or a Drop.
-
-    Raises:
-        Drop: ``MALFORMED``.
-    """
-    suite = SUITES.get(datagram[1]) if len(datagram) > _RESPONSE_HEADER.size else None
-    if suite is None or len(datagram) != response_bytes(suite):
-        raise Drop(DropReason.MALFORMED)
-    _, _, sender_index, receiver_index = _RESPONSE_HEADER.unpack_from(datagram)
-    if not (sender_index and receiver_index):
-        raise Drop(DropReason.MALFORMED)
-    size = _RESPONSE_HEADER.size
-    return Response(suite, sender_index, receiver_index, datagram[:size], datagram[size:-MACS_BYTES])
+    """Cut message 2 into its fields. Any bytes give a Response, or a Drop with ``MALFORMED``."""
+    suite, (sender, receiver), header, noise = _cut(datagram, _RESPONSE_HEADER, response_bytes)
+    return Response(suite, sender, receiver, header, noise)
 
 
 def encode_cookie_reply(receiver_index: int, nonce: bytes, sealed: bytes) -> bytes:
@@ -235,11 +233,7 @@ def encode_cookie_reply(receiver_index: int, nonce: bytes, sealed: bytes) -> byt
 
 
 def parse_cookie_reply(datagram: bytes) -> CookieReply:
-    """Cut message 3 into its fields. Any bytes give a CookieReply or a Drop.
-
-    Raises:
-        Drop: ``MALFORMED``.
-    """
+    """Cut message 3 into its fields. Any bytes give a CookieReply, or a Drop with ``MALFORMED``."""
     if len(datagram) != COOKIE_BYTES or datagram[1] != 0:
         raise Drop(DropReason.MALFORMED)
     _, _, receiver_index = _INITIATION_HEADER.unpack_from(datagram)
