@@ -45,7 +45,7 @@ def test_path_of_the_peer_stays_usable_while_another_sender_is_faster(confidenti
     for side in (pair.a, pair.b):
         assert side.peer.path == side.peer_at
         assert own_path(side).condition is PathCondition.USABLE
-        assert side.peer.traffic.paths_unproven > 0
+        assert side.peer.paths.unproven > 0
     assert changed_at <= {1.0}  # until the first answer, no path is better than another
 
 

@@ -206,7 +206,7 @@ def test_address_that_answers_nothing_is_forgotten(pair: Pair) -> None:
     pair.b.timeout(now)
     assert condition(pair.b, ELSEWHERE) is None
     assert now <= 1.0 + c.QUESTION_LIFETIME_S + c.PROBE_DOWN_S
-    assert pair.b.peer.traffic.paths_unproven == 1
+    assert pair.b.peer.paths.unproven == 1
 
 
 @pytest.mark.parametrize("path", [ELSEWHERE, relayed(0, "vps", 7)], ids=["address", "handle"])
@@ -216,7 +216,7 @@ def test_configured_path_that_never_answered_does_not_count(path: Path, pair: Pa
     pair.b.node.set_paths(pair.b.peer, [AT_A], 2.0)
     pair.b.timeout(2.0)
     assert condition(pair.b, path) is None
-    assert pair.b.peer.traffic.paths_unproven == 0
+    assert pair.b.peer.paths.unproven == 0
 
 
 @pytest.mark.parametrize("moves", [False, True])

@@ -97,10 +97,9 @@ def test_picked_index_is_neither_zero_nor_owned() -> None:
     assert [indices.pick(0.0), indices.pick(0.0)] == [5, 5]
     indices.owners[5] = OWNER
     assert indices.pick(0.0) == 6
-    indices.forget(5)
+    del indices.owners[5]
     assert not indices.is_quarantined(5, 0.0)
     assert indices.pick(0.0) == 5
-    indices.forget(5)  # without an owner: nothing happens
 
 
 def test_retired_index_is_quarantined_for_ten_minutes() -> None:

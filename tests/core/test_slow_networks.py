@@ -29,7 +29,7 @@ def facts(budget_bits_s: float = BUDGET_BITS_S, peers: int = 1) -> SocketFacts:
     """One network with a budget."""
     made = SocketFacts()
     made.set_budgets({SIK: budget_bits_s})
-    made.share_budgets(peers)
+    made.peers = peers
     return made
 
 

@@ -29,7 +29,7 @@ def initiate(peer: Peer, now: float) -> list[Output]:
     if not unmetered and not metered:
         return []
     if peer.keys_wanted_at() > initiator.initiated_at:  # none was wanted between the last initiation and this one
-        initiator.reset()
+        initiator.attempts = 0
     if initiator.attempts and peer.is_up:
         peer.traffic.handshakes_unanswered += 1
     paths = unmetered + initiator.take_metered(metered, now)
@@ -70,17 +70,6 @@ def receive_response(peer: Peer, pending: Pending, response: wire.Response, path
         return ask_for_echo(peer, session, now, () if state is None else (state,)) + events
     out = ask_for_echo(peer, session, now) + events
     return out + probing.ask_everywhere(peer, session, now)
-
-
-def receive_cookie(peer: Peer, mac1: bytes, path: Path, reply: wire.CookieReply, now: float) -> None:
-    """The peer is under load and asks us to prove our address.
-
-    Raises:
-        Drop: ``BAD_COOKIE``.
-    """
-    peer.initiator.receive_cookie(mac1, path, reply, now)
-    peer.traffic.cookies_taken += 1
-    peer.set_initiate()
 
 
 def receive_hint(peer: Peer, now: float) -> list[Output]:
@@ -142,7 +131,7 @@ def adopt(peer: Peer, session: Session, path: Path, now: float) -> list[Output]:
     peer.indices.owners[session.local_index] = peer, session
     out = freshness.end(peer, peer.sessions.confirm(session, now))
     peer.initiator.cancel()
-    peer.initiator.reset()
+    peer.initiator.attempts = 0
     peer.timers.stop(Timer.INITIATION_EXPIRY)
     peer.traffic.handshakes += 1
     if peer.sessions.current is session:
@@ -167,7 +156,7 @@ def receive_close(peer: Peer, session: Session, now: float) -> list[Output]:
         peer.is_up = False
         peer.unverified_since = None
         peer.unanswered_since = None
-        peer.initiator.reset()
+        peer.initiator.attempts = 0
         peer.initiator.retry_at = now + c.CLOSE_HOLDOFF_S
         out.append(PeerClosed(peer))
     peer.set_initiate()

@@ -21,7 +21,7 @@ def deliver(peer: Peer, session: Session, counter: int, payload: bytes, now: flo
     out: list[Output] = []
     verification = session.verification
     if now >= verification.ask_at and peer.sessions.is_in_use(session):
-        verification.begin()
+        verification.due_at = -NEVER  # repeat the request until it is answered
         out += ask_for_echo(peer, session, now, peer.paths.echo_route)
     if now <= verification.until:
         return [*out, Deliver(peer, payload, session.order_of(counter))]
@@ -105,7 +105,7 @@ def handle_timeout(peer: Peer, now: float) -> list[Output]:
                 out += ask_for_echo(peer, session, now)
         if now >= verification.due_at:
             if now > session.trusted_until:  # no frames arrive: the next one is asked about
-                verification.stop()
+                verification.due_at = NEVER
             else:
                 out += ask_for_echo(peer, session, now)
     peer.set_freshness()

@@ -51,7 +51,7 @@ class Initiator:
         self.retry_at = now
         """No initiation is sent earlier, however much new keys are wanted."""
         self.attempts = 0
-        """Initiations since new keys were wanted."""
+        """Initiations since new keys were wanted; 0: the next one is repeated after the shortest wait."""
         self.settings = settings
         self._identity = identity
         self._indices = indices
@@ -191,10 +191,6 @@ class Initiator:
         """A relay shows that the peer is there: try soon, but not faster than the first retry. It may be a lie."""
         self.retry_at = min(self.retry_at, max(now, self.initiated_at + self.settings.link.timers.retry_min_s))
 
-    def reset(self) -> None:
-        """No new keys are wanted now: the next initiation is repeated after the shortest wait."""
-        self.attempts = 0
-
     def cancel(self) -> None:
         """Accept no response to what was sent so far."""
         for index in list(self.pending):
@@ -211,4 +207,4 @@ class Initiator:
 
     def _forget(self, index: int) -> None:
         del self.pending[index]
-        self._indices.forget(index)
+        self._indices.owners.pop(index, None)

@@ -96,7 +96,7 @@ class Node:
         shared = Shared(self._indices, self._entropy, self._screen, self._last_seen, self.facts)
         peer = Peer(settings, own.identity, shared, now)
         self.peers[settings.name] = handshakes.peers[keys] = peer
-        self.facts.share_budgets(len(self.peers))
+        self.facts.peers = len(self.peers)
         self._handshakes.admission.set_peers(len(self.peers))
         return peer
 
@@ -107,7 +107,7 @@ class Node:
     def remove_peer(self, peer: Peer, now: float) -> list[Output]:
         """Cut this peer off at once: its keys are forgotten, and nothing from it is accepted any more."""
         del self.peers[peer.name]
-        self.facts.share_budgets(len(self.peers))
+        self.facts.peers = len(self.peers)
         self._handshakes.admission.set_peers(len(self.peers))
         self._handshakes.forget(peer)
         self._forget_addresses(peer)

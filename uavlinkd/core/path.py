@@ -83,13 +83,14 @@ FREE = Pace()
 class SocketFacts:
     """The facts about each socket. ``metered``: those whose network is paid by the byte."""
 
-    __slots__ = ("_budgets", "_peers", "_rates", "envelope_limits", "metered", "peers_at")
+    __slots__ = ("_budgets", "_rates", "envelope_limits", "metered", "peers", "peers_at")
 
     def __init__(self, metered: Iterable[int] = ()) -> None:
         self.metered = set(metered)
         self._budgets: dict[int, float] = {}
         self._rates: dict[int, float] = {}
-        self._peers = 0
+        self.peers = 0
+        """So many use each network."""
         self.envelope_limits: dict[int, int] = {}
         """The longest envelopes that several frames share, in bytes: :func:`.path_measures.limit_at`."""
         self.peers_at: dict[int, frozenset[Hashable]] = {}
@@ -105,10 +106,6 @@ class SocketFacts:
     def set_rates(self, rates: Mapping[int, float]) -> None:
         """In bits a second, of networks with a budget that carry less at present."""
         self._rates = {**self._budgets, **rates}
-
-    def share_budgets(self, peers: int) -> None:
-        """So many peers use each network."""
-        self._peers = peers
 
     def least_probe_s(self, path: Path) -> float:
         """Between questions along a path: every peer may be probed, and sends as many probes as it gets."""
@@ -141,7 +138,7 @@ class SocketFacts:
         return 0.0 if rate is None else 8 * (size + carriers) / rate
 
     def _share_s(self, path: Path, size: int, share: float, rates: Mapping[int, float]) -> float:
-        peers = 1 if path.socket in self.peers_at else self._peers
+        peers = 1 if path.socket in self.peers_at else self.peers
         return peers * self._airtime_s(path, size, rates) / share
 
     # Point-to-point networks.

@@ -25,7 +25,8 @@ class PathSlots:
         self.best: PathState | None = None
         """Where frames go; a path that failed stays the best while there is no other."""
         self._reported: set[PathState] = set()  # those that were reported as usable
-        self._unanswered = 0
+        self.unproven = 0
+        """Learned paths that were given up because they answered nothing; it only grows."""
         self.candidates: tuple[Path, ...] = ()
         """Paths without a slot that may be asked: the peer says that it may be there."""
         self._asked: dict[Path, PathState] = {}  # those of them that were asked, to know their answers
@@ -34,11 +35,6 @@ class PathSlots:
     def states(self) -> list[PathState]:
         """Every slot in use, the configured paths first."""
         return list(self.by_path.values())
-
-    @property
-    def has_any(self) -> bool:
-        """Whether there is somewhere to initiate to."""
-        return bool(self.by_path)
 
     @property
     def has_several(self) -> bool:
@@ -57,11 +53,6 @@ class PathSlots:
     def with_number(self, number: int) -> PathState | None:
         """The slot with this number."""
         return next((state for state in self.by_path.values() if state.number == number), None)
-
-    def take_unanswered(self) -> int:
-        """How many learned paths were given up since the last call, because they answered nothing."""
-        unanswered, self._unanswered = self._unanswered, 0
-        return unanswered
 
     def configure(self, paths: Iterable[Path], now: float) -> None:
         """The paths of the configuration, the likeliest first. One that works stays, as a learned path.
@@ -135,7 +126,7 @@ class PathSlots:
 
     def _drop(self, state: PathState) -> None:
         self._reported.discard(state)
-        self._unanswered += not (state.is_validated or state.is_configured)
+        self.unproven += not (state.is_validated or state.is_configured)
         if not state.is_known:
             return
         place = state.path.place

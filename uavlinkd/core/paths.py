@@ -115,8 +115,6 @@ class PathSet(PathSlots):
         """Whether one of them leads through a relay."""
         self.reports_single = False
         """Whether the condition of a path is reported even if it is the only one."""
-        self.has_standby = False
-        """Whether there is another path than the best one, whatever its condition."""
         self.is_multiple = False
         """Whether critical frames go along several paths: then an envelope holds frames of one class."""
         self.routes: dict[Class, Route] = dict.fromkeys(Class, ())
@@ -246,7 +244,6 @@ class PathSet(PathSlots):
         if self.best is not None and before is not None and self.best is not before:
             changes.insert(0, PathChanged(peer, self.best.path, before.path, reason or "session"))
         self._set_routes(now)
-        self.has_standby = self.has_several
         self.schedule(now)
         return changes
 

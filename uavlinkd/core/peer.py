@@ -49,8 +49,6 @@ class Traffic:
     """Envelopes of sessions that have ended, sent by the peer and never accepted here."""
     out_of_order: int = 0
     """Envelopes accepted after one that was sent later."""
-    paths_unproven: int = 0
-    """Addresses from which the peer's envelopes came, and from which no question was answered."""
     echoes_unanswered: int = 0
     """Own echo requests without an answer in time."""
     handshakes_unanswered: int = 0
@@ -233,7 +231,7 @@ class Peer:
 
     def keys_wanted_at(self) -> float:
         """When new keys are wanted: at once without a session; else by count, by age, or by silence."""
-        if not self.paths.has_any or not self.settings.initiates:
+        if not self.paths.by_path or not self.settings.initiates:
             return NEVER
         session = self.sessions.current
         if session is None or session.send_counter >= c.REKEY_AFTER_ENVELOPES or session.created_at < self.offered_at:

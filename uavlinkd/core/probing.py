@@ -13,12 +13,12 @@ from uavlinkd.core.probe import ANSWER_BYTES, QUESTION_BYTES, Probe
 from uavlinkd.core.send import seal
 from uavlinkd.core.session import Session
 from uavlinkd.core.sessions import Unconfirmed
+from uavlinkd.core.wire import MACS_BYTES
 
 
 def update(peer: Peer, now: float) -> list[Output]:
     """Judge the paths, and set when to do so again."""
     out: list[Output] = [*peer.paths.update(peer, now)]
-    peer.traffic.paths_unproven += peer.paths.take_unanswered()
     peer.set_paths_timer()
     follow_paths(peer, now)
     return out
@@ -53,7 +53,7 @@ def ask_everywhere(peer: Peer, session: Session, now: float, waiting: Unconfirme
         for path in waiting.paths[: c.LEARNED_PATHS]:
             if paths.find(path) is None:
                 state = learn(peer, path, now)
-                state.bytes_received, state.bytes_sent = waiting.initiation_bytes, waiting.response_bytes
+                state.bytes_received, state.bytes_sent = waiting.initiation_bytes, len(waiting.response) + MACS_BYTES
     out: list[Output] = []
     for state in paths.states:
         if state.is_configured and not paths.has_several:

@@ -170,8 +170,10 @@ class HandshakeReceiver:
         # One for each message and path: an observer can make more, but has to be faster than the peer each time.
         if asked is None or path not in asked.paths or path in asked.cookied:
             raise Drop(DropReason.UNEXPECTED_COOKIE)
-        establish.receive_cookie(peer, asked.mac1, path, reply, now)
+        peer.initiator.receive_cookie(asked.mac1, path, reply, now)
         asked.cookied.add(path)
+        peer.traffic.cookies_taken += 1
+        peer.set_initiate()
         self._schedule.update(peer)
         return []
 

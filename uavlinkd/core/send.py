@@ -32,7 +32,7 @@ def send_frames(peer: Peer, frames: Sequence[bytes], now: float, cls: Class) -> 
         peer.timers.set(Timer.PROBE, now + max(peer.durations.probe_interval_s, least_s))
     limit = session.payload_limit
     asks_at = NEVER
-    if paths.has_standby:
+    if len(paths.by_path) > 1:
         _note_activity(peer, cls, now)
     if paths.is_multiple or paths.has_relayed or paths.facts.envelope_limits:
         limit = min(limit, session.payload_limit_of(paths.longest(cls)))

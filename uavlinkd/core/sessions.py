@@ -31,6 +31,7 @@ class Indices(Generic[Owner_co]):
 
     def __init__(self, entropy: Entropy) -> None:
         self.owners: dict[int, Owner_co] = {}
+        """Without an owner, an index is free at once, unless it was retired."""
         self._entropy = entropy
         self._quarantine: dict[int, tuple[float, str]] = {}  # free again at, and whose; the oldest is first
         self._quarantined_of: dict[str, dict[int, None]] = {}  # the same by peer
@@ -56,10 +57,6 @@ class Indices(Generic[Owner_co]):
         quarantined[index] = None
         if len(quarantined) > QUARANTINED_PER_PEER:
             self._free(next(iter(quarantined)))
-
-    def forget(self, index: int) -> None:
-        """Free an index that never carried a session."""
-        self.owners.pop(index, None)
 
     def is_quarantined(self, index: int, now: float) -> bool:
         """Whether a session ended at ``index`` recently."""
@@ -98,11 +95,6 @@ class Unconfirmed:
     expires_at: float
     cookied: set[Path] = field(default_factory=set)
     """Paths along which a cookie reply to it was accepted: a second one is not."""
-
-    @property
-    def response_bytes(self) -> int:
-        """Length of the response with its macs."""
-        return len(self.response) + 2 * c.MAC_BYTES
 
 
 class Sessions:
@@ -204,7 +196,7 @@ class Sessions:
 
     def _forget(self, index: int) -> None:
         del self.unconfirmed[index]
-        self._indices.forget(index)
+        self._indices.owners.pop(index, None)
 
 
 @dataclass(slots=True)

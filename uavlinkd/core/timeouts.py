@@ -76,7 +76,7 @@ def _handle_silence(peer: Peer, now: float) -> list[Output]:
 def _initiate(peer: Peer, now: float) -> list[Output]:
     if now >= peer.keys_wanted_at():
         return initiate(peer, now)
-    peer.initiator.reset()
+    peer.initiator.attempts = 0
     peer.set_initiate()
     return []
 

@@ -32,7 +32,7 @@ class Verification:
         self.ask_at = now + interval_s
         """A frame that arrives then or later causes a request."""
         self.due_at = NEVER
-        """When to repeat a request that was not answered."""
+        """When to repeat a request that was not answered; infinity: do not, because no frames arrive."""
         self.look_at = self.ask_at
         """A frame that arrives earlier needs no look at the other moments."""
 
@@ -46,10 +46,6 @@ class Verification:
         self.ask_at = min(self.ask_at + max(0.0, interval_s - self._interval_s), now + interval_s)
         self._interval_s, self._hold_s, self._lifetime_s = interval_s, hold_s, lifetime_s
         self.look_at = min(self.ask_at, self.until)
-
-    def begin(self) -> None:
-        """Frames arrive: repeat the request that follows until it is answered."""
-        self.due_at = -NEVER
 
     def asked(self, now: float) -> None:
         """An echo request was sent on the session."""
@@ -78,10 +74,6 @@ class Verification:
     def refute(self) -> None:
         """An answer came late: nothing is verified any more."""
         self.until = self.look_at = -NEVER
-
-    def stop(self) -> None:
-        """Repeat no request: no frames arrive."""
-        self.due_at = NEVER
 
 
 def _lifetime_s(interval_s: float) -> float:

@@ -330,7 +330,7 @@ class PeerLink:
         return {
             LinkProblem.ENVELOPES_MISSING: self.peer.missing(now),
             LinkProblem.ENVELOPES_OUT_OF_ORDER: traffic.out_of_order,
-            LinkProblem.PATHS_UNPROVEN: traffic.paths_unproven,
+            LinkProblem.PATHS_UNPROVEN: self.peer.paths.unproven,
             LinkProblem.ECHOES_UNANSWERED: traffic.echoes_unanswered,
             LinkProblem.HANDSHAKES_UNANSWERED: traffic.handshakes_unanswered,
             LinkProblem.COOKIES_TAKEN: traffic.cookies_taken,

@@ -74,7 +74,7 @@ class TwoPaths:
         counts: Counter[str] = Counter()
         for drone, other in self._ends():
             counts.update(drone.peer(other).traffic.drops)
-            counts["paths_unproven"] += drone.peer(other).traffic.paths_unproven
+            counts["paths_unproven"] += drone.peer(other).paths.unproven
         return counts
 
     @property
