@@ -111,32 +111,27 @@ class HandshakeState:
         Raises:
             Drop: ``INVALID_KEY_SHARE`` if the other side's share is invalid.
         """
-        state, parts = self, []
+        state, message = self, b""
         for step in tokens_of(self.suite)[not self.is_initiator]:
-            symmetric = state.symmetric
+            part = b""
             if step == "e":  # mixed into the key too: the pattern has a PSK (Noise, section 9.2)
                 e = KeyPair(entropy(KEY_BYTES))
-                parts.append(e.public)
-                state = replace(state, e=e, symmetric=symmetric.mix_hash(e.public).mix_key(e.public))
+                part = e.public
+                state = replace(state, e=e, symmetric=state.symmetric.mix_hash(part).mix_key(part))
             elif step == "s":
-                symmetric, sealed = symmetric.encrypt_and_hash(state.s.public)
-                parts.append(sealed)
-                state = replace(state, symmetric=symmetric)
+                state, part = state._seal(state.s.public)
             elif step == "e1":
                 e1 = kem_of(state.suite).generate(entropy)
-                symmetric, sealed = symmetric.encrypt_and_hash(e1.share)
-                parts.append(sealed)
-                state = replace(state, e1=e1, symmetric=symmetric)
+                state, part = replace(state, e1=e1)._seal(e1.share)
             elif step == "ekem1":
                 ciphertext, secret = kem_of(state.suite).encapsulate(state.re1, entropy)
-                symmetric, sealed = symmetric.encrypt_and_hash(ciphertext)
-                parts.append(sealed)
-                state = replace(state, symmetric=symmetric.mix_key(secret))
+                state, part = state._seal(ciphertext)
+                state = state._mix_key(secret)
             else:
                 state = state._mix(step)
-        symmetric, sealed = state.symmetric.encrypt_and_hash(payload)
-        parts.append(sealed)
-        return replace(state, symmetric=symmetric), b"".join(parts)
+            message += part
+        state, part = state._seal(payload)
+        return state, message + part
 
     def read(self, message: bytes) -> tuple[HandshakeState, bytes]:
         """ReadMessage: the next state and the payload. A message that is too short fails as any forged one.
@@ -146,27 +141,36 @@ class HandshakeState:
         """
         state, rest = self, message
         for step in tokens_of(self.suite)[self.is_initiator]:
-            symmetric = state.symmetric
             if step == "e":
-                re, rest = _cut(rest, KEY_BYTES)
-                state = replace(state, re=re, symmetric=symmetric.mix_hash(re).mix_key(re))
+                re, rest = rest[:KEY_BYTES], rest[KEY_BYTES:]
+                state = replace(state, re=re, symmetric=state.symmetric.mix_hash(re).mix_key(re))
             elif step == "s":
-                sealed, rest = _cut(rest, KEY_BYTES + AEAD_TAG_BYTES)
-                symmetric, rs = symmetric.decrypt_and_hash(sealed)
-                state = replace(state, rs=rs, symmetric=symmetric)
+                state, rs, rest = state._open(rest, KEY_BYTES)
+                state = replace(state, rs=rs)
             elif step == "e1":
-                sealed, rest = _cut(rest, state.suite.share_bytes + AEAD_TAG_BYTES)
-                symmetric, re1 = symmetric.decrypt_and_hash(sealed)
-                state = replace(state, re1=re1, symmetric=symmetric)
+                state, re1, rest = state._open(rest, state.suite.share_bytes)
+                state = replace(state, re1=re1)
             elif step == "ekem1":
-                sealed, rest = _cut(rest, state.suite.ciphertext_bytes + AEAD_TAG_BYTES)
-                symmetric, ciphertext = symmetric.decrypt_and_hash(sealed)
+                state, ciphertext, rest = state._open(rest, state.suite.ciphertext_bytes)
                 assert state.e1 is not None
-                state = replace(state, symmetric=symmetric.mix_key(state.e1.decapsulate(ciphertext)))
+                state = state._mix_key(state.e1.decapsulate(ciphertext))
             else:
                 state = state._mix(step)
-        symmetric, payload = state.symmetric.decrypt_and_hash(rest)
-        return replace(state, symmetric=symmetric), payload
+        state, payload, _ = state._open(rest, len(rest))
+        return state, payload
+
+    def _seal(self, plaintext: bytes) -> tuple[HandshakeState, bytes]:
+        symmetric, sealed = self.symmetric.encrypt_and_hash(plaintext)
+        return replace(self, symmetric=symmetric), sealed
+
+    def _open(self, data: bytes, size: int) -> tuple[HandshakeState, bytes, bytes]:
+        """The next state, ``size`` bytes or fewer that were sealed in the data, and the data behind them."""
+        sealed, rest = data[: size + AEAD_TAG_BYTES], data[size + AEAD_TAG_BYTES :]
+        symmetric, plaintext = self.symmetric.decrypt_and_hash(sealed)
+        return replace(self, symmetric=symmetric), plaintext, rest
+
+    def _mix_key(self, secret: bytes) -> HandshakeState:
+        return replace(self, symmetric=self.symmetric.mix_key(secret))
 
     def _mix(self, step: str) -> HandshakeState:
         """The tokens that send nothing: the key exchanges and the PSK."""
@@ -177,11 +181,7 @@ class HandshakeState:
         private = self.s if ours == "s" else self.e
         public = self.rs if theirs == "s" else self.re
         assert private is not None
-        return replace(self, symmetric=self.symmetric.mix_key(private.exchange(public)))
-
-
-def _cut(data: bytes, length: int) -> tuple[bytes, bytes]:
-    return data[:length], data[length:]
+        return self._mix_key(private.exchange(public))
 
 
 def initiator(suite: Suite, prologue: bytes, s: KeyPair, rs: bytes, psk: Secret = NO_PSK) -> HandshakeState:

@@ -137,15 +137,6 @@ class FreshnessVerified(NamedTuple):
     unverified_s: float
 
 
-Event = (
-    PeerUp
-    | PeerLost
-    | PeerClosed
-    | SessionEstablished
-    | PathChanged
-    | PathStateChanged
-    | PathSuspected
-    | FreshnessUnverified
-    | FreshnessVerified
-)
+PathEvent = PathChanged | PathStateChanged | PathSuspected
+Event = PeerUp | PeerLost | PeerClosed | SessionEstablished | PathEvent | FreshnessUnverified | FreshnessVerified
 Output = Transmit | Deliver | RecordReceived | Dropped | Event

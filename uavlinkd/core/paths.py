@@ -10,7 +10,7 @@ from collections.abc import Iterable
 
 from uavlinkd.core import constants as c
 from uavlinkd.core.constants import NEVER
-from uavlinkd.core.outputs import Event, LinkedPeer, PathChanged, PathStateChanged, PathSuspected
+from uavlinkd.core.outputs import LinkedPeer, PathChanged, PathEvent, PathStateChanged, PathSuspected
 from uavlinkd.core.path import FREE, Pace, Path, SocketAddress, SocketFacts
 from uavlinkd.core.path_measures import Repeats
 from uavlinkd.core.path_slots import PathSlots
@@ -215,10 +215,10 @@ class PathSet(PathSlots):
         self._note_known(state)
         return state
 
-    def update(self, peer: LinkedPeer, now: float) -> list[Event]:
+    def update(self, peer: LinkedPeer, now: float) -> list[PathEvent]:
         """Judge every path, elect the best one, and set the routes and the next deadline. Returns what changed."""
         self.revised_at = NEVER
-        changes: list[Event] = []
+        changes: list[PathEvent] = []
         for state in self.states:
             was_usable = state.condition is PathCondition.USABLE
             state.check(now)
