@@ -149,9 +149,8 @@ class Course:
                 state.sent += 10
                 self._received[path] += 5 if self.loses and self.fast is state is self.paths.best else 10
                 state.make_probe(round(self.now * 100), 0, self.now - round_trip_s)
-                is_first = not state.is_validated
                 assert state.receive_answer(round(self.now * 100), self._received[path] + 1, self.now) is not None
-                self.paths.note_answer(state, self.now, is_first=is_first)
+                self.paths.note_answer(state, self.now)
             for change in of(self.paths.update(Named("bravo"), self.now), PathChanged):
                 self.changes.append((self.now, change.path, change.reason))
 

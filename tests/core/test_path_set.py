@@ -45,9 +45,8 @@ def answer(paths: PathSet, path: Path, now: float, round_trip_s: float = 0.1) ->
     state = of(paths, path)
     question = round(now * 1000) + 1
     state.make_probe(question, 0, now - round_trip_s)
-    is_first = not state.is_validated
     assert state.receive_answer(question, state.sent, now) is not None
-    paths.note_answer(state, now, is_first=is_first)
+    paths.note_answer(state, now)
     return paths.update(PEER, now)
 
 

@@ -44,14 +44,9 @@ class MacKeys:
             return message + _NO_COOKIE
         return message + hmac_sha256(cookie, message)[: c.MAC_BYTES]
 
-    def check_mac1(self, datagram: bytes) -> None:
-        """Raise unless the sender knew our public key and nothing was altered since.
-
-        Raises:
-            Drop: ``BAD_MAC1``.
-        """
-        if not fits_mac1(self._mac1, datagram):
-            raise Drop(DropReason.BAD_MAC1)
+    def has_valid_mac1(self, datagram: bytes) -> bool:
+        """Whether the sender knew our public key, and nothing was altered since."""
+        return fits_mac1(self._mac1, datagram)
 
     def seal_cookie(self, cookie: bytes, nonce: bytes, mac1: bytes) -> bytes:
         """The cookie for the sender of the message that carried ``mac1``."""

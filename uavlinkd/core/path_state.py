@@ -256,9 +256,8 @@ class PathState:
         # Earlier questions say no more than this one: only the later ones count as unanswered.
         later = [other.sent_at for other in self._waiting.values() if other.sent_at > asked.sent_at and other.sent]
         self._unanswered, self._unanswered_since = len(later), min(later, default=NEVER)
-        self.answered_at = now
+        self._note_answered(now)
         self.answers += 1
-        self.is_proven = True
         round_trip_s = now - asked.sent_at
         if self.answers <= c.SETTLING_ANSWERS and self.srtt_s is not None and round_trip_s < self.srtt_s / 2:
             # A radio that slept answered the waiting questions late. That must not decide an election for long.
@@ -270,9 +269,13 @@ class PathState:
 
     def note_echo(self, round_trip_s: float, now: float) -> None:
         """An echo request along the only path was answered."""
-        self.answered_at = now
-        self.is_proven = True
+        self._note_answered(now)
         self._add_round_trip(round_trip_s)
+
+    def _note_answered(self, now: float) -> None:
+        if not self.is_validated:
+            self.envelope_limit.begin(now)
+        self.answered_at, self.is_proven = now, True
 
     def _add_round_trip(self, round_trip_s: float) -> None:
         self.round_trip_s = round_trip_s

@@ -180,20 +180,17 @@ class PathSet(PathSlots):
 
     # Answers.
 
-    def note_answer(self, state: PathState, now: float, *, is_first: bool) -> None:
-        """A question along this path was answered. ``is_first``: none was before, so it is validated now."""
-        if is_first:
-            self._note_known(state)
-            state.envelope_limit.begin(now)
+    def note_answer(self, state: PathState, now: float) -> None:
+        """A question along this path was answered."""
+        self._note_known(state)
         is_only = not any(other.works for other in self.by_path.values() if other is not state)
         state.note_answer(now, is_only=is_only)
 
     def note_echo(self, round_trip_s: float, now: float) -> None:
         """An echo request was answered. If there is one path, the request was a question along it."""
         if self.best is not None and len(self.by_path) == 1:
-            is_first = not self.best.is_validated
             self.best.note_echo(round_trip_s, now)
-            self.note_answer(self.best, now, is_first=is_first)
+            self.note_answer(self.best, now)
             if self.reports_single and self.best not in self._reported:
                 self.revise(now)
 

@@ -118,12 +118,11 @@ def receive_probe(
         lost, age_s = state.receive_report(probe, now), now - session.created_at
         peer.losses.note_report(lost, now, age_s, asks=probe.question != 0)
     if probe.answer:
-        is_first = not state.is_validated
         round_trip_s = state.receive_answer(probe.answer, probe.received if counts else None, now)
         if round_trip_s is not None:
             if peer.round_trip_s is None or not peer.paths.has_several:
                 peer.round_trip_s = round_trip_s
-            peer.paths.note_answer(state, now, is_first=is_first)
+            peer.paths.note_answer(state, now)
         elif not is_copy:
             out.append(peer.drop_datagram(DropReason.UNEXPECTED_ANSWER, state.path))
     if probe.question and not (is_copy and probe.question == state.copied_question):

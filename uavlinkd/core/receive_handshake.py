@@ -101,15 +101,15 @@ class HandshakeReceiver:
     def _receive_initiation(self, datagram: bytes, path: Path, now: float) -> list[Output]:
         initiation = wire.parse_initiation(datagram)
         self.admission.read(path, now)
-        identity, cookies = self._addressed(datagram)
+        own = self._addressed(datagram)
         sender = self.remembered.get(initiation.ephemeral)
         if sender is not None:  # before the budget: one recording must not use it up
             self._facts.check_network(sender, path)
             return self._answer_copy(sender, datagram, path, now)
-        message = Message(datagram, initiation.sender_index, path, cookies)
+        message = Message(datagram, initiation.sender_index, path, own.cookies)
         self.admission.admit(message, now, is_response=False)
-        received = handshake.receive_initiation(identity, initiation)
-        peer = self.peers.get((identity.public, received.public_key))
+        received = handshake.receive_initiation(own.identity, initiation)
+        peer = self.peers.get((own.identity.public, received.public_key))
         if peer is None:
             raise Drop(DropReason.UNKNOWN_PEER, received.public_key)
         # Before it is remembered: otherwise a line could use up what this peer sends along its own network.
@@ -154,8 +154,7 @@ class HandshakeReceiver:
             is_copy = isinstance(pending, Session) and pending.remote_index == response.sender_index
             raise Drop(DropReason.DUPLICATE if is_copy else DropReason.UNEXPECTED_RESPONSE)
         self._facts.check_network(peer, path)
-        _, cookies = self._addressed(datagram)
-        message = Message(datagram, response.sender_index, path, cookies)
+        message = Message(datagram, response.sender_index, path, self._addressed(datagram).cookies)
         self.admission.admit(message, now, is_response=True)
         out = establish.receive_response(peer, pending, response, path, now)
         self._schedule.update(peer)
@@ -177,20 +176,16 @@ class HandshakeReceiver:
         self._schedule.update(peer)
         return []
 
-    def _addressed(self, datagram: bytes) -> tuple[KeyPair, CookieJar]:
+    def _addressed(self, datagram: bytes) -> OwnKeys:
         """Which of our keys a handshake message is for.
 
         Raises:
             Drop: ``BAD_MAC1`` if it is for none of them.
         """
-        try:
-            self.own.mac_keys.check_mac1(datagram)
-        except Drop:
-            if self.previous is None:
-                raise
-            self.previous.mac_keys.check_mac1(datagram)
-            return self.previous.identity, self.previous.cookies
-        return self.own.identity, self.own.cookies
+        for own in (self.own, self.previous):
+            if own is not None and own.mac_keys.has_valid_mac1(datagram):
+                return own
+        raise Drop(DropReason.BAD_MAC1)
 
     def _name_version(self, reason: DropReason, datagram: bytes, path: Path, now: float) -> None:
         """Another version may have other lengths (malformed), and has another label of mac1.
