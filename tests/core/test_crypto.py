@@ -115,8 +115,6 @@ def test_secrets_and_keys_do_not_show() -> None:
     assert secret.reveal() == value
     assert secret == Secret(value)
     assert secret not in (Secret(b"b"), value)
-    for key in (KeyPair(bytes(range(32))), MacKey(bytes(range(32))), AeadKey(bytes(range(32)))):
-        assert repr(key) == f"{type(key).__name__}(<redacted>)"
 
 
 def test_ffdhe_power_is_modular_exponentiation() -> None:

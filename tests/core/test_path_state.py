@@ -58,7 +58,6 @@ def down(at: float = 10.0) -> PathState:
 def test_new_path_is_unproven_until_its_own_question_is_answered() -> None:
     """Without an answer it gets no worse: nothing was lost that worked. An invented answer changes nothing."""
     state = fresh()
-    assert repr(state) == f"PathState({AT_A}, unproven)"
     question = ask(state, 0.0)
     ask(state, 0.5)
     state.check(60.0)

@@ -81,9 +81,6 @@ class MacKey:
         self.prepared = HMAC(key, SHA256())
         """Make a tag with a copy of it. The path of a frame does so without a call of :meth:`tag`."""
 
-    def __repr__(self) -> str:
-        return "MacKey(<redacted>)"
-
     def tag(self, data: Bytes) -> bytes:
         """The 32-byte tag over ``data``."""
         mac = self.prepared.copy()
@@ -98,9 +95,6 @@ class AeadKey:
 
     def __init__(self, key: bytes) -> None:
         self._cipher = ChaCha20Poly1305(key)
-
-    def __repr__(self) -> str:
-        return "AeadKey(<redacted>)"
 
     def seal(self, counter: int, plaintext: Bytes, associated: bytes) -> bytes:
         """Ciphertext and 16-byte tag. The nonce is 4 zero bytes and the counter, little-endian, as Noise's."""
@@ -129,9 +123,6 @@ class KeyPair:
         self._private = X25519PrivateKey.from_private_bytes(private)
         self.public = self._private.public_key().public_bytes_raw()
         """The public key, 32 bytes."""
-
-    def __repr__(self) -> str:
-        return "KeyPair(<redacted>)"
 
     def exchange(self, public: bytes) -> bytes:
         """The shared secret with the holder of ``public``.

@@ -39,7 +39,7 @@ class Question(NamedTuple):
     repeats: Repeats = NO_REPEATS
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(slots=True, eq=False, repr=False)
 class PathState:
     """A slot of a :class:`uavlinkd.core.paths.PathSet`. It is compared by identity."""
 
@@ -110,9 +110,6 @@ class PathState:
     def __post_init__(self, now: float) -> None:
         self.is_proven = self.is_configured
         self.since = self.question_at = now
-
-    def __repr__(self) -> str:
-        return f"PathState({self.path}, {self.condition})"
 
     # Facts.
 

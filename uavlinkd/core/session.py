@@ -90,9 +90,6 @@ class Session:
         self.payload_limit = self.payload_limit_of(keys.parameters.max_envelope)
         """Longest payload that fits into an envelope to the peer."""
 
-    def __repr__(self) -> str:
-        return f"Session(generation={self.parameters.generation}, local_index={self.local_index})"
-
     def envelope_bytes(self, payload_bytes: int) -> int:
         """Length of the next envelope around a payload of this length."""
         header = wire.SHORT_HEADER_BYTES if self.send_counter < c.SHORT_COUNTER_LIMIT else wire.LONG_HEADER_BYTES
