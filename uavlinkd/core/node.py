@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Hashable, Iterable, Mapping, Sequence
+from dataclasses import replace
 
 from uavlinkd.core import constants as c
 from uavlinkd.core import establish, probing, wire
@@ -129,9 +130,16 @@ class Node:
         self._revise_paths(peer, now)
 
     def offer(self, peer: Peer, features: int, now: float) -> None:
-        """Offer other features to a peer from now on. Its session stays until there are new keys."""
+        """Offer other features to a peer from now on. Its session stays until there are new keys.
+
+        A response to an earlier initiation would make a session with the features before.
+        """
         if features != peer.settings.link.features:
-            peer.offer(features, now)
+            peer.settings = replace(peer.settings, link=replace(peer.settings.link, features=features))
+            peer.initiator.settings = peer.settings
+            peer.initiator.cancel()
+            peer.paths.reports_single = bool(features & c.FEATURE_RECORDS)
+            peer.offered_at = now
             self._revise_paths(peer, now)
 
     def set_metered(self, sockets: Iterable[int], now: float) -> None:

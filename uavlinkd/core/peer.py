@@ -7,7 +7,7 @@ Functions change it, in modules by topic: :mod:`.send`, :mod:`.receive`, :mod:`.
 from __future__ import annotations
 
 from collections import Counter, deque
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from uavlinkd.core import constants as c
@@ -147,17 +147,6 @@ class Peer:
         """The current session, if it can still seal."""
         session = self.sessions.current
         return None if session is None or session.send_counter >= c.SESSION_ENVELOPE_LIMIT else session
-
-    def offer(self, features: int, now: float) -> None:
-        """Offer other features. A session keeps those that it began with, so new keys are wanted.
-
-        A response to an earlier initiation would make a session with the features before.
-        """
-        self.settings = replace(self.settings, link=replace(self.settings.link, features=features))
-        self.initiator.settings = self.settings
-        self.initiator.cancel()
-        self.paths.reports_single = bool(features & c.FEATURE_RECORDS)
-        self.offered_at = now
 
     def session_with(self, feature: int, now: float) -> Session | None:
         """The current session, if both ends have this feature and the keys may still seal."""

@@ -117,10 +117,7 @@ def _receive_copy(
 ) -> list[Output]:
     """Count an authentic envelope that was accepted before. Of a recent one, learn how much later its path is.
 
-    A recent probe still asks and answers along this path: see :func:`probing.receive_probe`.
-
-    Raises:
-        Drop: ``REPLAYED``.
+    A recent probe still asks and answers along this path: see :func:`probing.receive_probe`. Raises ``REPLAYED``.
     """
     out: list[Output] = []
     _, counter, header_bytes = header

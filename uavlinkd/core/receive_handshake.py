@@ -125,11 +125,7 @@ class HandshakeReceiver:
         return out
 
     def _answer_copy(self, peer: Peer, datagram: bytes, path: Path, now: float) -> list[Output]:
-        """An initiation of this peer that was read before: it sends one along several paths.
-
-        Raises:
-            Drop: ``REPLAYED_INITIATION``, or ``DUPLICATE`` if the response went along this path already.
-        """
+        """An initiation of this peer that was read before: it sends one along several paths."""
         mac1 = mac1_of(datagram)
         for waiting in peer.sessions.unconfirmed.values():
             if equal(waiting.initiation_mac1, mac1):
@@ -177,22 +173,14 @@ class HandshakeReceiver:
         return []
 
     def _addressed(self, datagram: bytes) -> OwnKeys:
-        """Which of our keys a handshake message is for.
-
-        Raises:
-            Drop: ``BAD_MAC1`` if it is for none of them.
-        """
+        """Which of our keys a handshake message is for. Raises ``BAD_MAC1`` if it is for none of them."""
         for own in (self.own, self.previous):
             if own is not None and own.mac_keys.has_valid_mac1(datagram):
                 return own
         raise Drop(DropReason.BAD_MAC1)
 
     def _name_version(self, reason: DropReason, datagram: bytes, path: Path, now: float) -> None:
-        """Another version may have other lengths (malformed), and has another label of mac1.
-
-        Raises:
-            Drop: ``OTHER_VERSION``.
-        """
+        """Raise ``OTHER_VERSION`` if it is one: it may have other lengths, and has another label of mac1."""
         if reason not in _NOT_OUR_VERSION or not self.admission.may_compare_versions(path, now):
             return
         if (version := version_of(datagram, self.public_keys)) is not None:

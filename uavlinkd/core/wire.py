@@ -201,11 +201,7 @@ class CookieReply(NamedTuple):
 def _cut(
     datagram: bytes, header: struct.Struct, size: Callable[[Suite], int]
 ) -> tuple[Suite, list[int], bytes, bytes]:
-    """Suite, indices, header and Noise message of a handshake message, whose ``size`` its suite gives.
-
-    Raises:
-        Drop: ``MALFORMED``.
-    """
+    """Suite, indices, header and Noise message of a handshake message, whose ``size`` its suite gives."""
     suite = SUITES.get(datagram[1]) if len(datagram) > header.size else None
     if suite is None or len(datagram) != size(suite):
         raise Drop(DropReason.MALFORMED)
