@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from uavlinkd.core import constants as c
 from uavlinkd.core import wire
-from uavlinkd.core.constants import NEVER
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.outputs import Deliver, FreshnessUnverified, FreshnessVerified, Output
 from uavlinkd.core.peer import Peer
@@ -21,7 +20,7 @@ def deliver(peer: Peer, session: Session, counter: int, payload: bytes, now: flo
     out: list[Output] = []
     verification = session.verification
     if now >= verification.ask_at and peer.sessions.is_in_use(session):
-        verification.due_at = -NEVER  # repeat the request until it is answered
+        verification.due_at = -c.NEVER  # repeat the request until it is answered
         out += ask_for_echo(peer, session, now, peer.paths.echo_route)
     if now <= verification.until:
         return [*out, Deliver(peer, payload, session.order_of(counter))]
@@ -105,7 +104,7 @@ def handle_timeout(peer: Peer, now: float) -> list[Output]:
                 out += ask_for_echo(peer, session, now)
         if now >= verification.due_at:
             if now > session.trusted_until:  # no frames arrive: the next one is asked about
-                verification.due_at = NEVER
+                verification.due_at = c.NEVER
             else:
                 out += ask_for_echo(peer, session, now)
     peer.set_freshness()
@@ -118,14 +117,14 @@ def end(peer: Peer, sessions: list[Session]) -> list[Output]:
     for session in sessions:
         out += _drop_held(peer, session)
         peer.echo_requests.forget(session)
-        peer.traffic.missing += session.missing(NEVER)
+        peer.traffic.missing += session.missing(c.NEVER)
     return out
 
 
 def _refute(peer: Peer) -> None:
     """An answer came late: so slow a path, or an attacker that stretches time. Nothing is known to be new."""
     for session in peer.sessions.confirmed:
-        session.trusted_until = -NEVER
+        session.trusted_until = -c.NEVER
         session.verification.refute()
 
 

@@ -6,7 +6,6 @@ from collections import deque
 from typing import NamedTuple
 
 from uavlinkd.core import constants as c
-from uavlinkd.core.constants import NEVER
 
 Repeats = tuple[int, ...]
 """How many second transmissions there were along a path, how many third ones, and so on."""
@@ -121,10 +120,10 @@ class EnvelopeLimit:
     def __init__(self) -> None:
         self.limit = c.MAX_ENVELOPE_LIMIT
         """Bytes. Longer envelopes are not sent along the path."""
-        self.next_at = NEVER
+        self.next_at = c.NEVER
         """When the next test is due; infinity without one."""
         self._asked = 0  # the question of the last test; 0 without one
-        self._asked_at = NEVER
+        self._asked_at = c.NEVER
         self._tries = 0
 
     def begin(self, now: float) -> None:
@@ -146,8 +145,8 @@ class EnvelopeLimit:
                 shorter = (size for size in c.SMALLER_LIMITS if size < min(self.limit, longest))
                 self.limit, self._tries = next(shorter, c.SMALLER_LIMITS[-1]), 0
         size = min(self.limit, longest)
-        self.next_at = NEVER if size <= c.SMALLER_LIMITS[-1] else now + c.LIMIT_TEST_S
-        return 0 if self.next_at == NEVER else size
+        self.next_at = c.NEVER if size <= c.SMALLER_LIMITS[-1] else now + c.LIMIT_TEST_S
+        return 0 if self.next_at == c.NEVER else size
 
     def asked(self, question: int, now: float) -> None:
         """The test was sent with this question."""
@@ -156,7 +155,7 @@ class EnvelopeLimit:
     def receive_answer(self, answer: int) -> None:
         """A question was answered. If it was the test, the path carries the limit."""
         if answer == self._asked:
-            self._asked, self.next_at = 0, NEVER
+            self._asked, self.next_at = 0, c.NEVER
 
 
 WAITS_S = 20.0
@@ -181,7 +180,7 @@ class MissingEnvelopes:
     def __init__(self) -> None:
         self.total = 0
         self._seen = 0
-        self._until = -NEVER  # gaps wait for reports until then
+        self._until = -c.NEVER  # gaps wait for reports until then
         self._gaps: _Counts = deque()
         self._lost: _Counts = deque()
 

@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 from uavlinkd.core import constants as c
 from uavlinkd.core import probe
-from uavlinkd.core.constants import NEVER
 from uavlinkd.core.path import Path
 from uavlinkd.core.path_measures import NO_REPEATS, EnvelopeLimit, PathLoss, Repeats
 from uavlinkd.core.probe import Probe
@@ -72,12 +71,12 @@ class PathState:
     bytes_received: int = 0
     duplicates: int = 0
     """Received copies of envelopes that had arrived already."""
-    echo_at: list[float] = field(default_factory=lambda: [-NEVER, -NEVER])
+    echo_at: list[float] = field(default_factory=lambda: [-c.NEVER, -c.NEVER])
     """On a network with a budget: when it may carry a copy of an echo request, and of a reply."""
     held_back_s: float = 0.0
-    returns_at: float = -NEVER
+    returns_at: float = -c.NEVER
     """When it may become the best path again."""
-    received_at: float = -NEVER
+    received_at: float = -c.NEVER
     """When an envelope arrived first along this path."""
     round_trips: int = 0
     """How many were measured."""
@@ -88,18 +87,18 @@ class PathState:
     loss_by_echo: PathLoss = field(default_factory=PathLoss)
     """As the answers to echo requests say, if it is the only path."""
     envelope_limit: EnvelopeLimit = field(default_factory=EnvelopeLimit)
-    answered_at: float = -NEVER
+    answered_at: float = -c.NEVER
     answers: int = 0
     """How many of its questions were answered."""
-    questioned_at: float = -NEVER
-    question_at: float = NEVER
+    questioned_at: float = -c.NEVER
+    question_at: float = c.NEVER
     """When the next question is due."""
     copied_question: int = 0
     """The last question that was answered here although it had arrived along another path before."""
     _waiting: dict[int, Question] = field(default_factory=dict)  # the oldest first
-    _unanswered_since: float = NEVER
+    _unanswered_since: float = c.NEVER
     _unanswered: int = 0  # questions since the last answer
-    _recovering_since: float = NEVER
+    _recovering_since: float = c.NEVER
     _recovering_answers: int = 0
     _loss_in: PathLoss = field(default_factory=PathLoss)
     _loss_out: PathLoss = field(default_factory=PathLoss)
@@ -116,7 +115,7 @@ class PathState:
     @property
     def is_validated(self) -> bool:
         """Whether a question along it was ever answered."""
-        return self.answered_at != -NEVER
+        return self.answered_at != -c.NEVER
 
     @property
     def works(self) -> bool:
@@ -126,7 +125,7 @@ class PathState:
     @property
     def is_recovering(self) -> bool:
         """Whether a path that was down answers again."""
-        return self._recovering_since != NEVER
+        return self._recovering_since != c.NEVER
 
     @property
     def loss_in(self) -> float:
@@ -185,7 +184,7 @@ class PathState:
         """Another session carries the traffic: its datagrams are counted from zero."""
         self.sent = self.received = self._reported_lost = 0
         self.repeats = NO_REPEATS
-        self.questioned_at = -NEVER  # the peer knows no counts of this session yet
+        self.questioned_at = -c.NEVER  # the peer knows no counts of this session yet
         self._loss_in, self._loss_out, self.loss_by_echo = PathLoss(), PathLoss(), PathLoss()
         self._waiting = {token: asked._replace(sent=0) for token, asked in self._waiting.items()}
 
@@ -252,7 +251,7 @@ class PathState:
         del self._waiting[answer]
         # Earlier questions say no more than this one: only the later ones count as unanswered.
         later = [other.sent_at for other in self._waiting.values() if other.sent_at > asked.sent_at and other.sent]
-        self._unanswered, self._unanswered_since = len(later), min(later, default=NEVER)
+        self._unanswered, self._unanswered_since = len(later), min(later, default=c.NEVER)
         self._note_answered(now)
         self.answers += 1
         round_trip_s = now - asked.sent_at
@@ -299,12 +298,12 @@ class PathState:
         """Its network disappeared, or appeared or changed: then it has to prove itself at once."""
         self.is_off = is_off
         self._waiting.clear()
-        self._unanswered, self._unanswered_since = 0, NEVER
+        self._unanswered, self._unanswered_since = 0, c.NEVER
         if is_off:
             self._set(PathCondition.DOWN, "network", now)
-        self.question_at = NEVER if is_off else now
+        self.question_at = c.NEVER if is_off else now
         if not is_off:
-            self.questioned_at = -NEVER  # ask at once, however recently it was asked
+            self.questioned_at = -c.NEVER  # ask at once, however recently it was asked
         if not is_off and self.is_validated:
             self.envelope_limit.begin(now)
 
@@ -330,7 +329,7 @@ class PathState:
         """Judge what was not answered in time."""
         is_late = now >= self._unanswered_since + self.wait_s
         if is_late and self.is_recovering:
-            self._recovering_since = NEVER
+            self._recovering_since = c.NEVER
         if not self.works:
             return
         if self._unanswered >= 2 and now >= self._unanswered_since + self._down_after_s:
@@ -344,10 +343,10 @@ class PathState:
             return self._unanswered_since + self.wait_s
         if self.condition is PathCondition.SUSPECT and self._unanswered >= 2:
             return self._unanswered_since + self._down_after_s
-        return NEVER
+        return c.NEVER
 
     def _set(self, condition: PathCondition, reason: str, now: float) -> None:
-        self._recovering_since = NEVER
+        self._recovering_since = c.NEVER
         if condition is not self.condition:
             self.condition, self.since = condition, now
         self.reason = reason

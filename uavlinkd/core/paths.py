@@ -9,7 +9,6 @@ from collections import Counter, deque
 from collections.abc import Iterable
 
 from uavlinkd.core import constants as c
-from uavlinkd.core.constants import NEVER
 from uavlinkd.core.outputs import LinkedPeer, PathChanged, PathEvent, PathStateChanged, PathSuspected
 from uavlinkd.core.path import FREE, Pace, Path, SocketAddress, SocketFacts
 from uavlinkd.core.path_measures import Repeats
@@ -25,14 +24,14 @@ class Election:
 
     def __init__(self) -> None:
         self._better: PathState | None = None
-        self._better_since = NEVER
+        self._better_since = c.NEVER
         self._chosen: PathState | None = None  # the best path, and since when
-        self._chosen_at = -NEVER
+        self._chosen_at = -c.NEVER
 
     @property
     def due_at(self) -> float:
         """When a better path has proved itself; infinity without one."""
-        return NEVER if self._better is None else self._better_since + c.BETTER_FOR_S
+        return c.NEVER if self._better is None else self._better_since + c.BETTER_FOR_S
 
     def elect(self, best: PathState | None, states: Iterable[PathState], now: float) -> tuple[PathState | None, str]:
         """The best of these paths, and why it is another one than ``best``.
@@ -107,9 +106,9 @@ class PathSet(PathSlots):
         self._idle_probe_s = idle_probe_s
         self._election = Election()
         self._reported_best: PathState | None = None
-        self.revised_at = NEVER
+        self.revised_at = c.NEVER
         """Slots or networks have changed: :meth:`update` is due since then, also while the peer is not up."""
-        self.slots_at = NEVER
+        self.slots_at = c.NEVER
         """When a slot is given up: the same."""
         self.has_relayed = False
         """Whether one of them leads through a relay."""
@@ -123,13 +122,13 @@ class PathSet(PathSlots):
         """Of echo requests that are repeated if they are lost, and of their replies."""
         self.stream_route: Route = ()
         """That of stream: a frame needs no look-up."""
-        self.next_at = NEVER
+        self.next_at = c.NEVER
         """When :meth:`update` has something to do, or a question is due."""
-        self.active_at = -NEVER
+        self.active_at = -c.NEVER
         """When frames were sent last."""
-        self.searched_at = -NEVER
+        self.searched_at = -c.NEVER
         """When a candidate was asked last."""
-        self.stream_at = -NEVER
+        self.stream_at = -c.NEVER
         """When the best path carried stream last."""
         self._stream_times = deque[float](maxlen=c.STREAM_ENVELOPES)  # of envelopes, the oldest first
 
@@ -214,7 +213,7 @@ class PathSet(PathSlots):
 
     def update(self, peer: LinkedPeer, now: float) -> list[PathEvent]:
         """Judge every path, elect the best one, and set the routes and the next deadline. Returns what changed."""
-        self.revised_at = NEVER
+        self.revised_at = c.NEVER
         changes: list[PathEvent] = []
         for state in self.states:
             was_usable = state.condition is PathCondition.USABLE
@@ -247,11 +246,11 @@ class PathSet(PathSlots):
     def _gone_at(self, state: PathState) -> float:
         """When a path gives up its slot; infinity for one that is configured, works, or is the best."""
         if state.is_configured:
-            return NEVER
+            return c.NEVER
         if state.condition is PathCondition.UNPROVEN:
             return state.since + (c.FIRST_PATH_S if state is self.best else c.QUESTION_LIFETIME_S)
         if state.works or state is self.best:
-            return NEVER
+            return c.NEVER
         return max(state.since, state.answered_at) + c.FORMER_PATH_S  # at 50 % loss a path answers, but stays down
 
     def _set_routes(self, now: float) -> None:
@@ -290,7 +289,7 @@ class PathSet(PathSlots):
         direct = Counter(path.socket for path in usable if not path.is_relayed)
         carrying: dict[int, Counter[str]] = {}  # by socket, how many through each relay
         picked = [state for state in others if not state.path.is_relayed]
-        others.sort(key=lambda state: (not state.works, state.srtt_s or NEVER))
+        others.sort(key=lambda state: (not state.works, state.srtt_s or c.NEVER))
         for state in (best, *others):
             if not state.path.is_relayed:
                 continue
@@ -361,7 +360,7 @@ class PathSet(PathSlots):
         others = [other for other in self.by_path.values() if other is not state]
         is_needed = state is self.best or not any(other.works for other in others)
         if state.is_metered and not is_needed:
-            return self._idle_probe_s or NEVER
+            return self._idle_probe_s or c.NEVER
         if state.condition is PathCondition.SUSPECT or state.is_recovering:
             return c.PROBE_FAST_S
         if not state.works:
@@ -372,7 +371,7 @@ class PathSet(PathSlots):
         if not others or self.is_idle(now):
             if state is self.best and now < self.searched_at + c.CANDIDATE_ROUND_MOST_S:
                 return c.PROBE_INTERVAL_S
-            return (self._idle_probe_s if others else 0) or NEVER  # echo requests ask along a path without others
+            return (self._idle_probe_s if others else 0) or c.NEVER  # echo requests ask along a path without others
         if state.answers < c.SETTLING_ANSWERS:
             return c.PROBE_FAST_S
         if not any(other.condition is PathCondition.USABLE for other in others):
@@ -382,11 +381,11 @@ class PathSet(PathSlots):
 
     def schedule(self, now: float) -> None:
         """Set the next deadline: a question, a judgement, or a better path that has proved itself."""
-        self.slots_at = min(map(self._gone_at, self.by_path.values()), default=NEVER)
+        self.slots_at = min(map(self._gone_at, self.by_path.values()), default=c.NEVER)
         moments = [self.revised_at, self._election.due_at, self.slots_at]
         for state in self.by_path.values():
-            interval_s = NEVER if state.is_off else self.interval_s(state, now)
-            state.question_at = NEVER if interval_s == NEVER else max(now, state.questioned_at + interval_s)
+            interval_s = c.NEVER if state.is_off else self.interval_s(state, now)
+            state.question_at = c.NEVER if interval_s == c.NEVER else max(now, state.questioned_at + interval_s)
             moments += [state.question_at, state.next_check()]
             if self.has_several and state.condition is PathCondition.USABLE:
                 moments.append(state.envelope_limit.next_at)

@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 from uavlinkd.core import constants as c
 from uavlinkd.core import wire
-from uavlinkd.core.constants import NEVER
 from uavlinkd.core.crypto import Entropy, KeyPair
 from uavlinkd.core.drops import Detail, DropReason
 from uavlinkd.core.initiator import Initiator, Pending
@@ -109,7 +108,7 @@ class Peer:
         self.paths.reports_single = bool(settings.link.features & c.FEATURE_RECORDS)
         self.set_waits()
         self.is_up = False
-        self.offered_at = -NEVER
+        self.offered_at = -c.NEVER
         """When the features changed that this side offers."""
         self.established_at: float | None = None
         self.received_at: float | None = None
@@ -121,11 +120,11 @@ class Peer:
         """When an envelope was sent last."""
         self.unanswered_since: float | None = None
         """When the first envelope was sent since one was received; None if none was."""
-        self.asked_at = -NEVER
+        self.asked_at = -c.NEVER
         """When an echo request was sent last."""
-        self.echo_at = NEVER
+        self.echo_at = c.NEVER
         """Ask for an echo then, if still nothing was received."""
-        self.hinted_at = -NEVER
+        self.hinted_at = -c.NEVER
         self.own_refusals = OwnRefusals()
         self.refusal_claims = RefusalClaims()
         """What the peer says that it refuses of our frames. Nothing acts on it."""
@@ -221,10 +220,10 @@ class Peer:
     def keys_wanted_at(self) -> float:
         """When new keys are wanted: at once without a session; else by count, by age, or by silence."""
         if not self.paths.by_path or not self.settings.initiates:
-            return NEVER
+            return c.NEVER
         session = self.sessions.current
         if session is None or session.send_counter >= c.REKEY_AFTER_ENVELOPES or session.created_at < self.offered_at:
-            return -NEVER
+            return -c.NEVER
         durations = self.durations
         wanted_at = session.created_at + durations.rekey_after_s
         if not session.is_initiator:
@@ -259,4 +258,4 @@ class Peer:
     def set_freshness(self) -> None:
         """Set when a session has to ask the peer again, or to drop frames that it holds."""
         moments = (min(session.held.due_at, session.verification.due_at) for session in self.sessions.confirmed)
-        self.timers.set(Timer.FRESHNESS, min(moments, default=NEVER))
+        self.timers.set(Timer.FRESHNESS, min(moments, default=c.NEVER))

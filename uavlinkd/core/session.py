@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from uavlinkd.core import constants as c
 from uavlinkd.core import wire
-from uavlinkd.core.constants import NEVER
 from uavlinkd.core.counters import Arrivals, CounterHistory, ReplayWindow
 from uavlinkd.core.crypto import AeadKey, MacKey, equal, hkdf_expand
 from uavlinkd.core.drops import Drop, DropReason
@@ -71,7 +70,7 @@ class Session:
         self.window = ReplayWindow()
         self.trusted_until = now + c.LATE_AFTER_S
         """An envelope that arrives until then is new: the silence before it was short."""
-        self.first_received_at = NEVER
+        self.first_received_at = c.NEVER
         """When the peer's first envelope came: from then on it sends on this session, or on one of higher rank."""
         self.held = HeldFrames()
         self.unverified_report: tuple[int, RefusalReport] | None = None

@@ -14,7 +14,6 @@ from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 from uavlinkd.core import constants as c
-from uavlinkd.core.constants import INDEX_QUARANTINE_S, QUARANTINED_PER_PEER
 from uavlinkd.core.crypto import Entropy
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.path import Path
@@ -52,10 +51,10 @@ class Indices(Generic[Owner_co]):
     def retire(self, index: int, peer: str, now: float) -> None:
         """The session of ``peer`` at ``index`` has ended; what still arrives for it is late."""
         self.owners.pop(index, None)
-        self._quarantine[index] = now + INDEX_QUARANTINE_S, peer
+        self._quarantine[index] = now + c.INDEX_QUARANTINE_S, peer
         quarantined = self._quarantined_of.setdefault(peer, {})
         quarantined[index] = None
-        if len(quarantined) > QUARANTINED_PER_PEER:
+        if len(quarantined) > c.QUARANTINED_PER_PEER:
             self._free(next(iter(quarantined)))
 
     def is_quarantined(self, index: int, now: float) -> bool:

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections import deque
 
 from uavlinkd.core import constants as c
-from uavlinkd.core.constants import NEVER
 from uavlinkd.core.path import FREE
 
 
@@ -31,7 +30,7 @@ class Verification:
         """Freshness is verified until then."""
         self.ask_at = now + interval_s
         """A frame that arrives then or later causes a request."""
-        self.due_at = NEVER
+        self.due_at = c.NEVER
         """When to repeat a request that was not answered; infinity: do not, because no frames arrive."""
         self.look_at = self.ask_at
         """A frame that arrives earlier needs no look at the other moments."""
@@ -49,7 +48,7 @@ class Verification:
 
     def asked(self, now: float) -> None:
         """An echo request was sent on the session."""
-        if self.due_at == NEVER:
+        if self.due_at == c.NEVER:
             return
         self.ask_at = now + self._interval_s
         is_slow = self._interval_s > c.VERIFY_INTERVAL_S
@@ -60,7 +59,7 @@ class Verification:
     def answered(self, asked_at: float, now: float) -> None:
         """The answer came in time."""
         self._answered_at = now
-        self.due_at = NEVER
+        self.due_at = c.NEVER
         self.until = max(self.until, min(now, asked_at + self._hold_s) + self._lifetime_s)
         self.ask_at = max(self.ask_at, asked_at + self._interval_s)
         self.look_at = min(self.ask_at, self.until)
@@ -73,7 +72,7 @@ class Verification:
 
     def refute(self) -> None:
         """An answer came late: nothing is verified any more."""
-        self.until = self.look_at = -NEVER
+        self.until = self.look_at = -c.NEVER
 
 
 def _lifetime_s(interval_s: float) -> float:
@@ -90,19 +89,19 @@ class HeldFrames:
     __slots__ = ("_ask_at", "_ends_at", "_frames", "due_at", "pace", "size")
 
     def __init__(self) -> None:
-        self.due_at = NEVER
+        self.due_at = c.NEVER
         """When to ask again or to drop frames; infinity while nothing is asked."""
         self.size = 0
         """Bytes that count towards :data:`c.HELD_BYTES`."""
-        self._ask_at = NEVER
-        self._ends_at = NEVER
+        self._ask_at = c.NEVER
+        self._ends_at = c.NEVER
         self._frames: deque[tuple[float, int, bytes]] = deque()
         self.pace = FREE
         """That of the best path."""
 
     def begin(self, now: float) -> bool:
         """Begin to ask about the session; False if the daemon asks already. If True, send a request now."""
-        if self.due_at != NEVER:
+        if self.due_at != c.NEVER:
             return False
         self.due_at = now
         self._ends_at = now + self.pace.hold_s
@@ -110,7 +109,7 @@ class HeldFrames:
 
     def asked(self, now: float) -> None:
         """An echo request was sent on the session."""
-        if self.due_at != NEVER:
+        if self.due_at != c.NEVER:
             self._ask_at = now + self.pace.ask_s
             self._set_due()
 
@@ -139,20 +138,20 @@ class HeldFrames:
             self._drop_oldest()
             expired += 1
         if now >= self._ends_at:
-            self.due_at = NEVER
+            self.due_at = c.NEVER
         else:
             self._set_due()
         return expired
 
     def is_request_due(self, now: float) -> bool:
         """Whether to ask again now."""
-        return self.due_at != NEVER and now >= self._ask_at
+        return self.due_at != c.NEVER and now >= self._ask_at
 
     def release(self, fresh: int) -> tuple[list[tuple[int, bytes]], int]:
         """The peer answered: what has a counter from ``fresh`` on, as it arrived, and the count of the others."""
         new = [(counter, payload) for _, counter, payload in self._frames if counter >= fresh]
         old = len(self.pop_all()) - len(new)
-        self.due_at = NEVER
+        self.due_at = c.NEVER
         return new, old
 
     def _set_due(self) -> None:
