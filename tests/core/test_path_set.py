@@ -10,7 +10,7 @@ import pytest
 from tests.core.harness import Named
 from uavlinkd.core import constants as c
 from uavlinkd.core.constants import NEVER
-from uavlinkd.core.outputs import Event, PathChanged, PathStateChanged
+from uavlinkd.core.outputs import PathChanged, PathEvent, PathStateChanged
 from uavlinkd.core.path import Path, SocketAddress, SocketFacts
 from uavlinkd.core.path_state import PathCondition, PathState
 from uavlinkd.core.paths import PathSet
@@ -40,7 +40,7 @@ def of(paths: PathSet, path: Path) -> PathState:
     return paths.by_path[path]
 
 
-def answer(paths: PathSet, path: Path, now: float, round_trip_s: float = 0.1) -> list[Event]:
+def answer(paths: PathSet, path: Path, now: float, round_trip_s: float = 0.1) -> list[PathEvent]:
     """A question along a path is answered."""
     state = of(paths, path)
     question = round(now * 1000) + 1
@@ -50,14 +50,14 @@ def answer(paths: PathSet, path: Path, now: float, round_trip_s: float = 0.1) ->
     return paths.update(PEER, now)
 
 
-def fail(paths: PathSet, path: Path, now: float) -> list[Event]:
+def fail(paths: PathSet, path: Path, now: float) -> list[PathEvent]:
     """Two questions along a path get no answer, until then."""
     for question, before_s in ((1, 2.0), (2, 1.5)):
         of(paths, path).make_probe(question, 0, now - before_s)
     return paths.update(PEER, now)
 
 
-def suspect(paths: PathSet, path: Path, now: float) -> list[Event]:
+def suspect(paths: PathSet, path: Path, now: float) -> list[PathEvent]:
     """One question along a path gets no answer, until then."""
     of(paths, path).make_probe(3, 0, now - 0.9)
     changes = paths.update(PEER, now)

@@ -177,9 +177,8 @@ class HandshakeState:
         if step == "psk":
             return replace(self, symmetric=self.symmetric.mix_key_and_hash(self.psk.reveal()))
         # The first letter is the initiator's key, the second the responder's.
-        ours, theirs = step if self.is_initiator else step[::-1]
-        private = self.s if ours == "s" else self.e
-        public = self.rs if theirs == "s" else self.re
+        private = self.s if step[not self.is_initiator] == "s" else self.e
+        public = self.rs if step[self.is_initiator] == "s" else self.re
         assert private is not None
         return self._mix_key(private.exchange(public))
 
