@@ -29,7 +29,6 @@ from uavlinkd.core import wire
 from uavlinkd.core.cookie import MacKeys, mac1_of
 from uavlinkd.core.crypto import AeadKey, KeyPair, MacKey, Secret
 from uavlinkd.core.node import Node
-from uavlinkd.core.noise import HandshakeState
 from uavlinkd.core.path import Path
 from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.core.suites import SUITES_BY_NAME, Suite
@@ -57,7 +56,7 @@ class SeededEntropy:
         return hashlib.shake_128(self._seed + self._drawn.to_bytes(8, "big")).digest(size)
 
 
-_IMMUTABLE = (*(KeyPair, MacKey, AeadKey, Secret, MacKeys, HandshakeState), *(PeerSettings, Link, Suite))
+_IMMUTABLE = (*(KeyPair, MacKey, AeadKey, Secret, MacKeys), *(PeerSettings, Link, Suite))
 """Types that a copy shares with the original. Most contain keys of OpenSSL, which cannot be copied."""
 _NO_DATA = (type, ModuleType, FunctionType, BuiltinFunctionType, str, bytes, int, float)
 
