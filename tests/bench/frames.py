@@ -18,7 +18,7 @@ from fastcrc.crc16 import mcrf4xx
 
 from uavlinkd.lab.sim.tlog import parse_tlog
 from uavlinkd.mavlink.dialect import MESSAGES
-from uavlinkd.mavlink.policy.compilation import compile_policy
+from uavlinkd.mavlink.policy.compilation import Policy
 
 MAVLINK2: Final = 0xFD
 PROBE_EVERY: Final = 20
@@ -74,7 +74,7 @@ def load_frames(flight: Path = FLIGHT) -> FrameSet:
 
 
 def _carried(said: Iterable[bytes]) -> Iterable[bytes]:
-    gate = compile_policy({"role": "vehicle", "system_ids": [SYSTEM]}).incoming
+    gate = Policy({"role": "vehicle", "system_ids": [SYSTEM]}).incoming
     passes = {message for message in MESSAGES if gate.decide(message, is_known=True) is None} - {PING}
     return (raw for raw in said if _is_plain(raw) and message_of(raw) in passes and not _has_target(raw))
 

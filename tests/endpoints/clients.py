@@ -16,7 +16,7 @@ from uavlinkd.endpoints.ports import LocalPort
 from uavlinkd.endpoints.stream_endpoint import StreamEndpoint
 from uavlinkd.endpoints.udp import UdpServer
 from uavlinkd.mavlink.frames import Frame
-from uavlinkd.mavlink.policy.compilation import compile_policy
+from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.delivery import Source
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic as boot_time
@@ -50,7 +50,7 @@ def heartbeat() -> bytes:
 
 def source(name: str) -> Source:
     """A peer that may send everything."""
-    return Source(name, compile_policy(TRUSTED).incoming)
+    return Source(name, Policy(TRUSTED).incoming)
 
 
 PASSES = source("peer")

@@ -32,7 +32,7 @@ from uavlinkd.link.evidence import (
 )
 from uavlinkd.link.peer_link import Carriage, PeerLink
 from uavlinkd.mavlink.frames import SplitCounters, split_payload
-from uavlinkd.mavlink.policy.compilation import compile_policy
+from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.system.addresses import Address
 
 HOST = "192.0.2.2"
@@ -177,7 +177,7 @@ class Traffic:
 
     def policy(self, rules: dict[str, object]) -> None:
         """Replace it."""
-        self.link.policy = compile_policy(rules, is_local=False)
+        self.link.policy = Policy(rules, is_local=False)
 
     def blocked(self, *received: int, sent: bool = False, seconds: int = 1) -> list[tuple[str, str, str]]:
         """What is blocked after a second with frames of these systems, and further ones without."""

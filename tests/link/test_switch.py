@@ -17,7 +17,7 @@ from uavlinkd.link.drop_summary import DropSummary, ShellReason
 from uavlinkd.link.switch import Switch
 from uavlinkd.mavlink.frames import Frame, SplitCounters, split_datagram
 from uavlinkd.mavlink.headers import Header
-from uavlinkd.mavlink.policy.compilation import Policy, compile_policy
+from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.delivery import Source
 from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.mavlink.routing import Router, Unrouted
@@ -94,7 +94,7 @@ class Stage:
 
 def policy(**data: object) -> Policy:
     """As a configuration describes it; nothing: everything passes."""
-    return compile_policy(data, is_local=True)
+    return Policy(data, is_local=True)
 
 
 def attitude(number: int, system: int = 1) -> Frame:

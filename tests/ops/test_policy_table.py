@@ -7,7 +7,7 @@ import re
 import pytest
 
 from uavlinkd.mavlink import dialect
-from uavlinkd.mavlink.policy.compilation import compile_policy
+from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import Gate, Refusal
 from uavlinkd.mavlink.policy.roles import ROLES
 from uavlinkd.ops.policy_table import table_rows
@@ -56,7 +56,7 @@ def _passing(gate: Gate) -> set[str]:
 def test_table_agrees_with_the_gates(case: str) -> None:
     """Read back, it allows what the gates allow."""
     data = {"system_ids": [1], **_POLICIES[case]}
-    policy = compile_policy(data)
+    policy = Policy(data)
     rows = [row for row in table_rows(policy, data) if row.subject in dialect.GROUPS]
     assert _read({row.subject: row.incoming for row in rows}) == _passing(policy.incoming)
     assert _read({row.subject: row.outgoing for row in rows}) == _passing(policy.outgoing)

@@ -21,7 +21,7 @@ from uavlinkd.lab.sim.autopilot import HOME
 from uavlinkd.mavlink.dialect import COMMANDS, MESSAGES
 from uavlinkd.mavlink.frames import parse_frame
 from uavlinkd.mavlink.payloads import HEARTBEAT
-from uavlinkd.mavlink.policy.compilation import compile_policy
+from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.delivery import DeliveredStream, Source
 from uavlinkd.mavlink.policy.gate import REQUEST_MESSAGE, Condition, Refusal
 
@@ -77,8 +77,8 @@ class RoleFrames:
         self.policy: Mapping[str, object] = {"role": role, "system_ids": list(self.systems)}
         self.by_message: Counter[str] = Counter()
         self._rng = random.Random(seed)
-        self._gate = compile_policy(self.policy).incoming
-        self._stream = DeliveredStream(compile_policy({}, is_local=True).outgoing)
+        self._gate = Policy(self.policy).incoming
+        self._stream = DeliveredStream(Policy({}, is_local=True).outgoing)
         self._source = Source(role, self._gate)
         self._now = 0.0
         verdicts = {msgid: self._gate.decide(msgid, is_known=True) for msgid in MESSAGES}

@@ -7,7 +7,7 @@ import pytest
 from tests.sitl.roles_frames import ROLES_TESTED, RoleFrames
 from uavlinkd.mavlink.dialect import MESSAGES, name_of
 from uavlinkd.mavlink.frames import SplitCounters, parse_frame, split_datagram
-from uavlinkd.mavlink.policy.compilation import compile_policy
+from uavlinkd.mavlink.policy.compilation import Policy
 
 FRAMES = 5000
 
@@ -16,7 +16,7 @@ FRAMES = 5000
 def test_each_frame_passes_the_role(role: str) -> None:
     """A gate of its own permits every frame, in MAVLink 1 and 2, signed and unsigned."""
     frames = RoleFrames(role, seed=3)
-    gate = compile_policy(frames.policy).incoming
+    gate = Policy(frames.policy).incoming
     drawn = [frames.draw() for _ in range(FRAMES)]
     split = [frame for raw in drawn for frame in split_datagram(raw, SplitCounters())]
     assert len(split) == FRAMES
@@ -34,7 +34,7 @@ def test_every_message_and_command_is_drawn(role: str) -> None:
     """Those that the gate's table passes: it decides by message, then by command."""
     frames = RoleFrames(role, seed=4)
     split = [frame for _ in range(FRAMES) if (frame := parse_frame(frames.draw().lstrip(b"\2"))) is not None]
-    gate = compile_policy(frames.policy).incoming
+    gate = Policy(frames.policy).incoming
     for msgid in MESSAGES:
         name = name_of(msgid)
         commands = {frame.header.command for frame in split if frame.header.msgid == msgid}

@@ -14,7 +14,7 @@ from uavlinkd.core.path import RELAY_HOST, SERIAL_HOST
 from uavlinkd.core.settings import PeerSettings
 from uavlinkd.endpoints.url import EndpointUrl, SerialUrl
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
-from uavlinkd.mavlink.policy.compilation import Policy, compile_policy
+from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.relay.member_settings import MemberSettings, RelayLimits
 from uavlinkd.system.addresses import Address
 
@@ -70,7 +70,7 @@ class EndpointConfig:
 
     def make_policy(self) -> Policy:
         """A new policy: its counters at zero, its rates unused."""
-        return compile_policy(self.policy, is_local=True)
+        return Policy(self.policy, is_local=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,7 +153,7 @@ class PeerConfig:
 
     def make_policy(self) -> Policy:
         """A new policy: its counters at zero, its rates unused."""
-        return compile_policy(self.policy)
+        return Policy(self.policy)
 
 
 @dataclass(frozen=True, slots=True)

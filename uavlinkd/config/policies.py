@@ -9,8 +9,7 @@ from typing import Any
 from uavlinkd.config.model import PolicyData
 from uavlinkd.config.problems import Found, Values
 from uavlinkd.config.schema import PolicySection
-from uavlinkd.mavlink.policy.compilation import compile_policy
-from uavlinkd.mavlink.policy.settings import PolicyError
+from uavlinkd.mavlink.policy.settings import PolicyError, read_settings
 
 # A policy's messages repeat a group, a message, a command or a number, so that a person can search for it.
 # Any other text may be a secret, or control a terminal, or have a million digits.
@@ -29,7 +28,7 @@ def data(section: Values) -> PolicyData:
 def check(section: Values, *, is_local: bool) -> Found:
     """Yield every problem of the section's policy."""
     try:
-        compile_policy(data(section), is_local=is_local)
+        read_settings(data(section), is_local=is_local)
     except PolicyError as error:
         for problem in error.problems:
             yield section.at(problem.key), f"{problem.problem}; {problem.remedy}"

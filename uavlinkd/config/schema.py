@@ -110,7 +110,7 @@ class NetworkSection(Section):
 class PolicySection(Section):
     """The keys in ``[[peer]]`` and ``[[endpoint]]`` that limit messages.
 
-    :func:`uavlinkd.mavlink.policy.compilation.compile_policy` checks them together.
+    :func:`uavlinkd.mavlink.policy.settings.read_settings` checks them together.
     """
 
     role: Any = None

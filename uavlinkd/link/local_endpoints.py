@@ -27,7 +27,7 @@ from uavlinkd.mavlink.own_frames import (
     StatusTextSource,
     TextSeverity,
 )
-from uavlinkd.mavlink.policy.compilation import Policy, compile_policy
+from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.delivery import Source
 from uavlinkd.mavlink.policy.gate import REFUSALS, Refusal
 from uavlinkd.mavlink.routing import SystemComponent
@@ -88,7 +88,7 @@ class LocalEndpoints:
         self._opened: list[tuple[Endpoint, EndpointConfig]] = []  # and not started yet
         self._urls: dict[str, EndpointUrl] = {}
         self._sources: dict[str, tuple[RadioStatusSource | None, StatusTextSource | None]] = {}
-        self._own = Source(name, compile_policy({}, is_local=True).incoming)
+        self._own = Source(name, Policy({}, is_local=True).incoming)
         self._gather_s = 0.0
 
     # From the configuration.

@@ -23,10 +23,10 @@ from uavlinkd.mavlink.egress.fair_queue import (
 from uavlinkd.mavlink.egress.lanes import EgressDrop
 from uavlinkd.mavlink.flows import flow_key
 from uavlinkd.mavlink.frames import Frame
-from uavlinkd.mavlink.policy.compilation import compile_policy
+from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.delivery import Source
 
-GATE = compile_policy(TRUSTED).incoming
+GATE = Policy(TRUSTED).incoming
 HONEST, CAPTURED = Source("honest", GATE), Source("captured", GATE)
 
 

@@ -15,7 +15,7 @@ from typing import Final, NamedTuple
 from tests.mavlink.parsers.hidden_frames import Carrier, frame, hide
 from uavlinkd.mavlink.dialect import COMMANDS, IDS, MESSAGES
 from uavlinkd.mavlink.frames import MAVLINK1
-from uavlinkd.mavlink.policy.compilation import compile_policy
+from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import Refusal
 
 MEMBER: Final = 2
@@ -195,7 +195,7 @@ def heartbeat_of(system: int) -> bytes:
 def lacking(dialect: str, member: str, *, numbered: bool = False) -> int:
     """A message that this member may send and the dialect lacks; with ``numbered`` one that MAVLink 1 can number."""
     known = importlib.import_module(f"pymavlink.dialects.v20.{dialect}").mavlink_map
-    gate = compile_policy(CAST[member]).incoming
+    gate = Policy(CAST[member]).incoming
     return next(
         msgid
         for msgid in sorted(MESSAGES, reverse=True)

@@ -20,7 +20,7 @@ from tests.mavlink.parsers.judge import Deliverer, Judge, Stream, judge_all
 from tests.mavlink.parsers.receivers import Options, Receiver
 from uavlinkd.mavlink.dialect import IDS, MESSAGES
 from uavlinkd.mavlink.frames import parse_frame
-from uavlinkd.mavlink.policy.compilation import compile_policy
+from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.delivery import DeliveredStream, Source
 
 TELEMETRY = (
@@ -42,7 +42,7 @@ def false_refusals(count: int, seed: int) -> Noise:
     """Deliver at least so many bytes of random telemetry of a swarm member."""
     rng = random.Random(seed)
     policy = {"role": "swarm-member", "system_ids": [1]}
-    source, stream = Source("member", compile_policy(policy).incoming), DeliveredStream()
+    source, stream = Source("member", Policy(policy).incoming), DeliveredStream()
     numbers = [IDS[name] for name in TELEMETRY]
     frames = total = refused = 0
     while total < count:

@@ -11,7 +11,7 @@ from tests.mavlink.parsers.captured_member import CAST, GOALS, command_long, hea
 from tests.mavlink.parsers.hidden_frames import SIGNATURE_BYTES, Carrier, crc_extra, frame, hide, msgid_of
 from tests.mavlink.parsers.receivers import PRIVATE_EXTRAS
 from uavlinkd.mavlink.dialect import COMMANDS, MESSAGES, OTHER_EXTRAS
-from uavlinkd.mavlink.policy.compilation import compile_policy
+from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import Refusal
 
 LETS_UNKNOWN_PASS: Final = frozenset({"private dialect"})
@@ -47,7 +47,7 @@ class _Sender(NamedTuple):
 
 @cache
 def _sender(name: str) -> _Sender:
-    policy = compile_policy(CAST[name])
+    policy = Policy(CAST[name])
     gate = policy.incoming
     systems = tuple(system for system in range(1, 256) if gate.may_speak_as(system))
     allowed = tuple(msgid for msgid in MESSAGES if not isinstance(gate.decide(msgid, is_known=True), Refusal))

@@ -18,7 +18,7 @@ from tests.mavlink.parsers.hidden_frames import SIGNATURE_BYTES, crc_extra, msgi
 from tests.mavlink.parsers.receivers import Accepted, Batch, Delivery, Receiver
 from uavlinkd.mavlink.dialect import OTHER_EXTRAS
 from uavlinkd.mavlink.frames import MAVLINK2, Frame, SplitCounters, parse_frame, split_payload
-from uavlinkd.mavlink.policy.compilation import compile_policy
+from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.delivery import DeliveredStream, Source
 from uavlinkd.mavlink.policy.gate import Gate
 
@@ -59,8 +59,8 @@ class Deliverer:
     _now: float = 0.0
 
     def __post_init__(self) -> None:
-        self._gates = {name: compile_policy(data).incoming for name, data in self.cast.items()}
-        self._outgoing = [compile_policy(data, is_local=True).outgoing for data in CLIENTS]
+        self._gates = {name: Policy(data).incoming for name, data in self.cast.items()}
+        self._outgoing = [Policy(data, is_local=True).outgoing for data in CLIENTS]
 
     def deliver(self, recipe: Recipe) -> Stream:
         """The stream that the client reads."""
@@ -137,8 +137,8 @@ class Judge:
     def __init__(
         self, cast: Mapping[str, Mapping[str, object]] = CAST, clients: Sequence[Mapping[str, object]] = CLIENTS
     ) -> None:
-        self._gates = {name: compile_policy(data).incoming for name, data in cast.items()}
-        self._outgoing = [compile_policy(data, is_local=True).outgoing for data in clients]
+        self._gates = {name: Policy(data).incoming for name, data in cast.items()}
+        self._outgoing = [Policy(data, is_local=True).outgoing for data in clients]
         self._now = 0.0
 
     def is_forbidden(self, raw: bytes, senders: Iterable[str], client: int = 0) -> bool:

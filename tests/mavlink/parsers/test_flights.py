@@ -13,7 +13,7 @@ from tests.samples import frames_of
 from uavlinkd.lab.sim.tlog import TlogRecord, read_tlog
 from uavlinkd.mavlink.dialect import name_of
 from uavlinkd.mavlink.frames import Frame
-from uavlinkd.mavlink.policy.compilation import compile_policy
+from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.delivery import DeliveredStream, Source
 
 FLIGHTS = ("arducopter_sitl_flight.tlog", "ardusub_dive.tlog", "copter_flight_mavlink1.tlog")
@@ -36,8 +36,8 @@ def test_recorded_flight_passes(shared_data: Path, name: str) -> None:
     """Every frame of vehicle and ground station, by policy, rates and invariant, in both directions, unchanged."""
     flight = parsed(read_tlog(shared_data / name).records)
     systems = sorted({frame.header.system for _, frame in flight} - {0, GROUND})
-    vehicle = compile_policy({"role": "vehicle", "system_ids": systems})
-    operator = compile_policy({"role": "operator", "system_ids": [GROUND]})
+    vehicle = Policy({"role": "vehicle", "system_ids": systems})
+    operator = Policy({"role": "operator", "system_ids": [GROUND]})
     sources = {True: Source("operator", operator.incoming), False: Source("vehicle", vehicle.incoming)}
     streams = {True: DeliveredStream(), False: DeliveredStream()}
     refused: Counter[tuple[str, str]] = Counter()

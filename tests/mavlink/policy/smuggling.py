@@ -9,7 +9,7 @@ from fastcrc.crc16 import mcrf4xx
 
 from tests.samples import build
 from uavlinkd.mavlink.dialect import MESSAGES, OTHER_EXTRAS
-from uavlinkd.mavlink.policy.compilation import compile_policy
+from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.delivery import Source
 
 ATTITUDE, PARAM_REQUEST_READ, SET_MODE, COMMAND_LONG, HEARTBEAT = 30, 20, 11, 76, 0
@@ -40,7 +40,7 @@ def split_over(middle: bytes = b"", msgid: int = COMMAND_LONG, system: int = 1) 
 
 def source(role: str = "swarm-member", systems: object = (1,), **more: object) -> Source:
     """A policy of a peer with this role and these systems."""
-    return Source(role, compile_policy({"role": role, "system_ids": systems, **more}).incoming)
+    return Source(role, Policy({"role": role, "system_ids": systems, **more}).incoming)
 
 
 def valid_frames(stream: bytes, *, any_extra: bool = False) -> Iterator[tuple[int, bytes]]:

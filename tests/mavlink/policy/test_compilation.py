@@ -7,7 +7,7 @@ import pytest
 from tests.samples import ID, blank
 from uavlinkd.mavlink.dialect import COMMANDS
 from uavlinkd.mavlink.policy.alternatives import EFFECTS
-from uavlinkd.mavlink.policy.compilation import Policy, compile_policy
+from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.roles import ROLES
 from uavlinkd.mavlink.policy.settings import PolicyError, PolicyProblem
 
@@ -18,7 +18,7 @@ OPERATOR = {"role": "operator", "system_ids": [255]}
 def problems(data: dict[str, object]) -> tuple[PolicyProblem, ...]:
     """The problems of a peer's policy."""
     with pytest.raises(PolicyError) as caught:
-        compile_policy(data)
+        Policy(data)
     assert all(str(problem) in str(caught.value) for problem in caught.value.problems)
     return caught.value.problems
 
@@ -95,7 +95,7 @@ def test_a_mistake_does_not_affect_a_corrected_list() -> None:
     """A refused list has no effect on the corrected list that follows: True equals 1."""
     data = {"system_ids": "all", "allow_out": []}
     assert problems({**data, "allow_in": [True]})
-    assert compile_policy({**data, "allow_in": [1]}).incoming.check(blank(1), 0.0) is None
+    assert Policy({**data, "allow_in": [1]}).incoming.check(blank(1), 0.0) is None
 
 
 # The table for people.
@@ -103,7 +103,7 @@ def test_a_mistake_does_not_affect_a_corrected_list() -> None:
 
 def test_table_describes_the_gate() -> None:
     """A group's line distinguishes all, none, most, some, and those that depend on the command."""
-    made = compile_policy(
+    made = Policy(
         {
             "system_ids": [1, "5-9"],
             "allow_in": ["telemetry", "mission", "MAV_CMD_NAV_TAKEOFF", 99999],
@@ -140,7 +140,7 @@ def test_table_describes_the_gate() -> None:
 
 
 def warnings(data: dict[str, object]) -> str:
-    return "\n".join(compile_policy(data).warnings)
+    return "\n".join(Policy(data).warnings)
 
 
 def test_effects_name_what_exists() -> None:
@@ -202,7 +202,7 @@ def test_allow_list_gives_no_warning() -> None:
     }
     assert warnings(data) == ""
     data = {**data, "allow_in": ["MAV_CMD_NAV_LAND", "MAV_CMD_DO_REPOSITION", "files-read"]}
-    (warning,) = compile_policy({**data, "deny_in": ["MAV_CMD_NAV_LAND"]}).warnings
+    (warning,) = Policy({**data, "deny_in": ["MAV_CMD_NAV_LAND"]}).warnings
     assert "stays possible by MAV_CMD_DO_REPOSITION:" in warning
 
 
@@ -214,11 +214,11 @@ def test_other_warnings() -> None:
     """About any system id, a denied command while opaque messages pass, and both directions."""
     assert "any system" in warnings({**LISTS, "system_ids": "all"})
     denial = ["MAV_CMD_DO_FLIGHTTERMINATION"]
-    (warning,) = opaque(compile_policy({**OPERATOR, "deny_in": denial}))
+    (warning,) = opaque(Policy({**OPERATOR, "deny_in": denial}))
     assert warning.startswith("deny_in names commands")
     assert "FILE_TRANSFER_PROTOCOL" in warning
     assert "SERIAL_CONTROL" not in warning
-    assert not opaque(compile_policy({**OPERATOR, "deny_in": [*denial, "files", "shell"]}))
+    assert not opaque(Policy({**OPERATOR, "deny_in": [*denial, "files", "shell"]}))
     assert warnings({**LISTS, "system_ids": [1], "deny_out": ["all", "command:1"]}) == ""
     assert "deny_out refuses MAV_CMD_NAV_LAND" in warnings(
         {"role": "vehicle", "system_ids": [1], "deny_out": ["MAV_CMD_NAV_LAND"]}

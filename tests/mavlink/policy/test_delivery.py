@@ -28,7 +28,7 @@ from uavlinkd.mavlink.dialect import MESSAGES
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.mavlink.headers import Header
 from uavlinkd.mavlink.policy import hidden
-from uavlinkd.mavlink.policy.compilation import compile_policy
+from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.delivery import MAX_STREAMS, DeliveredStream, DeliveredStreams, Source
 from uavlinkd.mavlink.policy.gate import Gate, Refusal
 
@@ -141,14 +141,14 @@ def file_part(content: bytes, system: int = 1) -> bytes:
 
 def test_setup_signing_never_passes_hidden() -> None:
     """Also from a source that may send everything."""
-    everything = Source("local", compile_policy({}, is_local=True).incoming)
+    everything = Source("local", Policy({}, is_local=True).incoming)
     assert not Client().send(file_part(v2(SETUP_SIGNING, bytes(41) + b"\1")), everything)
     assert Client().send(file_part(ARM), everything)
 
 
 def test_client_that_may_not_get_a_command_gets_none_hidden() -> None:
     """Outgoing frames have rules too."""
-    display = compile_policy({"allow_out": ["telemetry", "files"], "system_ids": "all", "allow_in": []}).outgoing
+    display = Policy({"allow_out": ["telemetry", "files"], "system_ids": "all", "allow_in": []}).outgoing
     assert not Client(display).send(file_part(ARM), source("operator", [255]))
     assert Client(display).send(file_part(bytes(40)), source("operator", [255]))
 
@@ -169,7 +169,7 @@ def test_refusal_is_reported_with_its_source() -> None:
     def report(name: str, header: Header, refusal: Refusal, now: float) -> None:
         reported.append((name, header.msgid, refusal, now))
 
-    member = Source("drone1", compile_policy({"role": "swarm-member", "system_ids": [1]}).incoming, report)
+    member = Source("drone1", Policy({"role": "swarm-member", "system_ids": [1]}).incoming, report)
     assert DeliveredStream().admit(read(carrying(MODE_V1)), member, 7.0) == b""
     assert reported == [("drone1", ATTITUDE, Refusal.HIDDEN_FRAME, 7.0)]
 

@@ -29,7 +29,7 @@ from tests.samples import (
 from uavlinkd.mavlink.dialect import COMMANDS, GROUPS, MESSAGES
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.mavlink.policy import gate as gates
-from uavlinkd.mavlink.policy.compilation import Policy, compile_policy
+from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import ANY_OTHER, Gate, Refusal
 from uavlinkd.mavlink.policy.roles import ROLES
 
@@ -51,7 +51,7 @@ def raw_frame(msgid: int, payload: bytes) -> Frame:
 def compiled(data: Mapping[str, object]) -> Policy:
     """A peer's policy. Without a role, a list that a test does not name passes everything."""
     lists = {} if "role" in data else {"allow_in": ["all"], "allow_out": ["all"]}
-    return compile_policy({"system_ids": "all", **lists, **data})
+    return Policy({"system_ids": "all", **lists, **data})
 
 
 def incoming(**data: object) -> Gate:
@@ -66,7 +66,7 @@ def passing(gate: Gate) -> set[str]:
 @pytest.mark.parametrize("data", [{}, {"deny_in": ["shell"]}, {"role": "all", "system_ids": "all"}])
 def test_open_policy_passes_everything_but_signing_keys(data: dict[str, object]) -> None:
     """The wire to a local client is trusted: an endpoint needs no role and no list. A peer may have role = "all"."""
-    made = compile_policy(data, is_local="role" not in data)
+    made = Policy(data, is_local="role" not in data)
     denied = {name for group in data.get("deny_in", ()) for name in GROUPS[group]}  # type: ignore[attr-defined]
     assert passing(made.incoming) == set(ID) - {"SETUP_SIGNING"} - denied
     assert passing(made.outgoing) == set(ID) - {"SETUP_SIGNING"}

@@ -12,7 +12,7 @@ from uavlinkd.core import refusals
 from uavlinkd.core.refusals import Refused
 from uavlinkd.mavlink.frames import SplitCounters, split_payload
 from uavlinkd.mavlink.policy import gate as gates
-from uavlinkd.mavlink.policy.compilation import compile_policy
+from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import CODES, REFUSALS, Gate, Refusal
 
 ARM, TAKE_OFF = 400, 22
@@ -20,7 +20,7 @@ ARM, TAKE_OFF = 400, 22
 
 def member() -> Gate:
     """What passes from a swarm member that is system 1."""
-    return compile_policy({"role": "swarm-member", "system_ids": [1]}).incoming
+    return Policy({"role": "swarm-member", "system_ids": [1]}).incoming
 
 
 def check(gate: Gate, *raws: bytes) -> None:

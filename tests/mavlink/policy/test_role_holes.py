@@ -9,7 +9,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from tests.samples import ID, build, frame, read
 from uavlinkd.mavlink.frames import Frame
-from uavlinkd.mavlink.policy.compilation import compile_policy
+from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import REQUEST_MESSAGE, Refusal
 
 OBSERVER = {"role": "observer", "system_ids": [200]}
@@ -28,16 +28,16 @@ def request(number: float, *, is_int: bool = False, version: int = 2) -> Frame:
 
 def test_osd_request_that_ends_arducopter_is_refused() -> None:
     """ArduCopter 4.7 reads a null pointer: screen 5, parameter 1. As the fuzzer sent it."""
-    gate = compile_policy(OBSERVER).incoming
+    gate = Policy(OBSERVER).incoming
     culprit = read(bytes.fromhex("fd080000bbc82f1b2b00ffffffff01010501bc6f"))
     assert gate.check(culprit, 0.0) is Refusal.MESSAGE_NOT_ALLOWED
     by_group = {"system_ids": [200], "allow_in": ["parameter-reads"], "allow_out": []}
-    assert compile_policy(by_group).incoming.check(culprit, 0.0) is Refusal.MESSAGE_NOT_ALLOWED
+    assert Policy(by_group).incoming.check(culprit, 0.0) is Refusal.MESSAGE_NOT_ALLOWED
 
 
 def test_request_of_every_event_is_refused() -> None:
     """PX4 answers it with 65,536 frames."""
-    gate = compile_policy(OBSERVER).incoming
+    gate = Policy(OBSERVER).incoming
     everything = build(ID["REQUEST_EVENT"], struct.pack("<HHBB", 0, 65535, 1, 1), 200)
     assert gate.check(read(everything), 0.0) is Refusal.MESSAGE_NOT_ALLOWED
 
@@ -46,7 +46,7 @@ def test_request_of_every_event_is_refused() -> None:
 @pytest.mark.parametrize("is_int", [False, True], ids=["COMMAND_LONG", "COMMAND_INT"])
 def test_observer_requests_only_what_it_may_receive(version: int, *, is_int: bool) -> None:
     """PX4 adds ten parameters to its list if it is asked for UAVIONIX_ADSB_OUT_CFG."""
-    gate = compile_policy(OBSERVER).incoming
+    gate = Policy(OBSERVER).incoming
     for name in ("AUTOPILOT_VERSION", "HOME_POSITION", "MESSAGE_INTERVAL", "PROTOCOL_VERSION", "HEARTBEAT"):
         asked = request(ID[name], is_int=is_int, version=version)
         assert gate.check(asked, 1.0) is None
@@ -58,11 +58,11 @@ def test_observer_requests_only_what_it_may_receive(version: int, *, is_int: boo
 
 def test_what_may_go_out_may_be_requested() -> None:
     """The rule follows the lists of the file. A role that has all commands has no such limit."""
-    more = compile_policy({**OBSERVER, "allow_out": ["UAVIONIX_ADSB_OUT_CFG"]}).incoming
+    more = Policy({**OBSERVER, "allow_out": ["UAVIONIX_ADSB_OUT_CFG"]}).incoming
     assert more.permits(request(ADSB_OUT_CFG))
-    fewer = compile_policy({**OBSERVER, "deny_out": ["HOME_POSITION"]}).incoming
+    fewer = Policy({**OBSERVER, "deny_out": ["HOME_POSITION"]}).incoming
     assert not fewer.permits(request(ID["HOME_POSITION"]))
-    operator = compile_policy({"role": "operator", "system_ids": [200]}).incoming
+    operator = Policy({"role": "operator", "system_ids": [200]}).incoming
     assert operator.permits(request(ADSB_OUT_CFG))
     assert operator.permits(request(float("nan")))
 
@@ -70,7 +70,7 @@ def test_what_may_go_out_may_be_requested() -> None:
 @pytest.mark.parametrize("name", ["PARAM_REQUEST_LIST", "PARAM_EXT_REQUEST_LIST"])
 def test_observer_requests_few_lists_of_parameters(name: str) -> None:
     """ArduPilot slows its telemetry to a quarter while it sends one. Two at once pass, then one in 20 s."""
-    gate = compile_policy(OBSERVER).incoming
+    gate = Policy(OBSERVER).incoming
     message = getattr(mavlink, f"MAVLink_{name.lower()}_message")
     passed = [
         now
@@ -84,9 +84,9 @@ def test_observer_requests_few_lists_of_parameters(name: str) -> None:
 def test_request_needs_an_answer_that_may_pass() -> None:
     """In both directions of lists. A list that allows requests but no answer has a warning."""
     lists = {"system_ids": [1], "allow_in": ["telemetry"], "allow_out": ["MAV_CMD_REQUEST_MESSAGE"]}
-    policy = compile_policy(lists)
+    policy = Policy(lists)
     assert policy.outgoing.check(request(ID["SYS_STATUS"]), 0.0) is None
     assert policy.outgoing.check(request(ADSB_OUT_CFG), 0.0) is Refusal.COMMAND_NOT_ALLOWED
     assert not any("MAV_CMD_REQUEST_MESSAGE" in warning for warning in policy.warnings)
-    (warning,) = compile_policy({**lists, "allow_in": []}).warnings
+    (warning,) = Policy({**lists, "allow_in": []}).warnings
     assert warning.startswith("allow_out has MAV_CMD_REQUEST_MESSAGE, but the other direction passes no message")

@@ -41,12 +41,18 @@ class PolicyRow(NamedTuple):
 
 
 class Policy:
-    """What one peer or endpoint may send (`incoming`) and receive (`outgoing`)."""
+    """What one peer or endpoint may send (`incoming`) and receive (`outgoing`), by the keys of the configuration.
+
+    `is_local`: for a local endpoint, where every key is optional and everything passes without data.
+
+    Raises:
+        PolicyError: with every problem in the data, each with its key and its remedy.
+    """
 
     __slots__ = ("_settings", "incoming", "outgoing", "warnings")
 
-    def __init__(self, settings: Settings) -> None:
-        self._settings = settings
+    def __init__(self, data: Mapping[str, object], *, is_local: bool = False) -> None:
+        settings = self._settings = read_settings(data, is_local=is_local)
         self.incoming, self.outgoing = Gate(settings, "in"), Gate(settings, "out")
         self.incoming.opposite, self.outgoing.opposite = self.outgoing, self.incoming
         # Sentences for the operator, the most severe first.
@@ -71,18 +77,6 @@ class Policy:
             PolicyRow("ground station's HEARTBEAT", _passes(settings.ground_station), "passes"),
             PolicyRow("rates", *map(_rates_text, settings.rates.values())),
         ]
-
-
-def compile_policy(data: Mapping[str, object], *, is_local: bool = False) -> Policy:
-    """The policy that plain data describes.
-
-    `is_local`: for a local endpoint, where every key is optional and everything passes without data. A peer's policy
-    must define what passes in each direction, and the systems that the peer may send as.
-
-    Raises:
-        PolicyError: with every problem in the data, each with its key and its remedy.
-    """
-    return Policy(read_settings(data, is_local=is_local))
 
 
 def _warnings(settings: Settings, gates: Mapping[Direction, Gate]) -> list[str]:
