@@ -2,7 +2,7 @@
 
 The text is changed line by line, which keeps comments and order. The parsed result is then compared with the parsed
 original after the same change. If they differ, the change is refused: a multi-line string may contain a ``[[peer]]``.
-A ``kind`` of section is ``peer``, ``relay`` or ``member``.
+A ``kind`` of section is ``peer``, ``relay`` or ``member``. Each change raises FleetError if it is not safe.
 """
 
 from __future__ import annotations
@@ -21,59 +21,46 @@ _KEY = re.compile(r"[ \t]*(?:\"([^\"]*)\"|'([^']*)'|([A-Za-z0-9_-]+))[ \t]*=")
 _LINK = re.compile(r"[ \t]*\[[ \t]*link[ \t]*\]")
 _KINDS = ("peer", "relay", "member")
 _PUBLIC = ("public_key", "previous_public_key")
-_PRIVATE = ("private_key_file", "previous_private_key_file")
 
 Table = dict[str, Any]
-Change = Callable[[str], str]
 
 
-def set_peer(text: str, section: str, name: str) -> str:
-    """Replace the section of a peer, relay or member, or append it.
-
-    Raises:
-        FleetError: the text cannot be changed safely.
-    """
-    ((kind, (added,)),) = tomllib.loads(section).items()
+def set_section(text: str, kind: str, name: str, section: str = "") -> str:
+    """Replace the section of a peer, relay or member, append it, or delete it if the new one is empty."""
 
     def change(table: Table) -> None:
-        table[kind] = [peer for peer in table.get(kind, []) if peer.get("name") != name] + [added]
-
-    kept = _without(_sections(text), kind, name)
-    return _checked(text, "".join(kept).rstrip("\n") + "\n\n" + section, change)
-
-
-def remove_peer(text: str, kind: str, name: str) -> str:
-    """Delete the section of a peer, relay or member.
-
-    Raises:
-        FleetError: the text cannot be changed safely.
-    """
-
-    def change(table: Table) -> None:
-        left = [peer for peer in table.get(kind, []) if peer.get("name") != name]
-        table.pop(kind, None)
-        if left:
+        left = [peer for peer in table.pop(kind, []) if peer.get("name") != name]
+        if left := left + tomllib.loads(section).get(kind, []):
             table[kind] = left
 
-    return _checked(text, "".join(_without(_sections(text), kind, name)).rstrip("\n") + "\n", change)
+    kept = "".join(piece for piece in _sections(text) if _name(piece, kind) != name).rstrip("\n") + "\n"
+    return _checked(text, f"{kept}\n{section}" if section else kept, change)
 
 
 def set_confidential(text: str) -> str:
-    """Encrypt the frames on all links.
+    """Encrypt the frames on all links."""
+    if not any(map(_LINK.match, _sections(text))):
+        text += "\n[link]\n"
+    place = next(number for number, section in enumerate(_sections(text)) if _LINK.match(section))
+    return _set_lines(text, place, lambda table: table["link"], ("confidential",), [CONFIDENTIAL])
 
-    Raises:
-        FleetError: the text cannot be changed safely.
-    """
-    sections = _sections(text)
-    at = next((number for number, section in enumerate(sections) if _LINK.match(section)), None)
-    if at is None:
-        sections.append("\n[link]\n")
-        at = -1
-    keys = tuple(tomllib.loads(CONFIDENTIAL))
-    sections[at] = _with_lines(sections[at], keys, (CONFIDENTIAL,))
-    return _checked(
-        text, "".join(sections), lambda table: _set_keys(table.setdefault("link", {}), keys, (CONFIDENTIAL,))
-    )
+
+def set_public_keys(text: str, kind: str, peer: Member) -> str:
+    """Replace the public keys of a peer, relay or member by its current ones."""
+    places = [number for number, section in enumerate(_sections(text)) if _name(section, kind) == peer.name]
+    if len(places) != 1:
+        raise FleetError(f'it has no [[{kind}]] with the name "{peer.name}": add it, or move the file away')
+
+    def section(table: Table) -> Table:
+        return next(section for section in table[kind] if section.get("name") == peer.name)
+
+    return _set_lines(text, places[0], section, _PUBLIC, public_key_lines(peer))
+
+
+def set_private_keys(text: str, member: Member) -> str:
+    """Replace the names of the member's own key files by the current ones."""
+    keys = ("private_key_file", "previous_private_key_file")
+    return _set_lines(text, 0, lambda table: table, keys, key_lines(member))
 
 
 def section_with_key(text: str, public_keys: Iterable[str]) -> str | None:
@@ -92,56 +79,41 @@ def section_with_key(text: str, public_keys: Iterable[str]) -> str | None:
     return None
 
 
-def set_public_keys(text: str, kind: str, peer: Member) -> str:
-    """Replace the public keys of a peer, relay or member by its current ones.
+def _set_lines(
+    text: str, place: int, table_of: Callable[[Table], Table], keys: Sequence[str], lines: Sequence[str]
+) -> str:
+    """Replace the lines with these keys in one section, whose table ``table_of`` finds in the parsed file.
 
-    Raises:
-        FleetError: the text cannot be changed safely, or has no such section.
+    The new lines are where the first of them was, or else at the end.
     """
-    lines = public_key_lines(peer)
 
     def change(table: Table) -> None:
-        for section in table.get(kind, []):
-            if section.get("name") == peer.name:
-                _set_keys(section, _PUBLIC, lines)
+        section = table_of(table)
+        for key in keys:
+            section.pop(key, None)
+        section.update(tomllib.loads("\n".join(lines)))
 
     sections = _sections(text)
-    places = [number for number, section in enumerate(sections) if _name(section, kind) == peer.name]
-    if len(places) != 1:
-        raise FleetError(f'it has no [[{kind}]] with the name "{peer.name}": add it, or move the file away')
-    sections[places[0]] = _with_lines(sections[places[0]], _PUBLIC, lines)
+    kept: list[str] = []
+    at: int | None = None
+    for line in sections[place].splitlines(keepends=True):
+        match = _KEY.match(line)
+        if match is not None and next(filter(None, match.groups()), "") in keys:
+            at = len(kept) if at is None else at
+        else:
+            kept.append(line)
+    at = len(kept) if at is None else at
+    sections[place] = "".join([*kept[:at], *(f"{line}\n" for line in lines), *kept[at:]])
     return _checked(text, "".join(sections), change)
 
 
-def set_private_keys(text: str, member: Member) -> str:
-    """Replace the names of the member's own key files by the current ones.
-
-    Raises:
-        FleetError: the text cannot be changed safely.
-    """
-    lines = key_lines(member)
-    sections = _sections(text)
-    sections[0] = _with_lines(sections[0], _PRIVATE, lines)
-    return _checked(text, "".join(sections), lambda table: _set_keys(table, _PRIVATE, lines))
-
-
-def _set_keys(table: Table, keys: Sequence[str], lines: Sequence[str]) -> None:
-    for key in keys:
-        table.pop(key, None)
-    table.update(tomllib.loads("\n".join(lines)))
-
-
 def _checked(before: str, after: str, change: Callable[[Table], None]) -> str:
-    """``after``, if it parses to the same as ``before`` with the change.
-
-    Raises:
-        FleetError: it does not.
-    """
+    """``after``, if it parses to the same as ``before`` with the change."""
     try:
         table = tomllib.loads(before)
         change(table)
         same = tomllib.loads(after) == table
-    except (ValueError, TypeError, AttributeError):
+    except (ValueError, TypeError, AttributeError, LookupError, StopIteration):
         same = False
     if not same:
         raise FleetError("its edits cannot be kept: move it away, and run the command again to write a new one")
@@ -158,10 +130,6 @@ def _sections(text: str) -> list[str]:
     return ["".join(piece) for piece in pieces]
 
 
-def _without(sections: Sequence[str], kind: str, name: str) -> list[str]:
-    return [section for section in sections if _name(section, kind) != name]
-
-
 def _name(section: str, kind: str) -> object:
     """The name in a section of a kind, such as ``[[peer]]``; None for other sections."""
     try:
@@ -169,17 +137,3 @@ def _name(section: str, kind: str) -> object:
     except ValueError:
         return None
     return peer[0].get("name") if isinstance(peer, list) and len(peer) == 1 else None
-
-
-def _with_lines(section: str, keys: Sequence[str], lines: Sequence[str]) -> str:
-    """Replace the lines with these keys. The new lines are where the first of them was, or else at the end."""
-    kept: list[str] = []
-    at: int | None = None
-    for line in section.splitlines(keepends=True):
-        match = _KEY.match(line)
-        if match is not None and next(filter(None, match.groups()), "") in keys:
-            at = len(kept) if at is None else at
-        else:
-            kept.append(line)
-    place = len(kept) if at is None else at
-    return "".join([*kept[:place], *(f"{line}\n" for line in lines), *kept[place:]])

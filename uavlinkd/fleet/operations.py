@@ -6,11 +6,8 @@ key. The commands do not need the key again: if a folder was moved to its vehicl
 
 from __future__ import annotations
 
-import errno
 import shlex
-import shutil
-import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -22,7 +19,7 @@ from uavlinkd.core.crypto import x25519_public_key
 from uavlinkd.fleet import edit, files
 from uavlinkd.fleet.manifest import Fleet, FleetSettings, Member, MemberKind, check_settings, read_manifest
 from uavlinkd.fleet.plan import FleetError, FleetFileError
-from uavlinkd.fleet.transaction import FileChanges, apply, check_members, is_loadable, lock
+from uavlinkd.fleet.transaction import FileChanges, apply, is_loadable, lock
 from uavlinkd.system.addresses import Address
 
 
@@ -59,11 +56,12 @@ def init(
     if drones + ground_stations + observers > 255:
         raise FleetError("a fleet has at most 255 members: MAVLink has no more system ids")
     try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
         is_taken = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
     except OSError as error:
-        raise _cannot_create(folder, error) from None
+        raise FleetFileError(f"{folder} cannot be created: {error.strerror}") from None
     if is_taken:
-        raise _exists(folder)
+        raise FleetError(f"{folder} exists already: choose the name of a new folder, or use `uavlinkd fleet add`")
     fleet = Fleet(settings)
     private_keys: dict[str, str] = {}
     for kind, places in (
@@ -79,26 +77,11 @@ def init(
             private_keys[name] = keys.generate_private_key()
             public = keys.public_key_text(private_keys[name])
             fleet = fleet.with_member(fleet.new_member(name, kind, public, address=address))
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        building = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
-    except OSError as error:
-        raise _cannot_create(folder, error) from None
-    try:
-        changes = FileChanges()
-        for member in fleet.members:
-            _write(changes, building, fleet, member, private_keys[member.name])
-        _add_psks(changes, building, fleet, _pairs(fleet))
-        apply(changes, building, fleet)
-        check_members(building, fleet.members)
-        building.chmod(0o755)
-        building.rename(folder)
-    except OSError as error:
-        if error.errno in (errno.EEXIST, errno.ENOTEMPTY):  # another command created it meanwhile
-            raise _exists(folder) from None
-        raise _cannot_create(folder, error) from None
-    finally:
-        shutil.rmtree(building, ignore_errors=True)
+    changes = FileChanges(folder, fleet)
+    for member in fleet.members:
+        _write(changes, member, private_keys[member.name])
+    _add_psks(changes, (pair for pair in combinations(fleet.members, 2) if pair[0].section_of(pair[1])))
+    apply(changes, fleet.members)
     return Result(fleet, tuple(member.name for member in fleet.members))
 
 
@@ -113,16 +96,15 @@ def add(
     with _open_fleet(folder) as before:
         private = keys.generate_private_key()
         member = before.new_member(name, kind, keys.public_key_text(private), address=address, system_id=system_id)
-        fleet = before.with_member(member)
-        changes = FileChanges()
-        _write(changes, folder, fleet, member, private)
-        peers = fleet.peers_of(member)
+        changes = FileChanges(folder, before.with_member(member))
+        _write(changes, member, private)
+        peers = changes.fleet.peers_of(member)
         loadable = [peer for peer in peers if is_loadable(folder, peer)]
-        _add_psks(changes, folder, fleet, [(member, peer) for peer in peers])
+        _add_psks(changes, ((member, peer) for peer in peers))
         for peer in peers:
-            _edit(changes, folder, fleet, peer, partial(_with_peer, fleet, peer, member))
-        apply(changes, folder, fleet, (member, *loadable))
-    return Result(fleet, (name, *(peer.name for peer in peers)), tuple(changes.notes))
+            _edit(changes, peer, partial(_with_peer, changes.fleet, peer, member))
+        apply(changes, (member, *loadable))
+    return _result(changes, member, *peers)
 
 
 def remove(folder: Path, name: str) -> Result:
@@ -133,16 +115,14 @@ def remove(folder: Path, name: str) -> Result:
     """
     with _open_fleet(folder) as before:
         member = before.member(name)
-        fleet = before.without(name)
-        changes = FileChanges()
+        changes = FileChanges(folder, before.without(name))
         peers = before.peers_of(member)
         for peer in peers:
-            kind = peer.section_of(member)
-            _edit(changes, folder, fleet, peer, lambda text, kind=kind: edit.remove_peer(text, kind, name))  # type: ignore[misc]
+            _edit(changes, peer, partial(edit.set_section, kind=peer.section_of(member), name=name))
             changes.deleted.append(folder / peer.name / files.psk_file(member))
-        _check_unused(changes, folder, fleet, name, member.public_keys)
-        apply(changes, folder, fleet)
-    return Result(fleet, tuple(peer.name for peer in peers), tuple(changes.notes))
+        _check_unused(changes, name, member.public_keys)
+        apply(changes)
+    return _result(changes, *peers)
 
 
 def rotate(folder: Path, name: str, *, at_once: bool = False) -> Result:
@@ -168,30 +148,29 @@ def rotate(folder: Path, name: str, *, at_once: bool = False) -> Result:
             public_key=keys.public_key_text(private),
             previous_public_key=None if at_once else old.public_key,
         )
-        fleet = before.with_member(member)
-        own = folder / name
-        changes = FileChanges()
-        changes.secrets[own / files.key_file(member)] = private
+        changes = FileChanges(folder, before.with_member(member))
+        own, previous = folder / name / files.key_file(member), folder / name / files.previous_key_file(member)
+        changes.secrets[own] = private
         if at_once:
-            changes.deleted += [own / files.key_file(member), own / files.previous_key_file(member)]
-        elif _contains_key(own / files.previous_key_file(member), old.public_key):
+            changes.deleted += [own, previous]
+        elif _contains_key(previous, old.public_key):
             # An earlier rotation was interrupted. No file has its key.
-            changes.deleted.append(own / files.key_file(member))
-        elif _exists_here(own / files.key_file(member)):
-            changes.moved[own / files.key_file(member)] = own / files.previous_key_file(member)
+            changes.deleted.append(own)
+        elif _exists_here(own):
+            changes.moved[own] = previous
         else:
             changes.notes.append(
                 f"The old key of {name} is not here. Before you copy the new files to its folder, run there:"
-                f" mv {files.key_file(member)} {files.previous_key_file(member)}"
+                f" mv {own.name} {previous.name}"
             )
-        peers = _replace_keys(changes, folder, fleet, member)
+        peers = _replace_keys(changes, member)
         if at_once:
-            for peer in peers if fleet.settings.psk else ():
-                changes.deleted += [folder / peer.name / files.psk_file(member), own / files.psk_file(peer)]
-            _add_psks(changes, folder, fleet, [(member, peer) for peer in peers])
-            _check_unused(changes, folder, fleet, name, old.public_keys)
-        apply(changes, folder, fleet)
-    return Result(fleet, (name, *(peer.name for peer in peers)), tuple(changes.notes))
+            for peer in peers if before.settings.psk else ():
+                changes.deleted += [folder / peer.name / files.psk_file(member), folder / name / files.psk_file(peer)]
+            _add_psks(changes, ((member, peer) for peer in peers))
+            _check_unused(changes, name, old.public_keys)
+        apply(changes)
+    return _result(changes, member, *peers)
 
 
 def finish_command(folder: Path, name: str) -> str:
@@ -210,12 +189,11 @@ def finish_rotation(folder: Path, name: str) -> Result:
         if old.previous_public_key is None:
             raise FleetError(f"the key of {name} is not being rotated")
         member = replace(old, previous_public_key=None)
-        fleet = before.with_member(member)
-        changes = FileChanges()
+        changes = FileChanges(folder, before.with_member(member))
         changes.deleted.append(folder / name / files.previous_key_file(member))
-        peers = _replace_keys(changes, folder, fleet, member)
-        apply(changes, folder, fleet)
-    return Result(fleet, (name, *(peer.name for peer in peers)), tuple(changes.notes))
+        peers = _replace_keys(changes, member)
+        apply(changes)
+    return _result(changes, member, *peers)
 
 
 @contextmanager
@@ -225,46 +203,46 @@ def _open_fleet(folder: Path) -> Iterator[Fleet]:
         yield read_manifest(folder)
 
 
-def _pairs(fleet: Fleet) -> Iterator[tuple[Member, Member]]:
-    return ((one, other) for one, other in combinations(fleet.members, 2) if one.section_of(other))
+def _result(changes: FileChanges, *changed: Member) -> Result:
+    return Result(changes.fleet, tuple(member.name for member in changed), tuple(changes.notes))
 
 
-def _write(changes: FileChanges, folder: Path, fleet: Fleet, member: Member, private: str) -> None:
+def _write(changes: FileChanges, member: Member, private: str) -> None:
     """Write the key and the configuration of a new member."""
-    changes.secrets[folder / member.name / files.key_file(member)] = private
-    changes.texts[folder / member.name / files.config_file(member)] = files.write_config(fleet, member)
+    own = changes.folder / member.name
+    changes.secrets[own / files.key_file(member)] = private
+    changes.texts[own / files.config_file(member)] = files.write_config(changes.fleet, member)
 
 
-def _add_psks(changes: FileChanges, folder: Path, fleet: Fleet, pairs: Iterable[tuple[Member, Member]]) -> None:
-    for a, b in pairs if fleet.settings.psk else ():
+def _add_psks(changes: FileChanges, pairs: Iterable[tuple[Member, Member]]) -> None:
+    for a, b in pairs if changes.fleet.settings.psk else ():
         psk = keys.generate_psk()
-        changes.secrets[folder / a.name / files.psk_file(b)] = psk
-        changes.secrets[folder / b.name / files.psk_file(a)] = psk
+        changes.secrets[changes.folder / a.name / files.psk_file(b)] = psk
+        changes.secrets[changes.folder / b.name / files.psk_file(a)] = psk
 
 
-def _replace_keys(changes: FileChanges, folder: Path, fleet: Fleet, member: Member) -> list[Member]:
+def _replace_keys(changes: FileChanges, member: Member) -> list[Member]:
     """Write a member's current keys into its own configuration and its peers'. Return the peers."""
-    _edit(changes, folder, fleet, member, lambda text: edit.set_private_keys(text, member))
-    peers = fleet.peers_of(member)
+    _edit(changes, member, partial(edit.set_private_keys, member=member))
+    peers = changes.fleet.peers_of(member)
     for peer in peers:
-        kind = peer.section_of(member)
-        _edit(changes, folder, fleet, peer, lambda text, kind=kind: edit.set_public_keys(text, kind, member))  # type: ignore[misc]
+        _edit(changes, peer, partial(edit.set_public_keys, kind=peer.section_of(member), peer=member))
     return peers
 
 
 def _with_peer(fleet: Fleet, member: Member, peer: Member, text: str) -> str:
     """A member's configuration with another member in it. Links that may go along a relay are encrypted."""
-    text = edit.set_peer(text, files.peer_section(fleet, member, peer), peer.name)
+    text = edit.set_section(text, member.section_of(peer), peer.name, files.peer_section(fleet, member, peer))
     return edit.set_confidential(text) if peer.is_relay else text
 
 
-def _edit(changes: FileChanges, folder: Path, fleet: Fleet, member: Member, change: edit.Change) -> None:
+def _edit(changes: FileChanges, member: Member, change: Callable[[str], str]) -> None:
     """Change a member's configuration. If the file is not here, write a new one."""
-    path = folder / member.name / files.config_file(member)
+    path = changes.folder / member.name / files.config_file(member)
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        changes.texts[path] = files.write_config(fleet, member)
+        changes.texts[path] = files.write_config(changes.fleet, member)
         changes.notes.append(f"{path} was not here: the new file does not contain edits made to another copy.")
         return
     except (OSError, ValueError) as error:
@@ -276,14 +254,14 @@ def _edit(changes: FileChanges, folder: Path, fleet: Fleet, member: Member, chan
         raise FleetError(f"{path}: {error}") from None
 
 
-def _check_unused(changes: FileChanges, folder: Path, fleet: Fleet, name: str, public_keys: Iterable[str]) -> None:
+def _check_unused(changes: FileChanges, name: str, public_keys: Iterable[str]) -> None:
     """Check that no member's configuration contains one of these keys, under any peer's name.
 
     Raises:
         FleetError: one does; with the file and the section.
     """
-    for member in fleet.members:
-        path = folder / member.name / files.config_file(member)
+    for member in changes.fleet.members:
+        path = changes.folder / member.name / files.config_file(member)
         try:
             text = changes.texts[path] if path in changes.texts else path.read_text(encoding="utf-8")
         except (OSError, ValueError):  # on its vehicle only, or not text
@@ -307,11 +285,3 @@ def _exists_here(path: Path) -> bool:
         return path.exists()
     except OSError as error:
         raise FleetFileError(f"{path} cannot be read: {error.strerror}") from None
-
-
-def _exists(folder: Path) -> FleetError:
-    return FleetError(f"{folder} exists already: choose the name of a new folder, or use `uavlinkd fleet add`")
-
-
-def _cannot_create(folder: Path, error: OSError) -> FleetFileError:
-    return FleetFileError(f"{folder} cannot be created: {error.strerror}")

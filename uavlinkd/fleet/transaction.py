@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,8 +20,10 @@ from uavlinkd.system.terminal import printable
 
 @dataclass(slots=True)
 class FileChanges:
-    """The files that a command changes, by path. ``notes`` are sentences for the person who runs the command."""
+    """The files that a command changes, by path, so that a folder contains a fleet."""
 
+    folder: Path
+    fleet: Fleet
     secrets: dict[Path, str] = field(default_factory=dict)
     """New key files."""
     texts: dict[Path, str] = field(default_factory=dict)
@@ -30,9 +32,10 @@ class FileChanges:
     """Files to rename, with their new paths."""
     deleted: list[Path] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    """Sentences for the person who runs the command."""
 
 
-def apply(changes: FileChanges, folder: Path, fleet: Fleet, checked: Sequence[Member] = ()) -> None:
+def apply(changes: FileChanges, checked: Iterable[Member] = ()) -> None:
     """Write all changes and then the manifest, or leave every file as before.
 
     The configurations of the members in ``checked`` must load afterwards.
@@ -41,19 +44,25 @@ def apply(changes: FileChanges, folder: Path, fleet: Fleet, checked: Sequence[Me
         FleetError: one of them does not load.
         FleetFileError: a file cannot be written.
     """
-    rollback = Rollback()
-    texts: Mapping[Path, str] = {**changes.texts, folder / FILE_NAME: write_manifest(fleet)}
+    rollback, folder = Rollback(), changes.folder
+    texts = {**changes.texts, folder / FILE_NAME: write_manifest(changes.fleet)}
     try:
+        rollback.make_folder(folder, 0o755)
         # The steps that need disk space come first.
         prepared = {path: rollback.prepare(path, text) for path, text in texts.items()}
         for path in changes.deleted:
-            rollback.set_aside(path)
+            rollback.keep(path)
+            path.unlink(missing_ok=True)
         for path, to in changes.moved.items():
-            rollback.move(path, to)
+            if to.exists():
+                raise FileExistsError(errno.EEXIST, "it exists: move it away", str(to))
+            rollback.keep(path)
+            rollback.keep(to)
+            path.replace(to)
         for path, text in changes.secrets.items():
             rollback.make_folder(path.parent)
             keys.write_secret_file(path, text)
-            rollback.created.append(path)
+            rollback.steps.append((path, None))
         for path, new in prepared.items():
             rollback.replace(path, new)
         check_members(folder, checked)
@@ -71,40 +80,32 @@ class Rollback:
     """The steps done so far, and how to undo them. Undoing only renames and deletes, because the disk may be full."""
 
     def __init__(self) -> None:
-        self.created: list[Path] = []
-        self._moved: list[tuple[Path, Path]] = []  # from, to
-        self._set_aside: list[tuple[Path, Path]] = []
-        self._folders: list[Path] = []
+        self.steps: list[tuple[Path, Path | None]] = []
+        """Each changed path with the file that has its old content; None if the path is new."""
 
-    def make_folder(self, folder: Path) -> None:
+    def make_folder(self, folder: Path, mode: int = 0o700) -> None:
         """Create a folder unless it exists."""
         if not folder.exists():
-            folder.mkdir(mode=0o700)
-            self._folders.append(folder)
+            folder.mkdir(mode=mode)
+            self.steps.append((folder, None))
 
-    def move(self, path: Path, to: Path) -> None:
-        """Rename a file.
-
-        Raises:
-            FileExistsError: a file has that name already.
-        """
-        if to.exists():
-            raise FileExistsError(errno.EEXIST, "it exists: move it away", str(to))
-        path.rename(to)
-        self._moved.append((path, to))
-
-    def set_aside(self, path: Path) -> None:
-        """Give a file a temporary name. :meth:`finish` deletes it."""
+    def keep(self, path: Path) -> None:
+        """Keep the content of a file, if it exists, under another name. :meth:`finish` deletes it."""
+        aside = None
         if path.exists():
-            aside = _aside(path)
-            path.rename(aside)
-            self._set_aside.append((path, aside))
+            aside = path.with_name(f".{path.name}.old")
+            aside.unlink(missing_ok=True)
+            try:
+                aside.hardlink_to(path)
+            except OSError:  # a file system without hard links
+                path.rename(aside)
+        self.steps.append((path, aside))
 
     def prepare(self, path: Path, text: str) -> Path:
         """Write the new content of a file to a temporary file beside it, and return its path."""
         self.make_folder(path.parent)
         new = path.with_name(f".{path.name}.new")
-        self.created.append(new)
+        self.steps.append((new, None))
         with new.open("wb") as file:
             file.write(text.encode())
             file.flush()
@@ -113,22 +114,13 @@ class Rollback:
 
     def replace(self, path: Path, new: Path) -> None:
         """Replace a file by a prepared one, atomically: a reader finds the old or the new content."""
-        if path.exists():
-            aside = _aside(path)
-            aside.unlink(missing_ok=True)
-            try:
-                aside.hardlink_to(path)
-            except OSError:  # a file system without hard links
-                path.rename(aside)
-            self._set_aside.append((path, aside))
-        else:
-            self.created.append(path)
+        self.keep(path)
         new.rename(path)
 
     def finish(self) -> list[str]:
-        """Delete the files that were set aside. Return a sentence about each that cannot be deleted."""
+        """Delete the old contents. Return a sentence about each that cannot be deleted."""
         notes: list[str] = []
-        for _, aside in self._set_aside:
+        for aside in (aside for _, aside in self.steps if aside is not None):
             try:
                 aside.unlink()
             except OSError as error:
@@ -137,27 +129,22 @@ class Rollback:
 
     def undo(self) -> None:
         """Undo every step. If one cannot be undone, the others still are."""
-        for path in self.created:
+        for path, aside in reversed(self.steps):
             with suppress(OSError):
-                path.unlink(missing_ok=True)
-        for path, other in reversed(self._moved + self._set_aside):
-            with suppress(OSError):
-                other.rename(path)
-                other.unlink(missing_ok=True)  # rename does nothing if both are hard links of one file
-        for folder in reversed(self._folders):
-            with suppress(OSError):
-                folder.rmdir()
-
-
-def _aside(path: Path) -> Path:
-    return path.with_name(f".{path.name}.old")
+                if aside is not None:
+                    aside.rename(path)
+                    aside.unlink(missing_ok=True)  # rename does nothing if both are hard links of one file
+                elif path.is_dir():
+                    path.rmdir()
+                else:
+                    path.unlink(missing_ok=True)
 
 
 def is_loadable(folder: Path, member: Member) -> bool:
     """Whether a daemon would accept a member's files as they are here. Some may be on the vehicle only."""
     try:
-        load_config(folder / member.name / config_file(member), {})
-    except ConfigError:
+        check_members(folder, [member])
+    except FleetError:
         return False
     return True
 
