@@ -75,7 +75,7 @@ _CHANGE_ROWS = [
     ("[[peer]]", "[[peers]]", "peers", "did you mean [[peer]]?"),
     ("swarm-member", "pilot", "peer[0].role (drone1)", "the roles are vehicle, "),
     ("system_ids", "#", "peer[0].system_ids (drone1)", "which systems"),
-    ("public_key", "#", "peer[0].public_key (drone1)", "what `uavlinkd pubkey` prints on the peer"),
+    ("public_key", "#", "peer[0].public_key (drone1)", "what `uavlinkd pubkey` prints there"),
     ("10.13.0.2", "0.0.0.0", "peer[0].addresses[0] (drone1)", "every address of this machine"),
     ("10.13.0.2", "localhost", "peer[0].addresses (drone1)", "where this daemon listens"),
     ('["10.13.0.2:5790"]', '["a:1", "a:1"]', "peer[0].addresses (drone1)", "names an address twice"),

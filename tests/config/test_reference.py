@@ -18,9 +18,7 @@ from uavlinkd.mavlink.policy.settings import KEYS, read_settings
 
 PAGE = (Path(__file__).parents[2] / "uavlinkd/config/README.md").read_text()
 _ROW = re.compile(r"^\| `(\w+)` \| (.+?) \| (.+?) \| `(.+?)` \| .+ \|$", re.MULTILINE)
-_MODELS = {
-    value for value in vars(schema).values() if isinstance(value, type) and issubclass(value, schema.Section)
-} - {schema.Section}
+_MODELS = {schema.FileSection, schema.PolicySection, *schema.SINGLE.values(), *schema.REPEATED.values()}
 _TITLES = dict(re.findall(r"^## (`\[*(\w+)\]*`|Policy|Top of the file)$", PAGE, re.MULTILINE))
 
 
@@ -31,10 +29,9 @@ def _model(title: str) -> type[BaseModel]:
 
 
 def _own_keys(model: type[BaseModel]) -> set[str]:
-    """The keys that a section adds to those it shares with others, without the names of sections."""
-    shared = {key for base in model.__mro__[1:] if issubclass(base, BaseModel) for key in base.__annotations__}
-    sections = set(_TITLES.values()) if model is schema.FileSection else set()
-    return set(model.model_fields) - shared - sections
+    """The keys that a section adds to those it shares with others."""
+    others = {schema.LinkSection, schema.PolicySection} - {model}
+    return set(model.model_fields) - {key for other in others & set(model.__mro__) for key in other.model_fields}
 
 
 def _rows(title: str) -> dict[str, tuple[str, str, str]]:

@@ -29,7 +29,7 @@ from tests.policies import TRUSTED
 from tests.samples import attitude
 from uavlinkd.config import PeerAddress
 from uavlinkd.config import PeerConfig as Peer
-from uavlinkd.config.link_settings import verify_interval_s
+from uavlinkd.config.build import verify_interval_s
 from uavlinkd.core import handshake
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.cookie import MacKeys

@@ -16,7 +16,7 @@ from tests.network.air import Address, Endpoint
 from tests.network.drone import Drone
 from tests.network.network import Network
 from uavlinkd.config import PeerAddress, PeerConfig, RelayConfig
-from uavlinkd.config.relay_rules import TIMERS
+from uavlinkd.config.build import TIMERS
 from uavlinkd.core import constants as c
 from uavlinkd.core import outputs as o
 from uavlinkd.core.crypto import Entropy

@@ -9,10 +9,12 @@ from collections.abc import Iterator, Mapping
 from itertools import combinations
 from typing import Any
 
-from uavlinkd.config import network_rules, pasted_keys, policies, relay_rules
+from uavlinkd.config import network_rules, pasted_keys, relay_rules
+from uavlinkd.config.build import inherited, policy_data
 from uavlinkd.config.problems import Found, Sections, Values, unique
 from uavlinkd.config.schema import LinkSection
 from uavlinkd.endpoints.url import EndpointKind, EndpointUrl, NetworkUrl, SerialUrl
+from uavlinkd.mavlink.policy.settings import PolicyError, read_settings
 from uavlinkd.system.addresses import Address, overlaps
 
 _RETRIES_BEFORE_REJECT = 2
@@ -33,10 +35,10 @@ def check(file: Sections) -> Found:
     yield from _endpoints(file)
     yield from _timers(file.link)
     for endpoint in file.endpoints:
-        yield from policies.check(endpoint, is_local=True)
+        yield from _policy(endpoint, is_local=True)
     for peer in file.peers:
         yield from _timers(peer, file.link)
-        yield from policies.check(peer, is_local=False)
+        yield from _policy(peer, is_local=False)
 
 
 def _public_keys(file: Sections) -> Found:
@@ -150,11 +152,6 @@ def _clash(a: EndpointUrl, b: EndpointUrl) -> str | None:
     return None
 
 
-def inherited(link: Values, peer: Values) -> dict[str, Any]:
-    """The link keys that apply to a peer: its own, else those of ``[link]``, without defaults."""
-    return {key: value for key, value in {**link.valid, **peer.valid}.items() if key in LinkSection.model_fields}
-
-
 def _timers(section: Values, link: Values | None = None) -> Found:
     """The timers of ``[link]``, or of a peer that inherits from it, are in order."""
     given = inherited(link, section) if link else section.valid
@@ -179,3 +176,11 @@ def _disorder(values: Mapping[str, Any]) -> Iterator[tuple[str, tuple[str, ...],
             f"must be {least:g} or more, rekey_after_s and {_RETRIES_BEFORE_REJECT} times retry_max_s: the ends"
             " need time to make new keys before they drop the old ones",
         )
+
+
+def _policy(section: Values, *, is_local: bool) -> Found:
+    try:
+        read_settings(policy_data(section), is_local=is_local)
+    except PolicyError as error:
+        for problem in error.problems:
+            yield section.at(problem.key), f"{problem.problem}; {problem.remedy}"

@@ -10,26 +10,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from uavlinkd.config import checks, network_rules, pasted_keys, policies, relay_rules, schema
+from uavlinkd.config import checks, pasted_keys, schema
 from uavlinkd.config.advice import advice
+from uavlinkd.config.build import build
 from uavlinkd.config.keys import CREDENTIALS, KeyFileError, find_secret_file, read_secret_file
-from uavlinkd.config.link_settings import link_of
-from uavlinkd.config.model import (
-    Config,
-    ConfigError,
-    EndpointConfig,
-    Log,
-    PeerConfig,
-    Problem,
-    Recording,
-    Routing,
-)
+from uavlinkd.config.model import Config, ConfigError, Problem
 from uavlinkd.config.problems import Problems, Sections, Values
 from uavlinkd.config.syntax import at, syntax_problem
-from uavlinkd.core import constants as c
 from uavlinkd.core.crypto import Secret
-from uavlinkd.core.settings import PeerSettings
-from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.system.threads import Threads
 
 _MAX_FILE_BYTES = 1 << 20
@@ -44,28 +32,13 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
     """
     table = _read_toml(path)
     problems = Problems(str(path))
-
-    def one(key: str, model: type[schema.Section]) -> Values:
-        return problems.read(model, _table(problems, table, key), key)
-
-    def many(key: str, model: type[schema.Section]) -> list[Values]:
-        return _sections(problems, table, key, model)
-
-    file = Sections(
-        folder=path.absolute().parent,
-        top=problems.read(schema.FileSection, table, ""),
-        link=one("link", schema.LinkSection),
-        log=one("log", schema.LogSection),
-        routing=one("routing", schema.RoutingSection),
-        metrics=one("metrics", schema.MetricsSection),
-        recording=one("recording", schema.RecordingSection),
-        relay_server=one("relay_server", schema.RelayServerSection),
-        networks=many("network", schema.NetworkSection),
-        endpoints=many("endpoint", schema.EndpointSection),
-        peers=many("peer", schema.PeerSection),
-        members=many("member", schema.MemberSection),
-        relays=many("relay", schema.RelaySection),
-    )
+    keys = {key: table[key] for key in table if key not in schema.SINGLE and key not in schema.REPEATED}
+    sections: dict[str, Any] = {"top": problems.read(schema.FileSection, keys, "")}
+    for key, model in schema.SINGLE.items():
+        sections[key] = problems.read(model, _table(problems, table, key), key)
+    for key, model in schema.REPEATED.items():
+        sections[f"{key}s"] = _sections(problems, table, key, model)
+    file = Sections(path.absolute().parent, **sections)
     for section, key in (
         (file.top, "private_key_file"),
         (file.top, "previous_private_key_file"),
@@ -76,36 +49,9 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
     for place, message in checks.check(file):
         problems.add(place, message)
     problems.raise_any()
-    config = _config(path, file)
+    config = build(path, file)
     warnings = (*pasted_keys.advice(config.private_key.reveal(), file.others), *advice(config))
     return replace(config, warnings=warnings)
-
-
-def _config(path: Path, file: Sections) -> Config:
-    """The configuration in a file without problems, without its warnings."""
-    private, public = file.secret(file.top, "private_key_file"), file.own_key()
-    assert private is not None  # their absence is a problem
-    assert public is not None
-    top, recording = file.top, schema.RecordingSection.model_construct(**file.recording.valid)
-    folder = _beside(path, recording.folder)
-    return Config(
-        path=path,
-        name=top.valid["name"],
-        private_key=private,
-        public_key=public,
-        listen=tuple(top.get("listen", ())),
-        endpoints=tuple(_endpoint(endpoint) for endpoint in file.endpoints),
-        peers=tuple(_peer(file, peer) for peer in file.peers),
-        routing=Routing(**schema.RoutingSection.model_construct(**file.routing.valid).model_dump()),
-        control_socket=_beside(path, top.get("control_socket")),
-        metrics=file.metrics.get("listen"),
-        recording=Recording(folder, recording.max_files, recording.min_free_bytes) if folder else None,
-        log=Log(**schema.LogSection.model_construct(**file.log.valid).model_dump()),
-        previous_private_key=file.secret(top, "previous_private_key_file"),
-        networks=tuple(network_rules.network_of(network) for network in file.networks),
-        relay_server=relay_rules.relay_server_of(file),
-        relays=tuple(relay_rules.relay_of(file, relay) for relay in file.relays),
-    )
 
 
 async def load_in_thread(path: Path, environ: Mapping[str, str]) -> Config:
@@ -130,36 +76,11 @@ def load_control_socket(path: Path) -> Path | None:
     """
     table = _read_toml(path)
     problems = Problems(str(path))
-    top = problems.read(schema.FileSection, table, "")
+    top = problems.read(schema.FileSection, {key: table[key] for key in ("control_socket",) if key in table}, "")
     if "control_socket" in top.invalid:
         problems.raise_any()
-    return _beside(path, top.get("control_socket"))
-
-
-def _beside(path: Path, name: str | None) -> Path | None:
-    """The path of a file that the configuration names relative to itself."""
-    return None if name is None else path.absolute().parent / name
-
-
-def _endpoint(section: Values) -> EndpointConfig:
-    keys = schema.EndpointSection.model_construct(**section.valid)
-    return EndpointConfig(keys.name, keys.url, policies.data(section), keys.radio_status, keys.status_text)
-
-
-def _peer(file: Sections, peer: Values) -> PeerConfig:
-    keys = schema.LinkSection.model_construct(**checks.inherited(file.link, peer))
-    link, used = link_of(keys), relay_rules.relays_of(peer, file.relays)
-    if used or relay_rules.peer_of(peer, (*file.members, *file.relays)):  # they exchange records
-        link = replace(link, features=link.features | c.FEATURE_RECORDS)
-    psk = file.secret(peer, "psk_file")
-    return PeerConfig(
-        settings=PeerSettings(peer.valid["name"], peer.valid["public_key"], psk, link),
-        addresses=relay_rules.addresses_of(peer, file.relays),
-        previous_public_key=peer.get("previous_public_key"),
-        relays=used,
-        policy=policies.data(peer),
-        egress=EgressSettings(keys.budget_bits_s, keys.coalesce_s, keys.max_age_s),
-    )
+    name = top.get("control_socket")
+    return path.absolute().parent / name if name else None
 
 
 def _read_toml(path: Path) -> dict[str, Any]:

@@ -212,8 +212,8 @@ class Recording:
 class Log:
     """``level``: debug, info, warning or error. ``format``: console, json, or auto (console on a terminal)."""
 
-    level: str
-    format: str
+    level: str = "info"
+    format: str = "auto"
 
 
 @dataclass(frozen=True, slots=True)

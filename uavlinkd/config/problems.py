@@ -170,40 +170,18 @@ def _example(field: FieldInfo) -> str:
     return f"{field.default:g}" if isinstance(field.default, int | float) else f'"{field.default}"'
 
 
-# The policy's keys are checked by the policy itself, so the schema has no examples of them.
-_EXAMPLES = {
-    "role": '"swarm-member"',
-    "system_ids": "[2]",
-    **dict.fromkeys(("allow_in", "deny_in", "allow_out", "deny_out"), '["heartbeat", "telemetry"]'),
-    **dict.fromkeys(("rate_in", "rate_out"), "{ ATTITUDE = 10 }"),
-    **dict.fromkeys(("mavlink1", "ground_station"), "false"),
-}
-
-
 def example_of(key: str) -> str | None:
     """A value of a key as it is written in TOML; None if no section has the key."""
-    if key in _EXAMPLES:
-        return _EXAMPLES[key]
-    for model in _SECTIONS.values():
-        if key in model.model_fields and (field := model.model_fields[key]).annotation is not Any:
-            return _example(field)
-    return None
+    fields = (model.model_fields.get(key) for model in _SECTIONS.values())
+    return next((_example(field) for field in fields if field is not None), None)
 
 
 _SECTIONS: dict[str, type[schema.Section]] = {
     "at the top, before the first [section]": schema.FileSection,
     "in [link] or in a [[peer]]": schema.LinkSection,
     "in a [[peer]] or an [[endpoint]]": schema.PolicySection,
-    "in a [[peer]]": schema.PeerSection,
-    "in a [[relay]]": schema.RelaySection,
-    "in a [[network]]": schema.NetworkSection,
-    "in an [[endpoint]]": schema.EndpointSection,
-    "in a [[member]]": schema.MemberSection,
-    "in [relay_server]": schema.RelayServerSection,
-    "in [log]": schema.LogSection,
-    "in [routing]": schema.RoutingSection,
-    "in [metrics]": schema.MetricsSection,
-    "in [recording]": schema.RecordingSection,
+    **{f"in [[{key}]]": model for key, model in schema.REPEATED.items()},
+    **{f"in [{key}]": model for key, model in schema.SINGLE.items()},
 }
 
 # Names that WireGuard and common usage have for these keys, where the most similar key is another one.
@@ -244,8 +222,10 @@ def unknown_key(key: str, model: type[schema.Section]) -> str:
     for where, other in _SECTIONS.items():
         if key in other.model_fields and key not in model.model_fields:
             return f"does not belong here: write it {where}"
-    known = list(model.model_fields)
+    known = [*model.model_fields, *(_SECTION_NAMES if model is schema.FileSection else ())]
     if close := get_close_matches(plain, known, n=1, cutoff=0.7):
-        is_repeated = model is schema.FileSection and close[0] in ("peer", "endpoint", "network", "member", "relay")
-        return f"is not known: did you mean {f'[[{close[0]}]]' if is_repeated else close[0]}?"
+        return f"is not known: did you mean {_SECTION_NAMES.get(close[0], close[0])}?"
     return f"is not known here: the keys are {', '.join(known)}"
+
+
+_SECTION_NAMES = {key: key for key in schema.SINGLE} | {key: f"[[{key}]]" for key in schema.REPEATED}

@@ -2,26 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from typing import Final
 
-from uavlinkd.config.link_settings import link_of
-from uavlinkd.config.model import PeerAddress, RelayConfig, RelayServer
+from uavlinkd.config.model import PeerAddress
 from uavlinkd.config.problems import Found, Sections, Values, unique
-from uavlinkd.config.schema import LinkSection, MemberSection, RelayServerSection
-from uavlinkd.core import constants as c
-from uavlinkd.core.path import RELAY_HOST
-from uavlinkd.core.settings import Link, PeerSettings, Timers, previous_of
-from uavlinkd.relay.member_settings import MemberSettings, RelayLimits
 
 MOST_MEMBERS: Final = 4000
 """Each has up to three sessions, of 65,535 indices."""
 MOST: Final = 3
 """Relays of one daemon. A peer has room for the paths along so many."""
-TIMERS: Final = Timers(echo_after_s=0.1, handshake_after_s=0.2, lost_after_s=1.0, retry_max_s=0.5)
-"""A relay is asked when a path along it fails or its peer is silent, and answers at once unless it was restarted. A
-try costs 0.3 kB: while a relay is down, 5 kbit/s. When it is lost, its name is resolved again: it may have moved."""
 
 
 def members(file: Sections) -> Found:
@@ -90,13 +80,13 @@ def relays(file: Sections) -> Found:
 def _addresses(section: Values, peer: Values | None, others: Sequence[Values]) -> Found:
     """At least one over IP. One process answers at an address, with one key."""
     place = section.at("addresses")
-    has_peers = peer is not None and ("addresses" in peer.invalid or bool(_over_ip(peer)))
+    has_peers = peer is not None and ("addresses" in peer.invalid or bool(over_ip(peer)))
     if section.lacks("addresses") and not has_peers:
         yield place, 'is empty, and a relay never initiates: write its address, such as ["relay.example.org:5790"]'
     if any(written.is_serial for written in section.get("addresses", ())):
         yield place, "names a serial network, but a relay is reached over IP: write its IP address or name"
     for other in others:
-        shared = [written for written in _over_ip(section) if written in _over_ip(other)]
+        shared = [written for written in over_ip(section) if written in over_ip(other)]
         if shared and section.get("public_key") != other.get("public_key"):
             yield (
                 place,
@@ -105,7 +95,7 @@ def _addresses(section: Values, peer: Values | None, others: Sequence[Values]) -
             )
 
 
-def _over_ip(section: Values) -> list[PeerAddress]:
+def over_ip(section: Values) -> list[PeerAddress]:
     return [written for written in section.get("addresses", ()) if not written.is_serial]
 
 
@@ -119,59 +109,3 @@ def needs_no_address(peer: Values, sections: Sequence[Values]) -> bool:
     """Whether a peer uses a relay of the file, or is one, which has an address."""
     uses_relays = bool(sections) and peer.get("relays") != [] and "relays" not in peer.invalid
     return uses_relays or any(peer_of(section, [peer]) is not None for section in sections)
-
-
-# In a file without problems:
-
-
-def relays_of(peer: Values, sections: Sequence[Values]) -> tuple[str, ...]:
-    """The names of the relays that a peer uses. It is not reached along itself."""
-    names: list[str] | None = peer.get("relays")
-    return tuple(
-        section.valid["name"]
-        for section in sections
-        if peer_of(section, [peer]) is None and (names is None or section.valid["name"] in names)
-    )
-
-
-def addresses_of(peer: Values, sections: Sequence[Values]) -> tuple[PeerAddress, ...]:
-    """The addresses of a peer: its own, and those of the relay that it is."""
-    of_relay = [written for section in sections if peer_of(section, [peer]) for written in _over_ip(section)]
-    return tuple(dict.fromkeys((*peer.get("addresses", ()), *of_relay)))
-
-
-def relay_of(file: Sections, section: Values) -> RelayConfig:
-    """A relay. It inherits the suites of ``[link]``."""
-    suites = tuple(LinkSection.model_construct(**file.link.valid).suites)
-    peer = peer_of(section, file.peers)
-    return RelayConfig(
-        settings=PeerSettings(
-            name=RELAY_HOST + section.valid["name"],
-            public_key=section.valid["public_key"],
-            psk=file.secret(section, "psk_file"),
-            link=Link(suites, timers=TIMERS, features=c.FEATURE_REFUSALS | c.FEATURE_RECORDS),
-        ),
-        addresses=tuple(dict.fromkeys((*([] if peer is None else _over_ip(peer)), *_over_ip(section)))),
-        previous_public_key=section.get("previous_public_key"),
-        peer=None if peer is None else peer.valid["name"],
-    )
-
-
-def relay_server_of(file: Sections) -> RelayServer | None:
-    """The relay that this daemon is; None if it has no members."""
-    if not file.members:
-        return None
-    keys = RelayServerSection.model_construct(**file.relay_server.valid)
-    link = replace(link_of(LinkSection.model_construct(**file.link.valid)), features=c.FEATURE_RECORDS)
-    every = tuple(settings for section in file.members for settings in _member(file, section, link))
-    return RelayServer(every, RelayLimits(keys.datagrams_s, keys.bits_s))
-
-
-def _member(file: Sections, section: Values, link: Link) -> Iterator[MemberSettings]:
-    """One, or two while its key changes: others ask for it by the key that they know."""
-    keys = MemberSection.model_construct(**section.valid)
-    peer = PeerSettings(keys.name, keys.public_key, file.secret(section, "psk_file"), link, initiates=False)
-    limits = RelayLimits(keys.datagrams_s, keys.bits_s)
-    yield MemberSettings(peer, keys.max_peers, limits)
-    if keys.previous_public_key is not None:
-        yield MemberSettings(previous_of(peer, keys.previous_public_key), keys.max_peers, limits)

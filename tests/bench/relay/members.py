@@ -14,8 +14,8 @@ from typing import Final
 from tests.bench.relay.load import RELAY_CORE, Generator, host
 from tests.bench.relay.volleys import Address, Flow, Hosts, Received
 from tests.daemon.toml import to_toml
+from uavlinkd.config.build import TIMERS
 from uavlinkd.config.keys import decode_key, encode_key, generate_private_key, public_key_text, write_secret_file
-from uavlinkd.config.relay_rules import TIMERS
 from uavlinkd.core import constants as c
 from uavlinkd.core.crypto import KeyPair, Secret
 from uavlinkd.core.node import Node

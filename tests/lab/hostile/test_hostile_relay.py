@@ -11,7 +11,7 @@ import pytest
 
 from tests.relay.core_member import CoreMember
 from uavlinkd.config import RelayServer
-from uavlinkd.config.relay_rules import TIMERS
+from uavlinkd.config.build import TIMERS
 from uavlinkd.core import constants as c
 from uavlinkd.core.crypto import KeyPair, Secret
 from uavlinkd.core.settings import Link, PeerSettings

@@ -1,0 +1,227 @@
+"""From the sections of a file without problems to its :class:`Config`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Final
+
+from uavlinkd.config.model import (
+    Config,
+    EndpointConfig,
+    Log,
+    PeerAddress,
+    PeerConfig,
+    PolicyData,
+    Recording,
+    RelayConfig,
+    RelayServer,
+    Routing,
+)
+from uavlinkd.config.network_rules import network_of
+from uavlinkd.config.problems import Sections, Values
+from uavlinkd.config.relay_rules import over_ip, peer_of
+from uavlinkd.config.schema import (
+    EndpointSection,
+    LinkSection,
+    MemberSection,
+    PolicySection,
+    RecordingSection,
+    RelayServerSection,
+)
+from uavlinkd.core import constants as c
+from uavlinkd.core import wire
+from uavlinkd.core.path import RELAY_HOST
+from uavlinkd.core.settings import Link, PeerSettings, Redundancy, Timers, previous_of
+from uavlinkd.mavlink.egress.budgeted import EgressSettings
+from uavlinkd.relay.member_settings import MemberSettings, RelayLimits
+from uavlinkd.system.addresses import IPV6_UDP_BYTES
+
+VERIFYING_SHARE: Final = 0.05
+"""Share of the budget that the echo requests and replies of one end may use."""
+TIMERS: Final = Timers(echo_after_s=0.1, handshake_after_s=0.2, lost_after_s=1.0, retry_max_s=0.5)
+"""A relay is asked when a path along it fails or its peer is silent, and answers at once unless it was restarted. A
+try costs 0.3 kB: while a relay is down, 5 kbit/s. When it is lost, its name is resolved again: it may have moved."""
+# A policy's messages repeat a group, a message, a command or a number, so that a person can search for it.
+# Any other text may be a secret, or control a terminal, or have a million digits.
+_WORD = re.compile(r"[A-Za-z0-9_:. -]{1,32}|[A-Z][A-Z0-9_]{0,55}|command:[A-Z0-9_]{1,55}")
+_MOST = 2**63
+_HIDDEN = "…"
+
+
+def build(path: Path, file: Sections) -> Config:
+    """The configuration in a file without problems, without its warnings."""
+    private, public = file.secret(file.top, "private_key_file"), file.own_key()
+    assert private is not None  # their absence is a problem
+    assert public is not None
+    top = file.top
+    socket = top.get("control_socket")
+    return Config(
+        path=path,
+        name=top.valid["name"],
+        private_key=private,
+        public_key=public,
+        listen=tuple(top.get("listen", ())),
+        endpoints=tuple(_endpoint(endpoint) for endpoint in file.endpoints),
+        peers=tuple(_peer(file, peer) for peer in file.peers),
+        routing=Routing(**file.routing.valid),
+        control_socket=file.folder / socket if socket else None,
+        metrics=file.metrics.get("listen"),
+        recording=_recording(file),
+        log=Log(**file.log.valid),
+        previous_private_key=file.secret(top, "previous_private_key_file"),
+        networks=tuple(network_of(network) for network in file.networks),
+        relay_server=_relay_server(file),
+        relays=tuple(_relay(file, relay) for relay in file.relays),
+    )
+
+
+def _recording(file: Sections) -> Recording | None:
+    keys = RecordingSection.model_construct(**file.recording.valid)
+    return Recording(file.folder / keys.folder, keys.max_files, keys.min_free_bytes) if keys.folder else None
+
+
+def _endpoint(section: Values) -> EndpointConfig:
+    keys = EndpointSection.model_construct(**section.valid)
+    return EndpointConfig(keys.name, keys.url, policy_data(section), keys.radio_status, keys.status_text)
+
+
+def _peer(file: Sections, peer: Values) -> PeerConfig:
+    keys = LinkSection.model_construct(**inherited(file.link, peer))
+    link, used = link_of(keys), _relays(peer, file.relays)
+    if used or peer_of(peer, (*file.members, *file.relays)):  # they exchange records
+        link = replace(link, features=link.features | c.FEATURE_RECORDS)
+    psk = file.secret(peer, "psk_file")
+    return PeerConfig(
+        settings=PeerSettings(peer.valid["name"], peer.valid["public_key"], psk, link),
+        addresses=_addresses(peer, file.relays),
+        previous_public_key=peer.get("previous_public_key"),
+        relays=used,
+        policy=policy_data(peer),
+        egress=EgressSettings(keys.budget_bits_s, keys.coalesce_s, keys.max_age_s),
+    )
+
+
+def inherited(link: Values, peer: Values) -> dict[str, Any]:
+    """The link keys that apply to a peer: its own, else those of ``[link]``, without defaults."""
+    return {key: value for key, value in {**link.valid, **peer.valid}.items() if key in LinkSection.model_fields}
+
+
+def link_of(keys: LinkSection) -> Link:
+    """The settings of one link. ``lost_after_s`` sets the pace of the questions before it."""
+    tag_bytes, pace = keys.tag_bits // 8, keys.lost_after_s / c.LOST_AFTER_S
+    return Link(
+        suites=tuple(keys.suites),
+        confidential=keys.confidential,
+        tag_bytes=tag_bytes,
+        mac_key_bits=keys.mac_key_bits,
+        max_envelope=keys.max_envelope_bytes,
+        timers=Timers(
+            rekey_after_s=keys.rekey_after_s,
+            reject_after_s=keys.reject_after_s,
+            retry_min_s=min(c.RETRY_MIN_S, keys.retry_max_s),
+            retry_max_s=keys.retry_max_s,
+            keepalive_s=keys.keepalive_s,
+            echo_after_s=pace * c.ECHO_AFTER_S,
+            handshake_after_s=pace * c.HANDSHAKE_AFTER_S,
+            lost_after_s=keys.lost_after_s,
+            probe_interval_s=keys.probe_interval_s,
+        ),
+        redundancy=Redundancy(keys.redundancy),
+        idle_probe_s=keys.idle_probe_s,
+        verify_interval_s=verify_interval_s(keys.budget_bits_s, tag_bytes),
+    )
+
+
+def verify_interval_s(budget_bits_s: int, tag_bytes: int) -> float:
+    """Seconds between two echo requests, at least :data:`c.VERIFY_INTERVAL_S`. A budget of 0 means unlimited.
+
+    The request and its reply count, with the long header and over IPv6: their largest size.
+    """
+    if not budget_bits_s:
+        return c.VERIFY_INTERVAL_S
+    records = sum(len(wire.Echo(is_reply, 0, 0, 0).encode()) for is_reply in (False, True))
+    wire_bytes = records + 2 * (wire.LONG_HEADER_BYTES + tag_bytes + IPV6_UDP_BYTES)
+    return max(c.VERIFY_INTERVAL_S, 8 * wire_bytes / (VERIFYING_SHARE * budget_bits_s))
+
+
+def policy_data(section: Values) -> PolicyData:
+    """The section's policy, as data that cannot change and that messages may repeat."""
+    return MappingProxyType(
+        {key: _frozen(key, value) for key, value in section.valid.items() if key in PolicySection.model_fields}
+    )
+
+
+def _frozen(key: str, value: Any) -> object:
+    if key == "system_ids" and value == ["all"]:
+        return "all"  # two spellings of one value
+    if isinstance(value, list):
+        return tuple(map(_leaf, value))
+    if isinstance(value, dict):
+        return MappingProxyType({_leaf(key): _leaf(item) for key, item in value.items()})
+    return _leaf(value)
+
+
+def _leaf(value: Any) -> object:
+    """One word or number. Any other value becomes a placeholder, which a policy does not know either."""
+    if isinstance(value, str):
+        return value if _WORD.fullmatch(value) else _HIDDEN
+    if isinstance(value, float) or (isinstance(value, int) and abs(value) < _MOST):
+        return value
+    return _HIDDEN
+
+
+def _relays(peer: Values, sections: Sequence[Values]) -> tuple[str, ...]:
+    """The names of the relays that a peer uses. It is not reached along itself."""
+    names: list[str] | None = peer.get("relays")
+    return tuple(
+        section.valid["name"]
+        for section in sections
+        if peer_of(section, [peer]) is None and (names is None or section.valid["name"] in names)
+    )
+
+
+def _addresses(peer: Values, sections: Sequence[Values]) -> tuple[PeerAddress, ...]:
+    """The addresses of a peer: its own, and those of the relay that it is."""
+    of_relay = [written for section in sections if peer_of(section, [peer]) for written in over_ip(section)]
+    return tuple(dict.fromkeys((*peer.get("addresses", ()), *of_relay)))
+
+
+def _relay(file: Sections, section: Values) -> RelayConfig:
+    """A relay. It inherits the suites of ``[link]``."""
+    suites = tuple(LinkSection.model_construct(**file.link.valid).suites)
+    peer = peer_of(section, file.peers)
+    return RelayConfig(
+        settings=PeerSettings(
+            name=RELAY_HOST + section.valid["name"],
+            public_key=section.valid["public_key"],
+            psk=file.secret(section, "psk_file"),
+            link=Link(suites, timers=TIMERS, features=c.FEATURE_REFUSALS | c.FEATURE_RECORDS),
+        ),
+        addresses=tuple(dict.fromkeys((*([] if peer is None else over_ip(peer)), *over_ip(section)))),
+        previous_public_key=section.get("previous_public_key"),
+        peer=None if peer is None else peer.valid["name"],
+    )
+
+
+def _relay_server(file: Sections) -> RelayServer | None:
+    """The relay that this daemon is; None if it has no members."""
+    if not file.members:
+        return None
+    keys = RelayServerSection.model_construct(**file.relay_server.valid)
+    link = replace(link_of(LinkSection.model_construct(**file.link.valid)), features=c.FEATURE_RECORDS)
+    every = tuple(settings for section in file.members for settings in _member(file, section, link))
+    return RelayServer(every, RelayLimits(keys.datagrams_s, keys.bits_s))
+
+
+def _member(file: Sections, section: Values, link: Link) -> Iterator[MemberSettings]:
+    """One, or two while its key changes: others ask for it by the key that they know."""
+    keys = MemberSection.model_construct(**section.valid)
+    peer = PeerSettings(keys.name, keys.public_key, file.secret(section, "psk_file"), link, initiates=False)
+    limits = RelayLimits(keys.datagrams_s, keys.bits_s)
+    yield MemberSettings(peer, keys.max_peers, limits)
+    if keys.previous_public_key is not None:
+        yield MemberSettings(previous_of(peer, keys.previous_public_key), keys.max_peers, limits)
