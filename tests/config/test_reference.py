@@ -30,8 +30,8 @@ def _model(title: str) -> type[BaseModel]:
 
 def _own_keys(model: type[BaseModel]) -> set[str]:
     """The keys that a section adds to those it shares with others."""
-    others = {schema.LinkSection, schema.PolicySection} - {model}
-    return set(model.model_fields) - {key for other in others & set(model.__mro__) for key in other.model_fields}
+    shared = (base for base in (schema.LinkSection, schema.PolicySection) if model is not base)
+    return set(model.model_fields) - {key for base in shared if issubclass(model, base) for key in base.model_fields}
 
 
 def _rows(title: str) -> dict[str, tuple[str, str, str]]:
