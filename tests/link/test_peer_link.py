@@ -113,7 +113,7 @@ def test_a_budget_that_comes_with_a_reload_pays_for_nothing_before_it() -> None:
     peer_link.send(heartbeat(), PASSES, 2.0, 0.0)
     assert len(of(outputs, Transmit)) == 1
     assert peer_link.output.egress is not None
-    assert peer_link.output.egress.shape.payload_limit == pair.b.session.payload_limit
+    assert peer_link.output.egress._shape.payload_limit == pair.b.session.payload_limit
 
 
 def test_a_peer_whose_addresses_are_other_ones_is_not_called_at_those_before() -> None:

@@ -139,7 +139,7 @@ class PeerOutput:
         if self.egress is not None:
             limit = min(session.payload_limit, session.payload_limit_of(peer.paths.longest(Class.STREAM)))
             seal = session.parameters.max_envelope - session.payload_limit
-            self.egress.shape = EnvelopeShape(limit, seal, carrier_bytes(path))
+            self.egress.set_shape(EnvelopeShape(limit, seal, carrier_bytes(path)))
 
     def _follow_networks(self, peer: Peer, now: float) -> None:
         routes = {cls: [state for state in route if state.works] or route for cls, route in peer.paths.routes.items()}

@@ -29,7 +29,7 @@ class Link:
     ) -> None:
         """``networks``: the best path's first; ``is_split``: the peer has several paths."""
         self.egress = PeerEgress(settings, 0.0, CLASS_OF)
-        self.egress.shape = shape
+        self.egress.set_shape(shape)
         self.shape = shape
         self.is_split = is_split
         self.networks = networks

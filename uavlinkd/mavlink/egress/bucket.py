@@ -66,10 +66,6 @@ class Bucket:
         if self.level(now) > -DEBT_S * self.rate:
             self._bytes -= wire_bytes
 
-    def entry(self, price: float) -> float:
-        """The bytes that must be there for this price. A longer envelope than the bucket holds goes into debt."""
-        return min(price, self.burst)
-
     def wait_s(self, price: float, now: float) -> float:
         """How long until it has so many bytes, if nothing is sent meanwhile."""
         return max(0.0, (price - self.level(now)) / self.rate)
@@ -148,10 +144,11 @@ class Supply:
             return 0.0
         if not self.networks:
             return own
-        levels = [
+        levels = [  # an envelope that is longer than the bucket holds goes into debt
             max(network.level(now), price)
             for network in self.networks
-            if network.level(now) >= network.entry(price) and not network.price_before(queue, is_urgent=is_urgent)
+            if network.level(now) >= min(price, network.burst)
+            and not network.price_before(queue, is_urgent=is_urgent)
         ]
         if levels:
             self.leave(queue)
@@ -168,7 +165,7 @@ class Supply:
     def wait_s(self, queue: object, price: float, now: float, *, is_urgent: bool) -> float:
         """How long until the queue has room for an envelope of this price, as far as that is known."""
         waits = [
-            network.wait_s(network.entry(price) + network.price_before(queue, is_urgent=is_urgent), now)
+            network.wait_s(min(price, network.burst) + network.price_before(queue, is_urgent=is_urgent), now)
             for network in self.networks
         ]
         wait_s = min(waits, default=0.0)

@@ -66,13 +66,8 @@ class PeerEgress:
         self._queues: dict[Class, Egress | Coalescer] = {}  # of the stream alone, unless it is split
         self._rebuild(now)
 
-    @property
-    def shape(self) -> EnvelopeShape:
-        """The size of an envelope to this peer."""
-        return self._shape
-
-    @shape.setter
-    def shape(self, shape: EnvelopeShape) -> None:
+    def set_shape(self, shape: EnvelopeShape) -> None:
+        """Envelopes to this peer have another size from now on."""
         self._shape = shape
         if self._own is not None:
             self._own.set_least_burst(shape.overhead + MAX_FRAME_BYTES)

@@ -115,18 +115,13 @@ EFFECTS: Final = tuple((name, _full_names(commands), _full_names(others)) for na
 alternatives: the messages, and commands that start with MAV_CMD_, that can cause it too."""
 
 
-def full_command_name(number: int) -> str:
-    """A command's name with MAV_CMD_ before it."""
-    return f"MAV_CMD_{dialect.command_name(number).removeprefix('MAV_CMD_')}"
-
-
 def open_effects(denied: Iterable[int], passes: Callable[[str], bool]) -> Iterator[tuple[str, list[str], list[str]]]:
     """The effects of denied commands that a policy leaves open: each effect's name, its denied commands, and the
     messages and commands that cause it and still pass.
 
     ``denied``: numbers of commands. ``passes``: whether the policy lets a message or command of this name through.
     """
-    names = {full_command_name(number) for number in denied}
+    names = {dialect.command_name(number) for number in denied}
     for effect, commands, alternatives in EFFECTS:
         asked = [name for name in commands if name in names]
         causes = dict.fromkeys((*commands, *alternatives)) if asked else ()

@@ -24,7 +24,7 @@ from collections.abc import Iterable, Mapping
 from typing import Final, NamedTuple
 
 from uavlinkd.mavlink import dialect
-from uavlinkd.mavlink.policy.alternatives import full_command_name, open_effects
+from uavlinkd.mavlink.policy.alternatives import open_effects
 from uavlinkd.mavlink.policy.gate import REQUEST_MESSAGE, SAME_AS_COMMAND, Gate, Refusal
 from uavlinkd.mavlink.policy.settings import Direction, Rules, Settings, read_settings
 
@@ -103,7 +103,7 @@ def _warnings(settings: Settings, gates: Mapping[Direction, Gate]) -> list[str]:
             if msgid in SAME_AS_COMMAND
         }
         by_message = {
-            full_command_name(number): name for number, name in same.items() if number not in rules.denied_commands
+            dialect.command_name(number): name for number, name in same.items() if number not in rules.denied_commands
         }
         for name, denied, still_open in open_effects(rules.denied_commands | set(same), gate.lets_act):
             asked = ", ".join(by_message.get(command, command) for command in denied)  # as the file names them

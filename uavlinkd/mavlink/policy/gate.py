@@ -10,8 +10,7 @@ from typing import Final
 
 from uavlinkd.core.drops import Attention, Reason
 from uavlinkd.core.refusals import Refused
-from uavlinkd.mavlink import dialect
-from uavlinkd.mavlink.dialect import COMMANDS, MESSAGES
+from uavlinkd.mavlink.dialect import COMMANDS, IDS, MESSAGES, SETUP_SIGNING
 from uavlinkd.mavlink.flows import FlowKey, flow_key
 from uavlinkd.mavlink.frames import Frame, payload_bytes
 from uavlinkd.mavlink.headers import Header
@@ -26,14 +25,12 @@ MAX_DECISIONS: Final = 1024  # message ids whose decision is remembered
 BURST_S: Final = 0.5  # how much of a second's frames may come at once
 SYSTEM_SHARE: Final = 16  # what all components of a system may send of a message, in rates of one
 
-_IDS: Final = dialect.IDS
-
 NAMED_COMMANDS: Final = frozenset(COMMANDS.values())
 COMMAND_CARRIERS: Final = frozenset(msgid for msgid, row in MESSAGES.items() if row[6] is not None)
-DIRECT_COMMANDS: Final = frozenset((_IDS["COMMAND_LONG"], _IDS["COMMAND_INT"]))
+DIRECT_COMMANDS: Final = frozenset((IDS["COMMAND_LONG"], IDS["COMMAND_INT"]))
 
 # An autopilot answers these with hundreds of frames: components of a system share one rate.
-REQUESTS_OF_LISTS: Final = frozenset((_IDS["PARAM_REQUEST_LIST"], _IDS["PARAM_EXT_REQUEST_LIST"]))
+REQUESTS_OF_LISTS: Final = frozenset((IDS["PARAM_REQUEST_LIST"], IDS["PARAM_EXT_REQUEST_LIST"]))
 
 # A request for one message, by its number in the first parameter, a float at the payload's start. Some autopilots do
 # more than answer: PX4 adds parameters to its list if it is asked for UAVIONIX_ADSB_OUT_CFG.
@@ -41,7 +38,7 @@ REQUEST_MESSAGE: Final = COMMANDS["MAV_CMD_REQUEST_MESSAGE"]
 
 # Messages that do what a command does.
 SAME_AS_COMMAND: Final[Mapping[int, int]] = {
-    _IDS[message]: COMMANDS[f"MAV_CMD_{command}"]
+    IDS[message]: COMMANDS[f"MAV_CMD_{command}"]
     for message, command in (
         ("SET_MODE", "DO_SET_MODE"),
         ("MISSION_SET_CURRENT", "DO_SET_MISSION_CURRENT"),
@@ -64,7 +61,7 @@ SAME_AS_COMMAND: Final[Mapping[int, int]] = {
 }
 
 # ArduPilot executes such a mission item at once, by the value of `current` and not by its command.
-MISSION_ITEMS: Final = frozenset((_IDS["MISSION_ITEM"], _IDS["MISSION_ITEM_INT"]))
+MISSION_ITEMS: Final = frozenset((IDS["MISSION_ITEM"], IDS["MISSION_ITEM_INT"]))
 CURRENT_IN_MISSION_ITEM: Final = 35  # offset in the payload of both
 DONE_AT_ONCE: Final[Mapping[int, int]] = {
     2: COMMANDS["MAV_CMD_DO_REPOSITION"],
@@ -75,7 +72,7 @@ DONE_AT_ONCE: Final[Mapping[int, int]] = {
 OPCODE_IN_FILE_TRANSFER: Final = 6
 
 # Carries five command numbers at once, which are not looked at: refused where any command is denied.
-CARRIES_MANY_COMMANDS: Final = frozenset({_IDS["TRAJECTORY_REPRESENTATION_WAYPOINTS"]})
+CARRIES_MANY_COMMANDS: Final = frozenset({IDS["TRAJECTORY_REPRESENTATION_WAYPOINTS"]})
 
 
 class Refusal(Reason):
@@ -283,7 +280,7 @@ class Gate:
     def decide(self, msgid: int, *, is_known: bool) -> Refusal | Condition | None:
         """What holds for every frame of a message: it passes, is refused, or has conditions to meet."""
         rules = self._rules
-        if msgid == dialect.SETUP_SIGNING:
+        if msgid == SETUP_SIGNING:
             return Refusal.SETUP_SIGNING
         if rules.denies_all or msgid in rules.denied:
             return Refusal.MESSAGE_NOT_ALLOWED
@@ -321,7 +318,7 @@ class Gate:
     def lets_act(self, name: str) -> bool:
         """Whether a frame of this message passes that changes something; with MAV_CMD_ in front, of this command."""
         if not name.startswith("MAV_CMD_"):
-            verdict = self.decide(_IDS[name], is_known=True)
+            verdict = self.decide(IDS[name], is_known=True)
             return verdict is None or (isinstance(verdict, Condition) and not verdict.only_reads_files)
         verdicts = (self.decide(msgid, is_known=True) for msgid in DIRECT_COMMANDS)
         return any(
