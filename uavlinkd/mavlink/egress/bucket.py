@@ -144,10 +144,10 @@ class Supply:
             return 0.0
         if not self.networks:
             return own
-        levels = [  # an envelope that is longer than the bucket holds goes into debt
-            max(network.level(now), price)
+        levels = [
+            max(level, price)
             for network in self.networks
-            if network.level(now) >= min(price, network.burst)
+            if (level := network.level(now)) >= min(price, network.burst)  # a longer envelope goes into debt
             and not network.price_before(queue, is_urgent=is_urgent)
         ]
         if levels:
