@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.ops.schema import golden, log_names, metric_names
-from uavlinkd.ops.schema_versions import LOG_SCHEMA, METRICS_SCHEMA
+from uavlinkd.ops import LOG_SCHEMA, METRICS_SCHEMA
 
 ROOT = Path(__file__).parents[1]
 

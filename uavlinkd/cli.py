@@ -6,7 +6,6 @@ Exit status 0: success. 1: failure; the reason is on standard error. 2: the comm
 from __future__ import annotations
 
 import argparse
-import math
 import os
 import sys
 from collections.abc import Callable, Coroutine, Sequence
@@ -17,12 +16,16 @@ from typing import Any
 from uavlinkd import __version__
 from uavlinkd.core.constants import PROTOCOL_NAME
 from uavlinkd.fleet.commands import add_parser as add_fleet
-from uavlinkd.ops.commands import CommandError
 from uavlinkd.ops.commands import add_parsers as add_daemon_commands
-from uavlinkd.system.terminal import printable
+from uavlinkd.system.terminal import FAILED, OK, CommandError, UsageError, printable
 
-OK, FAILED, WRONG = 0, 1, 2
 _LINE_LIMIT = 4096
+_OF_THE_LABORATORY = {
+    "sim": "fly a simulated autopilot, or play a recorded flight",
+    "demo": "run two daemons on this machine that exchange frames",
+    "evaluate": "measure uavlinkd: beside the paper's method, under attack, and with radios that fail",
+}
+"""Commands of an optional package, which adds their arguments."""
 _NOT_A_RELAY = (
     "is not the file of a relay: that has a [[member]] for each daemon that may use it, no [[peer]] and no"
     " [[endpoint]]. A daemon that is also a relay is started with `uavlinkd run`"
@@ -31,7 +34,12 @@ _NOT_A_RELAY = (
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command and return its exit status."""
-    return _to_the_end(lambda: _main(arguments))
+
+    def command() -> int:
+        options = _parser().parse_args(arguments)
+        return int(options.command(options))
+
+    return _to_the_end(command)
 
 
 def _to_the_end(command: Callable[[], int]) -> int:
@@ -39,12 +47,21 @@ def _to_the_end(command: Callable[[], int]) -> int:
     try:
         try:
             return command()
+        except CommandError as error:
+            return _fail(error)
+        except KeyboardInterrupt:
+            return FAILED
         finally:
             _flush()
     except BrokenPipeError:
         return FAILED
     except CommandError as error:
-        return _fail(*error.args)
+        return _fail(error)
+
+
+def _fail(error: CommandError) -> int:
+    print(printable(str(error), keep="\n"), file=sys.stderr)
+    return error.status
 
 
 def _flush() -> None:
@@ -60,39 +77,8 @@ def _flush() -> None:
         raise CommandError(f"standard output: {error.strerror}") from None
 
 
-def _main(arguments: Sequence[str] | None) -> int:
-    command: Callable[[argparse.Namespace], int] | None = None
-    try:
-        options = _parser().parse_args(arguments)
-        command = options.command
-        return command(options)
-    except CommandError as error:
-        return _fail(*error.args)
-    except KeyboardInterrupt:
-        return OK if command in (_run, _sim) else FAILED  # these run until a signal
-
-
-def mitm(arguments: Sequence[str] | None = None) -> int:
-    """Run ``uavlink-mitm``: a man in the middle, an emulated radio, or a hostile relay. Return the exit status."""
-    return _to_the_end(lambda: _mitm(sys.argv[1:] if arguments is None else arguments))
-
-
-def _mitm(words: Sequence[str]) -> int:
-    try:
-        _need_lab("uavlink-mitm")
-    except CommandError as error:
-        return _fail(*error.args)
-    if words[:1] == ["relay"]:
-        from uavlinkd.lab.hostile.relay_cli import relay_main  # the man in the middle itself cannot import a key
-
-        return relay_main(words[1:])
-    from uavlinkd.lab.mitm.cli import main as mitm_main
-
-    return mitm_main(words)
-
-
 def _need_lab(command: str) -> None:
-    """Raise a CommandError if the extra ``lab`` is not installed. The Debian package has no ``uavlinkd.lab``."""
+    """Refuse a command whose extra is not installed. The Debian package has no ``uavlinkd.lab``."""
     from importlib.util import find_spec
 
     if find_spec("uavlinkd.lab") is None or find_spec("pymavlink") is None:
@@ -162,36 +148,17 @@ def _parser() -> argparse.ArgumentParser:
     psk = add("psk", _psk, "make a pre-shared key for one pair of peers")
     psk.add_argument("--out", metavar="FILE", type=Path, help="write it to FILE (mode 0600) instead of stdout")
 
-    sim = add("sim", _sim, "fly a simulated autopilot, or play a recorded flight")
-    sim.add_argument("--url", default="udpout:127.0.0.1:14550", help="where it sends MAVLink (default: %(default)s)")
-    sim.add_argument("--system-id", type=int, default=1, metavar="ID", help="1 to 255 (default: %(default)s)")
-    sim.add_argument("--rate", type=float, default=10.0, metavar="HZ", help="rate of ATTITUDE (default: %(default)s)")
-    sim.add_argument("--seconds", type=float, metavar="N", help="end after N seconds")
-    sim.add_argument("--seed", type=int, default=0, metavar="N", help="seed of sensor noise (default: %(default)s)")
-    sim.add_argument("--tlog", type=Path, metavar="FILE", help="play this recorded flight instead")
-    sim.add_argument("--speed", type=float, default=1.0, metavar="N", help="N times as fast; 0: as fast as possible")
-
-    demo = add("demo", _demo, "run two daemons on this machine that exchange frames")
-    demo.add_argument("--seconds", type=float, metavar="N", help="of traffic (default: 15, or 3 for each attack)")
-    demo.add_argument(
-        "--attack",
-        metavar="NAME[,key=value]",
-        help="attack between the drones: a name of `uavlink-mitm --list`, or all; exit status 0 if no forged, altered"
-        " or replayed frame was delivered and the link is up afterwards",
-    )
-    demo.add_argument("--json", action="store_true", help="print the summary as JSON on the last line")
+    for name, text in _OF_THE_LABORATORY.items():
+        commands.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.", fill=_fill_by_lab)
     add_fleet(commands)
-    text = "measure uavlinkd: beside the paper's method, under attack, and with radios that fail"
-    description = text[0].upper() + text[1:] + "."
-    commands.add_parser("evaluate", help=text, description=description, fill=_add_evaluations)
     return parser
 
 
-def _add_evaluations(parser: argparse.ArgumentParser) -> None:
-    _need_lab("uavlinkd evaluate")
-    from uavlinkd.lab.evaluation.commands import add_evaluations
+def _fill_by_lab(parser: argparse.ArgumentParser) -> None:
+    _need_lab(parser.prog)
+    from uavlinkd.lab.commands import add_arguments
 
-    add_evaluations(parser.add_subparsers(title="evaluations", metavar="WHAT", required=True))
+    add_arguments(parser)
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -201,19 +168,13 @@ def _run(options: argparse.Namespace) -> int:
     if not sys.stderr.isatty():
         # If rich is installed, structlog imports it for tracebacks on a terminal: 4 MB that JSON does not need.
         sys.modules.setdefault("rich", None)  # type: ignore[arg-type]
-    from uavlinkd.config import ConfigError
     from uavlinkd.config.load import load_config
-    from uavlinkd.endpoints.sockets import BindError
     from uavlinkd.link.daemon import Daemon
-    from uavlinkd.ops.control import ControlError
     from uavlinkd.ops.log import set_up_logging
 
-    try:
-        config = load_config(options.config, os.environ)
-    except ConfigError as error:
-        return _fail(error, WRONG)
+    config = load_config(options.config, os.environ)
     if options.is_relay and not config.is_only_relay:
-        return _fail(f"{options.config}: {_NOT_A_RELAY}", WRONG)
+        raise UsageError(f"{options.config}: {_NOT_A_RELAY}")
     set_up_logging(config.log.level, config.log.format)
 
     async def work() -> None:
@@ -221,10 +182,10 @@ def _run(options: argparse.Namespace) -> int:
 
     try:
         _run_loop(work())
-    except BindError as error:
-        return _fail(f"{options.config}: {error}")
-    except ControlError as error:
-        return _fail(f"{options.config}: control_socket: {error}")
+    except CommandError as error:
+        raise CommandError(f"{options.config}: {error}") from None
+    except KeyboardInterrupt:
+        pass  # before the daemon handled signals
     return OK
 
 
@@ -244,7 +205,6 @@ def _run_loop(work: Coroutine[None, None, None]) -> None:
 
 
 def _check(options: argparse.Namespace) -> int:
-    from uavlinkd.config import ConfigError
     from uavlinkd.config.keys import CREDENTIALS
     from uavlinkd.config.load import load_config
     from uavlinkd.ops.network_report import look_at_networks
@@ -252,12 +212,9 @@ def _check(options: argparse.Namespace) -> int:
     from uavlinkd.ops.topology import print_topology
 
     if options.keys is not None and not (options.keys.is_dir() and os.access(options.keys, os.R_OK | os.X_OK)):
-        return _fail(f"--keys: {options.keys} is not a readable folder", WRONG)
+        raise UsageError(f"--keys: {options.keys} is not a readable folder")
     environ = os.environ if options.keys is None else {CREDENTIALS: str(options.keys.absolute())}
-    try:
-        config = load_config(options.config, environ)
-    except ConfigError as error:
-        return _fail(error, WRONG)
+    config = load_config(options.config, environ)
     if options.elsewhere:
         print_topology(config)
         return OK
@@ -268,24 +225,22 @@ def _check(options: argparse.Namespace) -> int:
 
 
 def _keygen(options: argparse.Namespace) -> int:
-    from uavlinkd.config.keys import generate_private_key, public_key_text
+    from uavlinkd.config.keys import generate_private_key, public_key_text, write_secret_file
 
     private = generate_private_key()
     if options.out is None:
         print(private)
         print(f"public key: {public_key_text(private)}", file=sys.stderr)
         return OK
-    return _write_secret(options.out, private) or _print(public_key_text(private))
+    write_secret_file(options.out, private)
+    return _print(public_key_text(private))
 
 
 def _pubkey(options: argparse.Namespace) -> int:
-    from uavlinkd.config.keys import KeyFileError, encode_key, public_key_text, read_secret_file
+    from uavlinkd.config.keys import encode_key, public_key_text, read_secret_file
 
     if options.file is not None:
-        try:
-            private = encode_key(read_secret_file(options.file).reveal())
-        except KeyFileError as error:
-            return _fail(error)
+        private = encode_key(read_secret_file(options.file).reveal())
     else:
         private = ""
         with suppress(UnicodeDecodeError):  # bytes that are not text are not a key
@@ -293,90 +248,19 @@ def _pubkey(options: argparse.Namespace) -> int:
     try:
         return _print(public_key_text(private))
     except ValueError as error:
-        return _fail(f"{options.file or 'standard input'}: {error}")
+        raise CommandError(f"{options.file or 'standard input'}: {error}") from None
 
 
 def _psk(options: argparse.Namespace) -> int:
-    from uavlinkd.config.keys import generate_psk
+    from uavlinkd.config.keys import generate_psk, write_secret_file
 
     psk = generate_psk()
-    return _print(psk) if options.out is None else _write_secret(options.out, psk)
-
-
-def _write_secret(path: Path, text: str) -> int:
-    from uavlinkd.config.keys import KeyFileError, write_secret_file
-
-    try:
-        write_secret_file(path, text)
-    except KeyFileError as error:
-        return _fail(error)
+    if options.out is None:
+        return _print(psk)
+    write_secret_file(options.out, psk)
     return OK
-
-
-def _sim(options: argparse.Namespace) -> int:
-    _need_lab("uavlinkd sim")
-    import asyncio
-
-    from uavlinkd.lab.sim.flight import SimOptions, run_sim
-    from uavlinkd.lab.sim.links import LinkError, parse_url
-    from uavlinkd.lab.sim.tlog import TlogError
-
-    if not (math.isfinite(options.speed) and options.speed >= 0):
-        return _fail("--speed must be 0 or more", WRONG)
-    _check_seconds(options)
-    try:
-        url = parse_url(options.url)
-    except LinkError as error:
-        return _fail(error, WRONG)
-
-    def write(line: str) -> None:
-        print(printable(line), flush=True)
-
-    settings = SimOptions(
-        url, options.system_id, options.rate, options.seconds, options.seed, options.tlog, options.speed
-    )
-    try:
-        asyncio.run(run_sim(settings, write))
-    except (LinkError, TlogError) as error:
-        return _fail(error)
-    except OSError as error:
-        return _fail(f"cannot read {options.tlog}: {error.strerror or error}" if options.tlog else error)
-    except ValueError as error:  # a setting out of range
-        return _fail(error, WRONG)
-    return OK
-
-
-def _demo(options: argparse.Namespace) -> int:
-    _need_lab("uavlinkd demo")
-    import asyncio
-
-    from uavlinkd.lab.child_processes import interrupted_by_signals
-    from uavlinkd.lab.mitm.attack import AttackError
-    from uavlinkd.lab.sim.demo import DEMO_ERRORS, run_demo
-
-    _check_seconds(options)
-    try:
-        with interrupted_by_signals():
-            summary = asyncio.run(run_demo(options.seconds, show=not options.json, attack=options.attack))
-    except AttackError as error:
-        return _fail(error, WRONG)
-    except DEMO_ERRORS as error:
-        return _fail(error)
-    if options.json:
-        print(summary.to_json())
-    return OK if summary.is_good else FAILED
-
-
-def _check_seconds(options: argparse.Namespace) -> None:
-    if options.seconds is not None and not (math.isfinite(options.seconds) and options.seconds > 0):
-        raise CommandError("--seconds must be more than 0", WRONG)
 
 
 def _print(text: str) -> int:
     print(printable(text, keep="\n"))
     return OK
-
-
-def _fail(problem: object, status: int = FAILED) -> int:
-    print(printable(str(problem), keep="\n"), file=sys.stderr)
-    return status

@@ -30,7 +30,7 @@ from uavlinkd.link.direct_search import (
 from uavlinkd.link.event_log import LinkWatch, is_noteworthy
 from uavlinkd.link.peer_sockets import PeerSockets
 from uavlinkd.link.relays import Relays
-from uavlinkd.ops.link_problems import LinkProblem
+from uavlinkd.ops.findings import LinkProblem
 
 LINK = quiet(features=c.FEATURE_RECORDS)
 HOME_A, HOME_B = ("198.51.100.1", 4001), ("203.0.113.2", 4002)

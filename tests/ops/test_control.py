@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from uavlinkd.ops import control
-from uavlinkd.ops.control import MAX_CONNECTIONS, ControlError, ControlServer, ask
+from uavlinkd.ops.control import MAX_CONNECTIONS, MAX_REQUEST_BYTES, ControlError, ControlServer, ask
 
 
 @pytest.fixture
@@ -71,11 +71,11 @@ async def test_hostile_requests_get_an_error_only(server: ControlServer, path: P
 
 async def test_server_limits_the_request_exactly(path: Path) -> None:
     """The client reports why a longer request was refused, and does not repeat the request."""
-    server = ControlServer(path, lambda request: {"length": len(request)}, max_request_bytes=4096)
+    server = ControlServer(path, lambda request: {"length": len(request)})
     await server.start()
-    assert await asyncio.to_thread(ask, path, "x" * 4096) == {"length": 4096}
-    with pytest.raises(ControlError, match="refuses the request: the request is longer than 4096 bytes"):
-        await asyncio.to_thread(ask, path, "x" * 4097)
+    assert await asyncio.to_thread(ask, path, "x" * MAX_REQUEST_BYTES) == {"length": MAX_REQUEST_BYTES}
+    with pytest.raises(ControlError, match="refuses the request: the request is longer than 8192 bytes"):
+        await asyncio.to_thread(ask, path, "x" * (MAX_REQUEST_BYTES + 1))
     await server.stop()
 
 

@@ -1,12 +1,13 @@
-"""``uavlinkd netcheck``: what it concludes from what relays see, and from the tokens that arrived."""
+"""``uavlinkd netcheck``: what it concludes from views and tokens of relays. ``ping``: what it prints of each path."""
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import pytest
 
-from uavlinkd.ops.netcheck import Filtered, Mapped, behaviours
+from uavlinkd.ops.netcheck import INTERVAL_S, Filtered, Mapped, behaviours, ping
 
 PRIVATE, PUBLIC, OTHER = "192.168.1.5:5790", "203.0.113.7:40001", "203.0.113.7:40002"
 
@@ -76,3 +77,48 @@ def test_filtering_follows_from_the_tokens(passes: tuple[bool | None, ...], filt
     assert list(behaviours(answer(view("one", "a:1", PRIVATE), filtering=results))) == [
         (None, Mapped.NO_NAT, filtered)
     ]
+
+
+DIRECT: dict[str, Any] = {
+    "address": "203.0.113.7:5790",
+    "relay": None,
+    "network": "lte",
+    "answered_s": 1.02,  # at once, an interval ago
+    "round_trip_s": 0.0234,
+    "loss_in": 0.0,
+    "loss_out": 0.02,
+    "carries": ["critical", "stream", "bulk"],
+}
+RELAYED = {
+    **DIRECT,
+    "number": 1,
+    "address": "relayed via vps",
+    "relay": "vps",
+    "relay_address": "198.51.100.2:5790",
+    "network": None,
+    "carries": ["critical"],
+}
+SILENT = {**RELAYED, "answered_s": 3.0, "carries": []}
+
+
+@pytest.mark.parametrize(("paths", "is_answered"), [([DIRECT, SILENT], True), ([SILENT], False), ([], False)])
+def test_each_question_has_a_line_for_each_path(
+    paths: list[dict[str, Any]],
+    is_answered: bool,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The answers to the first question are shown a second later."""
+    slept: list[float] = []
+    monkeypatch.setattr(time, "sleep", slept.append)
+    assert ping(lambda: {"paths": paths}, 3) is is_answered
+    lines = capsys.readouterr().out.splitlines()
+    assert slept == [INTERVAL_S] * 3
+    assert len(lines) == 3 * max(1, len(paths))
+    assert lines[-1].startswith("3: ")
+    if len(paths) == 2:
+        assert lines[:2] == [
+            "1: direct to 203.0.113.7:5790 on lte, 23.4 ms, loss 0 % in, 2 % out, carries critical and stream and"
+            " bulk",
+            "1: relayed via vps, no answer, loss 0 % in, 2 % out, carries no frames",
+        ]

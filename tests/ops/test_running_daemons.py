@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 
 from tests.ops.test_status_screen import peer, status_of
-from uavlinkd.cli import FAILED, OK, WRONG, main
+from uavlinkd.cli import main
 from uavlinkd.ops import commands
-from uavlinkd.ops.running_daemons import control_sockets
+from uavlinkd.system.terminal import FAILED, OK, WRONG
 
 
 class Daemons:
@@ -59,7 +59,7 @@ def daemons(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Daemons
     """A folder in place of /run/uavlinkd; short enough for the path of a socket."""
     monkeypatch.chdir(tmp_path)
     folder = Path("run")
-    monkeypatch.setattr(commands, "control_sockets", lambda: control_sockets(folder))
+    monkeypatch.setattr(commands, "RUNTIME_FOLDER", folder)
     daemons = Daemons(folder)
     yield daemons
     daemons.close()

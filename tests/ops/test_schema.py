@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from tests.ops.schema import golden, status_names
 from tests.test_readmes import ROOT, names_in_table
-from uavlinkd.ops.schema_versions import STATUS_SCHEMA
+from uavlinkd.ops import STATUS_SCHEMA
 
 
 async def test_status_has_the_declared_names() -> None:

@@ -9,8 +9,7 @@ import pytest
 from rich.console import Console, RenderableType
 
 from uavlinkd.core.path_state import PathCondition
-from uavlinkd.ops.findings import Finding, Severity, Subject
-from uavlinkd.ops.link_problems import LinkProblem
+from uavlinkd.ops.findings import Finding, LinkProblem, Severity, Subject
 from uavlinkd.ops.status_screen import render_status
 
 PATH: dict[str, Any] = {

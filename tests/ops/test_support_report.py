@@ -10,10 +10,11 @@ import pytest
 
 from tests.daemon.harness import Stage, secret_forms
 from tests.waiting import until
-from uavlinkd.cli import FAILED, OK, main
+from uavlinkd.cli import main
 from uavlinkd.config import keys
 from uavlinkd.ops import support_report as report
 from uavlinkd.ops.redaction import Redactor
+from uavlinkd.system.terminal import FAILED, OK
 
 KEY = "eZPBKM+9Oztdms1v2yiR+byync+zZsR87etuOX4heHE="
 OTHER_KEY = "3NNFMbj2qtFyJqKVHtuuoixhFmd1DvyLQR2FuMwgtkY="

@@ -17,6 +17,7 @@ from pathlib import Path
 
 from uavlinkd.core.constants import KEY_BYTES
 from uavlinkd.core.crypto import Secret, x25519_public_key
+from uavlinkd.system.terminal import CommandError
 
 KEY_TEXT_LENGTH = 44
 """Characters of a key in base64."""
@@ -31,7 +32,7 @@ _FIELD_PRIME = 2**255 - 19
 """The field of X25519 (RFC 7748, section 4.1)."""
 
 
-class KeyFileError(Exception):
+class KeyFileError(CommandError):
     """A key file that cannot be used or written. The message names the file and the remedy, never a key."""
 
 

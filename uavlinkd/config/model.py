@@ -17,6 +17,7 @@ from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.relay.member_settings import MemberSettings, RelayLimits
 from uavlinkd.system.addresses import Address
+from uavlinkd.system.terminal import UsageError
 
 SERIAL = Address(SERIAL_HOST, 0)
 """The other end of a serial network."""
@@ -39,7 +40,7 @@ class Problem(NamedTuple):
         return ": ".join(part for part in self if part)
 
 
-class ConfigError(Exception):
+class ConfigError(UsageError):
     """Every problem of a file. ``str()`` has one line for each."""
 
     def __init__(self, problems: tuple[Problem, ...]) -> None:

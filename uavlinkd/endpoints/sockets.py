@@ -13,6 +13,7 @@ import structlog
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.error_meanings import ADDRESS_NOT_HERE_YET, meaning_of
 from uavlinkd.system.interfaces import find_interface
+from uavlinkd.system.terminal import CommandError
 
 BUFFER_BYTES = 1 << 20
 """Requested for the receive buffer and the send buffer: room for hundreds of envelopes of the default size. The
@@ -26,7 +27,7 @@ _FREEBIND = {
 }
 
 
-class BindError(Exception):
+class BindError(CommandError):
     """An address that cannot be listened on. The message is for the operator."""
 
     is_taken = False

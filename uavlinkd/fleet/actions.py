@@ -9,21 +9,14 @@ import sys
 from uavlinkd.fleet import operations
 from uavlinkd.fleet.manifest import FleetSettings, MemberKind
 from uavlinkd.fleet.operations import Result
-from uavlinkd.fleet.plan import DEFAULT_PLAN, NO_PLAN, FleetError, FleetFileError
+from uavlinkd.fleet.plan import DEFAULT_PLAN, NO_PLAN, FleetError
 from uavlinkd.system.addresses import Address, AddressError, parse_address
-from uavlinkd.system.terminal import printable
-
-OK, FAILED, WRONG = 0, 1, 2
+from uavlinkd.system.terminal import OK, printable
 
 
 def act(options: argparse.Namespace) -> int:
     """Run ``options.action``, and print the fleet and what to do next."""
-    try:
-        result = _ACTIONS[options.action](options)
-    except FleetError as error:
-        print(printable(str(error), keep="\n"), file=sys.stderr)
-        return FAILED if isinstance(error, FleetFileError) else WRONG
-    _print_result(options, result)
+    _print_result(options, _ACTIONS[options.action](options))
     return OK
 
 

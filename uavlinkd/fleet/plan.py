@@ -8,6 +8,7 @@ from ipaddress import IPv4Network, IPv6Network, ip_network
 from pathlib import Path
 
 from uavlinkd.system.addresses import DEFAULT_PORT, Address, AddressError, parse_address
+from uavlinkd.system.terminal import FAILED, UsageError
 
 DEFAULT_PLAN = "10.13.0.0/24"
 NO_PLAN = "none"
@@ -19,7 +20,7 @@ SYSTEM_IDS = range(1, 256)
 _BRACES = re.compile(r"\{n\}|\{name\}|[{}]")
 
 
-class FleetError(Exception):
+class FleetError(UsageError):
     """The command line, the manifest or a configuration is wrong. The command changed nothing.
 
     Each message is for a person and contains no secret.
@@ -28,6 +29,8 @@ class FleetError(Exception):
 
 class FleetFileError(FleetError):
     """A file or folder cannot be read or written."""
+
+    status = FAILED
 
 
 def no_fleet(folder: Path) -> FleetError:

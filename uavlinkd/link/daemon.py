@@ -21,9 +21,9 @@ from uavlinkd.link.parts import DaemonParts, make_parts
 from uavlinkd.link.peer_link import radio_figures
 from uavlinkd.link.status import daemon_status, paths_status, state_of
 from uavlinkd.mavlink.own_frames import INTERVAL_S
+from uavlinkd.ops import LOG_SCHEMA
 from uavlinkd.ops.control import ControlServer
 from uavlinkd.ops.recorder import Recorder
-from uavlinkd.ops.schema_versions import LOG_SCHEMA
 from uavlinkd.ops.sdnotify import Supervisor
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic

@@ -13,8 +13,7 @@ from uavlinkd.core.path import Path
 from uavlinkd.core.settings import link_name
 from uavlinkd.link.conditions import Conditions, LineLimits, OpenCondition, Phase
 from uavlinkd.link.peer_link import PeerLink
-from uavlinkd.ops.findings import Finding, Severity, Subject
-from uavlinkd.ops.link_problems import LinkProblem
+from uavlinkd.ops.findings import Finding, LinkProblem, Severity, Subject
 from uavlinkd.ops.log import shown
 
 FINDING_DELAY_S = 2.0

@@ -24,7 +24,7 @@ from uavlinkd.mavlink.frames import Frame, SplitCounters
 from uavlinkd.mavlink.own_frames import LinkFigures, worst
 from uavlinkd.mavlink.payloads import REQUESTS, ParameterAnswers
 from uavlinkd.mavlink.policy.delivery import Source
-from uavlinkd.ops.link_problems import LinkProblem
+from uavlinkd.ops.findings import LinkProblem
 from uavlinkd.ops.recorder import TO_PEER, Recorder
 
 NOT_ANSWERING_S = 5.0

@@ -17,8 +17,9 @@ from uavlinkd.link.relay_link import RelayLink
 from uavlinkd.mavlink.dialect import command_name, name_of
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import ANY_OTHER, REFUSALS, Refusal
+from uavlinkd.ops import STATUS_SCHEMA
 from uavlinkd.ops.log import shown
-from uavlinkd.ops.schema_versions import STATUS_SCHEMA
+from uavlinkd.ops.recorder import Recorder
 from uavlinkd.relay.service import RelayMember, RelayService
 from uavlinkd.system.addresses import Address
 

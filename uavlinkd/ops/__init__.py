@@ -1,1 +1,11 @@
-"""What an operator sees: control socket, status, metrics, logs and recordings."""
+"""What an operator uses: commands, status, log, metrics, recordings.
+
+The versions of what other software reads are here. A version rises when a name is removed, renamed or changes its
+type or meaning. An addition leaves it as it is. ``tests/ops/schema/`` has what each version contains.
+"""
+
+from typing import Final
+
+STATUS_SCHEMA: Final = 2
+LOG_SCHEMA: Final = 1
+METRICS_SCHEMA: Final = 2

@@ -7,20 +7,22 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
-from uavlinkd.ops.running_daemons import NoSocketError, control_sockets
-from uavlinkd.system.terminal import printable
+from uavlinkd.system.terminal import FAILED, OK, CommandError, UsageError, printable
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-OK, FAILED, WRONG = 0, 1, 2
+RUNTIME_FOLDER: Final = Path("/run/uavlinkd")
+"""Where the systemd units put the control sockets."""
+SOCKET_NAME: Final = "control.sock"
 WATCH_INTERVAL_S = 1.0
 
 
@@ -56,189 +58,171 @@ def _add(
         description=f"{text[0].upper()}{text[1:]}. Without an option it finds the running service and its instances.",
     )
     command.set_defaults(command=function)
-    add_daemon(command)
-    return command
-
-
-def add_daemon(command: argparse.ArgumentParser) -> None:
-    """Add the options that name a daemon."""
     daemon = command.add_mutually_exclusive_group()
     daemon.add_argument("--config", metavar="FILE", type=Path, help="the daemon's configuration")
     daemon.add_argument("--socket", metavar="PATH", type=Path, help="the daemon's control socket")
+    return command
 
 
-class CommandError(Exception):
-    """A command failed. The first argument is the reason, the second the exit status."""
+# The daemons that a command is for.
 
 
 def _control_sockets(options: argparse.Namespace) -> list[Path]:
-    """The control socket of the daemon that the options name, or those of all running services.
+    """The control socket of the daemon that the options name, or those of the service and its instances, by name.
 
     Raises:
         CommandError: no service runs, or the configuration names no socket or cannot be read.
     """
-    from uavlinkd.config import ConfigError
     from uavlinkd.config.load import load_control_socket
 
     if options.socket is not None:
-        return [Path(options.socket)]
-    if options.config is None:
-        try:
-            return control_sockets()
-        except NoSocketError as error:
-            raise CommandError(error, FAILED) from None
-    try:
-        path = load_control_socket(options.config)
-    except ConfigError as error:
-        raise CommandError(error, WRONG) from None
-    if path is None:
-        raise CommandError(f'{options.config} names no control_socket: add control_socket = "NAME.sock"', FAILED)
-    return [path]
+        return [options.socket]
+    if options.config is not None:
+        if (path := load_control_socket(options.config)) is None:
+            raise CommandError(f'{options.config} names no control_socket: add control_socket = "NAME.sock"')
+        return [path]
+    candidates = [RUNTIME_FOLDER / SOCKET_NAME, *sorted(RUNTIME_FOLDER.glob(f"*/{SOCKET_NAME}"))]
+    if not (sockets := [path for path in candidates if os.path.lexists(path)]):
+        raise CommandError(
+            f"no control socket in {RUNTIME_FOLDER} that this user may see: use sudo, start the service (`systemctl"
+            f' start uavlinkd`) with control_socket = "{candidates[0]}" in its file, or name the daemon:'
+            " --config FILE or --socket PATH"
+        )
+    return sockets
 
 
-def _ask(socket: Path, request: str, on_waiting: Callable[[], None] | None = None) -> dict[str, Any]:
-    """The daemon's answer. With ``on_waiting``, there is no time limit.
+def _control_socket(options: argparse.Namespace) -> Path:
+    """The control socket of the only daemon.
 
     Raises:
-        CommandError: there is no daemon, or it does not answer.
+        CommandError: as above, or several daemons run.
+    """
+    socket, *others = _control_sockets(options)
+    if others:
+        listed = "\n".join(f"  --socket {path}" for path in (socket, *others))
+        raise UsageError(f"several daemons run here: name one of them\n{listed}")
+    return socket
+
+
+def _for_each(options: argparse.Namespace, request: str, show: Callable[[dict[str, Any]], int]) -> int:
+    """Show the answer of each daemon, also after one that does not answer. The worst exit status counts.
+
+    Raises:
+        CommandError: there is no daemon, or the only one does not answer.
     """
     from uavlinkd.ops.control import ControlError, ask
 
-    try:
-        return ask(socket, request, on_waiting=on_waiting)
-    except ControlError as error:
-        raise CommandError(error, FAILED) from None
+    sockets = _control_sockets(options)
+    worst = OK
+    for socket in sockets:
+        try:
+            worst = max(worst, show(ask(socket, request)))
+        except ControlError as error:
+            if len(sockets) == 1:
+                raise
+            print(printable(str(error)), file=sys.stderr)
+            worst = FAILED
+    return worst
+
+
+# The commands.
 
 
 def _status(options: argparse.Namespace) -> int:
     from rich.console import Console
 
-    sockets = _control_sockets(options)
+    from uavlinkd.ops.status_screen import render_status
+
     if options.watch:
-        return _watch(sockets)
-    if options.json:
-        return _for_each(sockets, _print_json)
+        return _watch(_control_sockets(options))
     console = Console()
-    return _for_each(sockets, lambda socket: _show(socket, console))
+
+    def show(status: dict[str, Any]) -> int:
+        if options.json:
+            print(json.dumps(status))
+        else:
+            console.print(render_status(status))
+        return OK if status["frames_pass"] else FAILED
+
+    return _for_each(options, "status", show)
 
 
-def _for_each(sockets: Sequence[Path], show: Callable[[Path], int]) -> int:
-    """Show each daemon, also after one that does not answer. The worst exit status counts.
-
-    Raises:
-        CommandError: the only daemon does not answer.
-    """
-    if len(sockets) == 1:
-        return show(sockets[0])
-    worst = OK
-    for socket in sockets:
-        try:
-            worst = max(worst, show(socket))
-        except CommandError as error:
-            print(error.args[0], file=sys.stderr)
-            worst = max(worst, FAILED)
-    return worst
-
-
-def _print_json(socket: Path) -> int:
-    from uavlinkd.ops.status_screen import frames_pass
-
-    status = _ask(socket, "status")
-    print(json.dumps(status))
-    return OK if frames_pass(status) else FAILED
-
-
-def _show(socket: Path, console: Any) -> int:
-    from uavlinkd.ops.status_screen import frames_pass, render_status
-
-    status = _ask(socket, "status")
-    console.print(render_status(status))
-    return OK if frames_pass(status) else FAILED
-
-
-def _watch(sockets: Sequence[Path]) -> int:
+def _watch(sockets: list[Path]) -> int:
     """Refresh the screen until interrupted, also while the daemon restarts."""
     from rich.console import Group
     from rich.live import Live
-
-    passing: list[bool] = []
-    with suppress(KeyboardInterrupt), Live(auto_refresh=False, screen=True, vertical_overflow="crop") as live:
-        while True:
-            shown = list(map(_watched, sockets))
-            passing = [passes for _, passes in shown]
-            live.update(Group(*(screen for screen, _ in shown)), refresh=True)
-            time.sleep(WATCH_INTERVAL_S)
-    return OK if passing and all(passing) else FAILED
-
-
-def _watched(socket: Path) -> tuple[RenderableType, bool]:
     from rich.text import Text
 
-    from uavlinkd.ops.status_screen import frames_pass, render_status
+    from uavlinkd.ops.control import ControlError, ask
+    from uavlinkd.ops.status_screen import render_status
 
-    try:
-        status = _ask(socket, "status")
-    except CommandError as error:
-        return Text(str(error.args[0]), style="bold red"), False
-    return render_status(status), frames_pass(status)
+    passes = False
+    with suppress(KeyboardInterrupt), Live(auto_refresh=False, screen=True, vertical_overflow="crop") as live:
+        while True:
+            screens: list[RenderableType] = []
+            passing = []
+            for socket in sockets:
+                try:
+                    status = ask(socket, "status")
+                except ControlError as error:
+                    screens.append(Text(str(error), style="bold red"))
+                    passing.append(False)
+                else:
+                    screens.append(render_status(status))
+                    passing.append(bool(status["frames_pass"]))
+            passes = all(passing)
+            live.update(Group(*screens), refresh=True)
+            time.sleep(WATCH_INTERVAL_S)
+    return OK if passes else FAILED
 
 
 def _reload(options: argparse.Namespace) -> int:
+    from uavlinkd.ops.control import ask
+
     def report_wait() -> None:
         print("the daemon has not answered yet: it reads its file, or is busy. Still waiting", file=sys.stderr)
 
-    sockets = _control_sockets(options)
-    if len(sockets) > 1:
-        raise CommandError(_several(sockets), WRONG)
-    answer = _ask(sockets[0], "reload", on_waiting=report_wait)
+    socket = _control_socket(options)
+    answer = ask(socket, "reload", on_waiting=report_wait)
     if answer["problems"]:
-        raise CommandError("\n".join(answer["problems"]), WRONG)
-    print(printable(f"{answer.get('name', sockets[0])} reloaded"))
+        raise UsageError("\n".join(answer["problems"]))
+    print(printable(f"{answer.get('name', socket)} reloaded"))
     return OK
 
 
 def _ping(options: argparse.Namespace) -> int:
-    from uavlinkd.ops.ping import run
+    from uavlinkd.ops.control import ask
+    from uavlinkd.ops.netcheck import ping
 
-    sockets = _control_sockets(options)
-    if len(sockets) > 1:
-        raise CommandError(_several(sockets), WRONG)
+    socket = _control_socket(options)
     if options.count < 1:
-        raise CommandError("--count must be 1 or more", WRONG)
-    with suppress(KeyboardInterrupt):
-        return OK if run(lambda: _ask(sockets[0], f"ping {options.peer}"), options.count) else FAILED
-    return FAILED
+        raise UsageError("--count must be 1 or more")
+    return OK if ping(lambda: ask(socket, f"ping {options.peer}"), options.count) else FAILED
 
 
 def _netcheck(options: argparse.Namespace) -> int:
     from uavlinkd.ops.netcheck import report
 
-    def show(socket: Path) -> int:
-        answer = _ask(socket, "netcheck")
+    def show(answer: dict[str, Any]) -> int:
         for line in report(answer):
             print(printable(line))
         return OK if any(relay["state"] == "up" for relay in answer["relays"].values()) else FAILED
 
-    return _for_each(_control_sockets(options), show)
-
-
-def _several(sockets: Sequence[Path]) -> str:
-    listed = "\n".join(f"  --socket {socket}" for socket in sockets)
-    return f"several daemons run here: name one of them\n{listed}"
+    return _for_each(options, "netcheck", show)
 
 
 def _report(options: argparse.Namespace) -> int:
-    from uavlinkd.ops.support_report import service_files, write_report
+    from uavlinkd.ops.support_report import SERVICE_FILES, write_report
 
-    configs = service_files() if options.config is None and options.socket is None else [options.config]
+    configs = [options.config] if options.config is not None else []
+    if options.config is None and options.socket is None:
+        configs = sorted(SERVICE_FILES.glob("*.toml"))
     try:
         sockets = _control_sockets(options)
     except CommandError as error:
-        print(error.args[0], file=sys.stderr)  # a report on a daemon that does not start is needed too
+        print(printable(str(error), keep="\n"), file=sys.stderr)  # a daemon that does not start is reported on too
         sockets = []
-    problem = write_report(options, [path for path in configs if path is not None], sockets)
-    if problem is not None:
-        raise CommandError(problem, FAILED)
+    write_report(options, configs, sockets)
     return OK
 
 
@@ -247,14 +231,13 @@ def _peer_list(options: argparse.Namespace) -> int:
 
     from uavlinkd.ops.status_screen import render_peers
 
-    sockets = _control_sockets(options)
     console = Console()
+    is_one = len(_control_sockets(options)) == 1
 
-    def show(socket: Path) -> int:
-        status = _ask(socket, "status")
-        if len(sockets) > 1:
+    def show(status: dict[str, Any]) -> int:
+        if not is_one:
             console.print(f"{status['name']}:", style="bold", markup=False, highlight=False)
         console.print(render_peers(status))
         return OK
 
-    return _for_each(sockets, show)
+    return _for_each(options, "status", show)

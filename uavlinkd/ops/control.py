@@ -15,35 +15,35 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-MAX_REQUEST_BYTES = 256
-"""Default limit: the daemon's requests are single words."""
+from uavlinkd.system.terminal import CommandError
+
+MAX_REQUEST_BYTES = 8192
+"""Enough for the attacks of a man in the middle with all their parameters."""
 UNKNOWN = "unknown request"
 REQUEST_TIMEOUT_S = 5.0
 """Limit for sending the request, and for reading the answer. Making the answer has no limit."""
 MAX_CONNECTIONS = 8
 RECEIVE_BYTES = 65536
-_NO_UNIX_SOCKETS = "Python has no Unix sockets on this system: delete control_socket from the configuration"
-
 
 Answer = dict[str, object] | None
 
 
-class ControlError(Exception):
+class ControlError(CommandError):
     """The daemon did not get the request, or did not answer. The message says what to do."""
+
+
+def _unix_socket() -> socket.socket:
+    if not hasattr(socket, "AF_UNIX"):
+        raise ControlError("Python has no Unix sockets here: delete control_socket from the configuration")
+    return socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
 
 
 class ControlServer:
     """Answers requests with the result of ``answer``, which may be awaitable. None means an unknown request."""
 
-    def __init__(
-        self,
-        path: Path,
-        answer: Callable[[str], Answer | Awaitable[Answer]],
-        max_request_bytes: int = MAX_REQUEST_BYTES,
-    ) -> None:
+    def __init__(self, path: Path, answer: Callable[[str], Answer | Awaitable[Answer]]) -> None:
         self._path = path
         self._answer = answer
-        self._max_request_bytes = max_request_bytes
         self._server: asyncio.Server | None = None
         self._connections = 0
 
@@ -53,13 +53,10 @@ class ControlServer:
         Raises:
             ControlError: the path cannot be used.
         """
-        if not hasattr(socket, "AF_UNIX"):
-            raise ControlError(_NO_UNIX_SOCKETS)
-        if is_served(self._path):
-            raise ControlError(
-                f"cannot listen on the control socket {self._path}: another daemon answers there: choose another path"
-            )
-        sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        start = f"cannot listen on the control socket {self._path}"
+        if _is_served(self._path):
+            raise ControlError(f"{start}: another daemon answers there: choose another path")
+        sock = _unix_socket()
         try:
             if self._path.is_socket():
                 self._path.unlink()  # left by a daemon that was killed: no process listens
@@ -68,12 +65,10 @@ class ControlServer:
                 sock.bind(str(self._path))
             finally:
                 os.umask(mask)
-            self._server = await asyncio.start_unix_server(self._serve, sock=sock, limit=self._max_request_bytes)
+            self._server = await asyncio.start_unix_server(self._serve, sock=sock, limit=MAX_REQUEST_BYTES)
         except OSError as error:
             sock.close()
-            raise ControlError(
-                f"cannot listen on the control socket {self._path}: {error.strerror or error}: {_remedy(self._path)}"
-            ) from None
+            raise ControlError(f"{start}: {error.strerror or error}: {_remedy(self._path)}") from None
 
     async def stop(self) -> None:
         """Close the socket and remove it."""
@@ -86,15 +81,9 @@ class ControlServer:
         self._connections += 1
         try:
             if self._connections <= MAX_CONNECTIONS:
-                try:
-                    async with asyncio.timeout(REQUEST_TIMEOUT_S):
-                        line = await reader.readline()
-                except ValueError:
-                    answer = _line({"error": f"the request is longer than {self._max_request_bytes} bytes"})
-                else:
-                    answer = await self._respond(line)  # without a time limit
+                answer = await self._respond(reader)
                 async with asyncio.timeout(REQUEST_TIMEOUT_S):
-                    writer.write(answer)
+                    writer.write(json.dumps(answer).encode() + b"\n")
                     await writer.drain()
         except (OSError, TimeoutError):
             pass  # the client disconnected or hangs
@@ -102,16 +91,21 @@ class ControlServer:
             self._connections -= 1
             writer.close()
 
-    async def _respond(self, line: bytes) -> bytes:
+    async def _respond(self, reader: asyncio.StreamReader) -> dict[str, object]:
+        try:
+            async with asyncio.timeout(REQUEST_TIMEOUT_S):
+                line = await reader.readline()
+        except ValueError:
+            return {"error": f"the request is longer than {MAX_REQUEST_BYTES} bytes"}
         answer = self._answer(line.decode("utf-8", "replace").strip())
         if isinstance(answer, Awaitable):
-            answer = await answer
-        return _line({"error": UNKNOWN} if answer is None else answer)
+            answer = await answer  # without a time limit
+        return {"error": UNKNOWN} if answer is None else answer
 
 
-def is_served(path: Path) -> bool:
+def _is_served(path: Path) -> bool:
     """Whether a daemon listens on this control socket."""
-    with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as sock:
+    with suppress(OSError), _unix_socket() as sock:
         sock.setblocking(False)  # a busy daemon has room in its queue, or refuses at once
         with suppress(BlockingIOError):
             sock.connect(str(path))
@@ -119,8 +113,14 @@ def is_served(path: Path) -> bool:
     return False
 
 
-def _line(answer: dict[str, object]) -> bytes:
-    return json.dumps(answer).encode() + b"\n"
+def _remedy(path: Path) -> str:
+    """What to do about a socket that cannot be made."""
+    # The folder for the socket of a service is RuntimeDirectory= in systemd.exec(5).
+    folder, of_service = path.parent, os.environ.get("RUNTIME_DIRECTORY", "/run/uavlinkd").partition(":")[0]
+    if folder.is_relative_to(of_service):
+        return f"run `mkdir -p {folder}`, or start the service, which makes it"
+    make = "its folder must be writable" if folder.is_dir() else f"run `mkdir -p {folder}`"
+    return f'{make}; for a service, write control_socket = "{of_service}/control.sock"'
 
 
 def ask(
@@ -133,10 +133,8 @@ def ask(
     Raises:
         ControlError: no daemon listens, it refuses the client or the request, or it does not answer in time.
     """
-    if not hasattr(socket, "AF_UNIX"):
-        raise ControlError(_NO_UNIX_SOCKETS)
     try:
-        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as sock:
+        with _unix_socket() as sock:
             sock.settimeout(timeout_s)
             sock.connect(str(path))
             sock.sendall(request.encode() + b"\n")
@@ -154,20 +152,6 @@ def ask(
     if "error" in answer:
         raise ControlError(f"the daemon at {path} refuses the request: {answer['error']}")
     return answer
-
-
-def _remedy(path: Path) -> str:
-    """What to do about a socket that cannot be made."""
-    folder, of_service = path.parent, _runtime_folder()
-    if folder.is_relative_to(of_service):
-        return f"run `mkdir -p {folder}`, or start the service, which makes it"
-    make = "its folder must be writable" if folder.is_dir() else f"run `mkdir -p {folder}`"
-    return f'{make}; for a service, write control_socket = "{of_service}/control.sock"'
-
-
-def _runtime_folder() -> str:
-    """The folder for the socket of a service (RuntimeDirectory= in systemd.exec(5))."""
-    return os.environ.get("RUNTIME_DIRECTORY", "/run/uavlinkd").partition(":")[0]
 
 
 def _read_answer(sock: socket.socket, on_waiting: Callable[[], None] | None) -> bytes:

@@ -1,9 +1,11 @@
-"""Findings: each names one cause that stops frames or threatens a link, and its remedy."""
+"""Findings: each names one cause that stops frames or threatens a link, and its remedy. Problems that are counted."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import IntEnum
+from typing import NamedTuple
+
+from uavlinkd.core.drops import Reason
 
 
 class Severity(IntEnum):
@@ -25,8 +27,7 @@ class Subject(IntEnum):
     ENDPOINT = 2
 
 
-@dataclass(frozen=True, slots=True)
-class Finding:
+class Finding(NamedTuple):
     """One cause with its remedy, as ``status`` shows it in one line."""
 
     cause: str
@@ -43,10 +44,37 @@ class Finding:
     def as_json(self) -> dict[str, str]:
         """Plain values for ``status --json``."""
         return {
-            "cause": self.cause,
-            "severity": self.severity.name.lower(),
-            "subject": self.subject.name.lower(),
-            "name": self.name,
-            "text": self.text,
-            "remedy": self.remedy,
+            field: value.name.lower() if isinstance(value, IntEnum) else value
+            for field, value in self._asdict().items()
         }
+
+
+class LinkProblem(Reason):
+    """What the daemon counts for a peer although it drops no datagram."""
+
+    ENVELOPES_MISSING = "envelopes_missing", "envelopes did not arrive: the radio is bad, or an attacker drops them"
+    ENVELOPES_OUT_OF_ORDER = (
+        "envelopes_out_of_order",
+        "envelopes arrived after later ones: the network has several paths, or an attacker reorders them",
+        "out of order",
+    )
+    PATHS_UNPROVEN = (
+        "paths_unproven",
+        "the peer's envelopes came from an address that is not the peer's: an attacker forwards them",
+        "addresses without an answer",
+    )
+    ECHOES_UNANSWERED = (
+        "echoes_unanswered",
+        "the peer did not answer echo requests: it does not receive them, or an attacker drops the replies",
+        "unanswered echo requests",
+    )
+    HANDSHAKES_UNANSWERED = (
+        "handshakes_unanswered",
+        "the daemon repeated handshakes while the peer was up: the radio is bad, or an attacker drops them",
+        "unanswered handshakes",
+    )
+    COOKIES_TAKEN = (
+        "cookies_taken",
+        "the peer asked for proof of this daemon's address: it is under load, or an attacker forges its replies",
+        "cookies requested by the peer",
+    )

@@ -31,7 +31,7 @@ from uavlinkd.core.drops import DropReason
 from uavlinkd.core.path_state import PathCondition
 from uavlinkd.core.settings import Class
 from uavlinkd.mavlink.policy.gate import Refusal
-from uavlinkd.ops.schema_versions import LOG_SCHEMA, METRICS_SCHEMA, STATUS_SCHEMA
+from uavlinkd.ops import LOG_SCHEMA, METRICS_SCHEMA, STATUS_SCHEMA
 from uavlinkd.relay.forwarding import RelayReason
 
 CONTENT_TYPE = CONTENT_TYPE_PLAIN_0_0_4

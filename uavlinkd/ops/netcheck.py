@@ -1,4 +1,4 @@
-"""``uavlinkd netcheck``: which relays answer, how NATs map and filter, and what that means for direct paths.
+"""What ``uavlinkd ping`` and ``netcheck`` print: which paths and relays answer, and what NATs do to direct paths.
 
 The terms are those of RFC 4787 and RFC 5780. Relays report the source address that they see, and send a token from
 another port; what they cannot show is reported as unknown.
@@ -6,11 +6,54 @@ another port; what they cannot show is reported as unknown.
 
 from __future__ import annotations
 
+import time
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from enum import StrEnum
 from itertools import combinations
-from typing import Any
+from typing import Any, Final
+
+from uavlinkd.ops.status_screen import addresses
+from uavlinkd.system.terminal import printable
+
+INTERVAL_S: Final = 1.0
+"""Between the questions of ``ping``."""
+
+Answer = Mapping[str, Any]
+
+
+def ping(ask: Callable[[], Answer], count: int) -> bool:
+    """Ask along every path ``count`` times, a second apart, and print a line for each answer that came or did not.
+
+    ``ask`` sends the questions, and returns the paths as they were before. Returns whether the last question was
+    answered along any path.
+    """
+    ask()
+    answered = False
+    for number in range(1, count + 1):
+        time.sleep(INTERVAL_S)
+        paths = ask()["paths"]  # also the next questions
+        # A younger answer is one to the last question, which is an interval old.
+        times = [path["answered_s"] for path in paths]
+        answers = [time_s is not None and time_s < 1.5 * INTERVAL_S for time_s in times]
+        answered = any(answers)
+        for path, address, is_answered in zip(paths, addresses(paths), answers, strict=True):
+            facts = [
+                address if path["relay"] is not None else f"direct to {address}",
+                f"{1000 * path['round_trip_s']:.1f} ms" if is_answered else "no answer",
+                f"loss {100 * path['loss_in']:.0f} % in, {100 * path['loss_out']:.0f} % out",
+                f"carries {' and '.join(path['carries'])}" if path["carries"] else "carries no frames",
+            ]
+            if path["network"]:
+                facts[0] += f" on {path['network']}"
+            print(printable(f"{number}: {', '.join(facts)}"), flush=True)
+        if not paths:
+            print(
+                f"{number}: no path is known: the peer has not connected, or no relay has bound it;"
+                " `uavlinkd status` names the cause",
+                flush=True,
+            )
+    return answered
 
 
 class Mapped(StrEnum):
@@ -33,10 +76,6 @@ class Filtered(StrEnum):
     UNKNOWN = "unknown"
 
 
-STABLE = frozenset((Mapped.NO_NAT, Mapped.INDEPENDENT))
-"""Peers see the same port as relays do."""
-CHANGING = frozenset((Mapped.BY_ADDRESS, Mapped.BY_EITHER, Mapped.BY_PORT))
-
 ANY_PEER = "every peer that UDP reaches can connect directly, also from behind a NAT that changes ports"
 MOST_PEERS = "a peer can connect directly, unless its own NAT changes ports for each destination"
 STABLE_PEERS = (
@@ -56,53 +95,45 @@ ONE_HOST = (
     " second relay on another host"
 )
 
-NO_RELAY = (
-    "This file has no [[relay]]: netcheck asks relays how they see this machine. To add one, see"
-    " uavlinkd/relay/README.md"
-)
-
-Answer = Mapping[str, Any]
-
 
 def report(answer: Answer) -> Iterator[str]:
     """The lines of the report for a daemon's answer."""
     relays = answer["relays"]
     if not relays:
-        yield NO_RELAY
-        if answer.get("is_relay"):
+        yield (
+            "This file has no [[relay]]: netcheck asks relays how they see this machine. To add one, see"
+            " uavlinkd/relay/README.md"
+        )
+        if answer["is_relay"]:
             yield "This daemon is a relay itself: run netcheck at its members"
         return
-    up = [name for name, relay in relays.items() if relay["state"] == "up"]
-    yield f"UDP          {'gets out' if up else 'gets no answer'}: {len(up)} of {len(relays)} relays answer"
+    up = sum(relay["state"] == "up" for relay in relays.values())
+    yield f"UDP          {'gets out' if up else 'gets no answer'}: {up} of {len(relays)} relays answer"
     for name, relay in relays.items():
         yield f"relay        {name}: {relay['state']}{_about(relay)}"
-    if not up:
-        yield f"candidates   {', '.join(answer['candidates']) or 'none'}"
-        yield (
-            "No relay answers: compare addresses and public_key with the relay, write a [[member]] for this daemon"
-            " there, and let UDP through the firewalls. `uavlinkd status` here and there names the cause"
-        )
-        return
-    for view in answer["views"]:
+    for view in answer["views"] if up else ():
         network = f" on {view['network']}" if view["network"] else ""
         yield f"seen as      {view['seen_as']} by {view['relay']} at {view['relay_address']}{network}"
-    for where, mapped, filtered in behaviours(answer):
+    for where, mapped, filtered in behaviours(answer) if up else ():
         on_network = f" on {where}" if where else ""
         yield f"mapping      {mapped}{on_network}"
         yield f"filtering    {filtered}{on_network}"
         yield f"             {meaning(mapped, filtered)}"
     yield f"candidates   {', '.join(answer['candidates']) or 'none'}"
+    if not up:
+        yield (
+            "No relay answers: compare addresses and public_key with the relay, write a [[member]] for this daemon"
+            " there, and let UDP through the firewalls. `uavlinkd status` here and there names the cause"
+        )
 
 
 def _about(relay: Answer) -> str:
     """How fast a relay answers; where it does not."""
     if relay["state"] == "up":
         return f", {1000 * relay['round_trip_s']:.0f} ms" if relay["round_trip_s"] is not None else ""
-    if relay.get("unresolved"):
-        names = ", ".join(relay["unresolved"])
-        return f"; {names} has no address now: see `getent hosts {relay['unresolved'][0]}`"
-    where = ", ".join(relay.get("addresses", ()))  # an older daemon has none
-    return f"; no answer at {where}" if where else ""
+    if names := relay["unresolved"]:
+        return f"; {', '.join(names)} has no address now: see `getent hosts {names[0]}`"
+    return f"; no answer at {', '.join(relay['addresses'])}" if relay["addresses"] else ""
 
 
 def behaviours(answer: Answer) -> Iterator[tuple[str | None, Mapped, Filtered]]:
@@ -145,12 +176,15 @@ def _filtered(passes: set[bool | None]) -> Filtered:
 
 def meaning(mapped: Mapped, filtered: Filtered) -> str:
     """What both mean for direct paths."""
-    if mapped in CHANGING:
-        return FEW_PEERS
-    if mapped in STABLE:
-        return {
-            Filtered.NOT_BY_PORT: ANY_PEER,
-            Filtered.BY_PORT: MOST_PEERS,
-            Filtered.UNKNOWN: STABLE_PEERS,
-        }[filtered]
-    return ONE_HOST if mapped is Mapped.NOT_BY_PORT else ONE_VIEW
+    match mapped, filtered:
+        case (Mapped.BY_ADDRESS | Mapped.BY_EITHER | Mapped.BY_PORT), _:
+            return FEW_PEERS
+        case Mapped.UNKNOWN, _:
+            return ONE_VIEW
+        case Mapped.NOT_BY_PORT, _:
+            return ONE_HOST
+        case _, Filtered.NOT_BY_PORT:
+            return ANY_PEER
+        case _, Filtered.BY_PORT:
+            return MOST_PEERS
+    return STABLE_PEERS

@@ -18,7 +18,7 @@ from uavlinkd.core.drops import DropReason, Reason
 from uavlinkd.mavlink.egress.lanes import EgressDrop
 from uavlinkd.mavlink.frames import FrameFault
 from uavlinkd.mavlink.policy.gate import Refusal
-from uavlinkd.ops.link_problems import LinkProblem
+from uavlinkd.ops.findings import LinkProblem
 from uavlinkd.relay.forwarding import RelayReason
 from uavlinkd.system.error_meanings import meaning_of
 

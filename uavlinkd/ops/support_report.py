@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -18,7 +19,7 @@ from typing import Any, Final, NamedTuple
 from uavlinkd import __version__
 from uavlinkd.ops.control import ControlError, ask
 from uavlinkd.ops.redaction import Redactor
-from uavlinkd.system.terminal import printable
+from uavlinkd.system.terminal import CommandError, printable
 
 COMMAND_TIMEOUT_S: Final = 60.0
 LOG_LINES: Final = 300
@@ -191,41 +192,31 @@ def _split(address: str) -> tuple[str, str]:
 # The command.
 
 
-def write_report(options: argparse.Namespace, configs: Sequence[Path], sockets: Sequence[Path]) -> str | None:
-    """Make the report, show it and write it. Returns why it was not written.
+def write_report(options: argparse.Namespace, configs: Sequence[Path], sockets: Sequence[Path]) -> None:
+    """Make the report, show it and write it. On a terminal the user confirms it; elsewhere it needs ``--yes``.
 
-    On a terminal the user confirms it. Without a terminal, only ``--yes`` writes it.
+    Raises:
+        CommandError: the report was not written.
     """
-    is_asked = not options.yes
-    if is_asked and not _is_terminal():
-        return "a person has to read the report before it is written: run it on a terminal, or add --yes"
+    if not options.yes and not _is_terminal():
+        raise CommandError("a person has to read the report before it is written: run it on a terminal, or add --yes")
     path = options.out or Path(time.strftime("uavlinkd-report-%Y%m%d-%H%M%S.txt"))
     text = make_report(configs, sockets)
-    if is_asked:
+    if not options.yes:
         print(text)
-        try:
+        answer = ""
+        with suppress(EOFError):
             answer = input(f"Write this to {path}? [y/N] ")
-        except EOFError:
-            answer = ""
         if answer.strip().lower() not in ("y", "yes"):
-            return "the report was not written"
+            raise CommandError("the report was not written")
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
         with os.fdopen(descriptor, "w") as file:
             file.write(text)
     except OSError as error:
-        return f"{path}: cannot be written: {error.strerror}"
+        raise CommandError(f"{path}: cannot be written: {error.strerror}") from None
     print(path)
-    return None
 
 
 def _is_terminal() -> bool:
     return sys.stdin.isatty() and sys.stdout.isatty()
-
-
-def service_files() -> list[Path]:
-    """The configurations of the service and its instances."""
-    try:
-        return sorted(SERVICE_FILES.glob("*.toml"))
-    except OSError:
-        return []

@@ -1,6 +1,21 @@
-"""Text for a terminal: text from a file or an attacker must not act as a control sequence."""
+"""The end of a command: its exit status, and text for a terminal that must not act as a control sequence."""
 
 from __future__ import annotations
+
+OK, FAILED, WRONG = 0, 1, 2
+"""Exit statuses."""
+
+
+class CommandError(Exception):
+    """Ends a command. The message is for the user."""
+
+    status = FAILED
+
+
+class UsageError(CommandError):
+    """The command line or a configuration is wrong."""
+
+    status = WRONG
 
 
 def printable(text: str, *, keep: str = "") -> str:

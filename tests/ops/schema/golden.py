@@ -38,7 +38,7 @@ def differences(kind: str, version: int, declared: Mapping[str, Any], actual: Na
     file = f"tests/ops/schema/{kind}.json"
     rules = []
     if broken and version == declared["version"]:
-        rules.append(f"raise {kind.upper()}_SCHEMA in uavlinkd/ops/schema_versions.py: software that reads it breaks")
+        rules.append(f"raise {kind.upper()}_SCHEMA in uavlinkd/ops/__init__.py: software that reads it breaks")
     if broken or added or version != declared["version"]:
         rules.append(f"declare the version and these names in {file}")
     return [*broken, *added, *rules]

@@ -33,7 +33,7 @@ from uavlinkd.lab.mitm.attack import AttackObject, Direction
 from uavlinkd.lab.sim.drone_process import DroneProcess
 from uavlinkd.lab.sim.loopback_ports import free_ports
 from uavlinkd.mavlink.frames import SplitCounters, split_datagram
-from uavlinkd.ops.link_problems import LinkProblem
+from uavlinkd.ops.findings import LinkProblem
 
 OnDelivered = Callable[[str, bytes], None]
 """Called with the name of the receiver and a frame."""

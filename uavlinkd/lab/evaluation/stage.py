@@ -27,7 +27,7 @@ from uavlinkd.lab.evaluation.tampering_records import OURS, PAPER
 from uavlinkd.lab.mitm.attack import Direction
 from uavlinkd.lab.sim.drone_process import DroneProcess
 from uavlinkd.lab.sim.loopback_ports import free_ports
-from uavlinkd.ops.link_problems import LinkProblem
+from uavlinkd.ops.findings import LinkProblem
 
 PATIENCE_S = 120.0
 """How long linking may take; 0.5 s on a quiet machine."""

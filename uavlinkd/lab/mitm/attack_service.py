@@ -110,8 +110,6 @@ class Journal:
 
 
 REQUESTS = '"statistics", "stop", "attack none" or "attack NAME,key=value ..."'
-MAX_REQUEST_BYTES = 8192
-"""Enough for several attacks with all their parameters."""
 LOOP_TICK_S = 0.001
 """An event loop may fire a timer up to one clock tick early."""
 
@@ -180,7 +178,7 @@ class Service(ABC):
         """Open the control socket and the journal, or close everything."""
         try:
             if self._run.control_socket is not None:
-                self._control = ControlServer(self._run.control_socket, self.answer, MAX_REQUEST_BYTES)
+                self._control = ControlServer(self._run.control_socket, self.answer)
                 await self._control.start()
             self.journal = Journal(self._run.log, self.log, self._began_at)
         except BaseException:

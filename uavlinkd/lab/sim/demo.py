@@ -24,7 +24,7 @@ from uavlinkd.lab.mitm.attack import AttackContext
 from uavlinkd.lab.mitm.attacks import ATTACKS, AttackSpec, parse_attack
 from uavlinkd.lab.sim.demo_screen import AttackResult, Summary, render, render_summary
 from uavlinkd.lab.sim.drone_process import DroneError
-from uavlinkd.ops.link_problems import LinkProblem
+from uavlinkd.ops.findings import LinkProblem
 
 DEMO_ERRORS = (DroneError, EvaluationError)
 """The demo failed. The message is for the operator."""
