@@ -207,21 +207,16 @@ def _run_loop(work: Coroutine[None, None, None]) -> None:
 def _check(options: argparse.Namespace) -> int:
     from uavlinkd.config.keys import CREDENTIALS
     from uavlinkd.config.load import load_config
-    from uavlinkd.ops.network_report import look_at_networks
-    from uavlinkd.ops.surroundings import lacks, look_up_names
+    from uavlinkd.ops.surroundings import look_around
     from uavlinkd.ops.topology import print_topology
 
     if options.keys is not None and not (options.keys.is_dir() and os.access(options.keys, os.R_OK | os.X_OK)):
         raise UsageError(f"--keys: {options.keys} is not a readable folder")
     environ = os.environ if options.keys is None else {CREDENTIALS: str(options.keys.absolute())}
     config = load_config(options.config, environ)
-    if options.elsewhere:
-        print_topology(config)
-        return OK
-    answers = look_up_names(config)
-    networks = look_at_networks(config, answers)
-    print_topology(config, lacks=[*lacks(config, answers), *networks.lacks], networks=networks)
-    return FAILED if networks.errors else OK
+    here = None if options.elsewhere else look_around(config)
+    print_topology(config, here)
+    return FAILED if here is not None and here.errors else OK
 
 
 def _keygen(options: argparse.Namespace) -> int:

@@ -92,7 +92,7 @@ def make_control() -> Run:
 
 def make_metrics() -> Run:
     """One connection per script: one well-formed answer or none; the content only for a request of it."""
-    server = MetricsServer(Address("127.0.0.1", 9000), lambda: b"metric 1\n", "text/plain")
+    server = MetricsServer(Address("127.0.0.1", 9000), lambda: b"metric 1\n")
 
     def run(data: bytes) -> None:
         connection = Connection()

@@ -39,7 +39,7 @@ def source() -> Source:
 @pytest.fixture
 async def server(source: Source) -> AsyncIterator[MetricsServer]:
     """A server on loopback."""
-    server = MetricsServer(Address("127.0.0.1", 0), source, "text/x-test")
+    server = MetricsServer(Address("127.0.0.1", 0), source)
     await server.start()
     yield server
     server.stop()
@@ -88,7 +88,7 @@ async def test_prometheus_is_answered(server: MetricsServer) -> None:
         request = b"GET /metrics HTTP/1.1\r\nHost: 127.0.0.1:9790\r\nAccept: */*\r\n\r\n"
         response = await exchange(server, request, end=end)
         assert status(response) == 200
-        assert b"\r\nContent-Type: text/x-test\r\n" in response
+        assert b"\r\nContent-Type: text/plain; version=0.0.4\r\n" in response
         assert response.endswith(b"\r\n\r\n" + BODY)
 
 
@@ -172,11 +172,11 @@ async def test_frequent_requests_reuse_the_answer(
 @settings(max_examples=300)
 def test_any_bytes_are_answered(request: bytes) -> None:
     """The server raises no exception and does not send the content."""
-    server = MetricsServer(Address("127.0.0.1", 9790), lambda: BODY, "text/x-test")
+    server = MetricsServer(Address("127.0.0.1", 9790), lambda: BODY)
     assert status(server._respond(request + b"\r\n\r\n")) in (400, 404, 405, 421)
 
 
 def test_beyond_loopback_any_host_name_is_accepted() -> None:
     """The network reaches the port anyway, and Prometheus may use a name."""
-    server = MetricsServer(Address("0.0.0.0", 9790), lambda: BODY, "text/x-test")
+    server = MetricsServer(Address("0.0.0.0", 9790), lambda: BODY)
     assert status(server._respond(b"GET /metrics HTTP/1.1\r\nHost: drone1.local\r\n\r\n")) == 200

@@ -10,7 +10,7 @@ from uavlinkd.mavlink import dialect
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import Gate, Refusal
 from uavlinkd.mavlink.policy.roles import ROLES
-from uavlinkd.ops.policy_table import table_rows
+from uavlinkd.ops.topology import table_rows
 
 _POLICIES: dict[str, dict[str, object]] = {
     **{role: {"role": role} for role in ROLES},

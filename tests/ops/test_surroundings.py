@@ -1,19 +1,27 @@
-"""What ``check`` says about this machine: it looks, and binds, opens and writes nothing of the configuration."""
+"""What ``check`` says about this machine: it looks, and binds, opens and writes nothing of the configuration.
+
+tests/daemon/test_two_networks.py has networks with real routes.
+"""
 
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from tests.config.files import ADDRESSES, ENDPOINT, PEER, TOP, URL, load
+from tests.needs import need
 from uavlinkd.cli import main
+from uavlinkd.config import Config
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.ops import surroundings
 
 Lacks = Callable[..., list[str]]
+Load = Callable[[str], Config]
+_LOOPBACK = '[[network]]\nname = "loopback"\ninterface = "lo"\n'
 
 
 @pytest.fixture
@@ -25,7 +33,8 @@ def lacks(tmp_path: Path) -> Lacks:
     ) -> list[str]:
         text = f'{TOP}control_socket = "{control}"\nlisten = ["{listen or f"127.0.0.1:{free_port()}"}"]\n'
         text += ENDPOINT.replace(URL, url or f"udpin:127.0.0.1:{free_port()}")
-        return surroundings.lacks(load(tmp_path, text + PEER.replace(ADDRESSES, f'["{address}"]')))
+        config = load(tmp_path, text + PEER.replace(ADDRESSES, f'["{address}"]'))
+        return surroundings.look_around(config).lacks
 
     return loading
 
@@ -53,3 +62,30 @@ def test_check_prints_it_unless_the_file_is_for_another_machine(
     for options, is_shown in ([], True), (["--elsewhere"], False):
         assert main(["check", "--config", str(tmp_path / "drone0.toml"), *options]) == 0
         assert ("/dev/no-such-tty is not there" in " ".join(capsys.readouterr().out.split())) == is_shown
+
+
+@pytest.fixture
+def load_network(tmp_path: Path) -> Load:
+    """Loads a file with a network and this address of the peer."""
+    need(sys.platform == "linux", "Linux")
+    return lambda address: load(tmp_path, TOP + _LOOPBACK + PEER.replace(ADDRESSES, f'["{address}"]'))
+
+
+def test_without_the_tool_for_routes_nothing_is_said_about_them(
+    load_network: Load, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No route is reported as missing."""
+    monkeypatch.setattr(surroundings, "_IP", None)
+    report = surroundings.look_at_networks(load_network("203.0.113.7:5790"), {})
+    assert report.lacks == ["there is no `ip` here, so routes were not checked: install iproute2"]
+    assert (report.errors, report.reaches[0].unreached) == ([], [])
+
+
+def test_name_is_reached_at_one_of_its_addresses(load_network: Load) -> None:
+    """A name that does not resolve is neither reached nor unreached: another line reports it."""
+    need(surroundings._IP is not None, "iproute2")
+    config = load_network("drone1.test:5790")
+    (reach,) = surroundings.look_at_networks(config, {"drone1.test": ["127.0.0.1"]}).reaches
+    assert (reach.reached, reach.unreached) == (["drone1 drone1.test:5790"], [])
+    (reach,) = surroundings.look_at_networks(config, {"drone1.test": []}).reaches
+    assert (reach.reached, reach.unreached) == ([], [])

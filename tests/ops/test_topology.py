@@ -42,7 +42,7 @@ confidential = true
 
 def _printed(config: Config) -> str:
     file = io.StringIO()
-    print_topology(config, Console(file=file))
+    print_topology(config, console=Console(file=file))
     return file.getvalue()
 
 

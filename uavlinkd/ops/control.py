@@ -81,7 +81,13 @@ class ControlServer:
         self._connections += 1
         try:
             if self._connections <= MAX_CONNECTIONS:
-                answer = await self._respond(reader)
+                try:
+                    async with asyncio.timeout(REQUEST_TIMEOUT_S):
+                        line = await reader.readline()
+                except ValueError:
+                    answer: dict[str, object] = {"error": f"the request is longer than {MAX_REQUEST_BYTES} bytes"}
+                else:
+                    answer = await self._respond(line)  # without a time limit
                 async with asyncio.timeout(REQUEST_TIMEOUT_S):
                     writer.write(json.dumps(answer).encode() + b"\n")
                     await writer.drain()
@@ -91,15 +97,10 @@ class ControlServer:
             self._connections -= 1
             writer.close()
 
-    async def _respond(self, reader: asyncio.StreamReader) -> dict[str, object]:
-        try:
-            async with asyncio.timeout(REQUEST_TIMEOUT_S):
-                line = await reader.readline()
-        except ValueError:
-            return {"error": f"the request is longer than {MAX_REQUEST_BYTES} bytes"}
+    async def _respond(self, line: bytes) -> dict[str, object]:
         answer = self._answer(line.decode("utf-8", "replace").strip())
         if isinstance(answer, Awaitable):
-            answer = await answer  # without a time limit
+            answer = await answer
         return {"error": UNKNOWN} if answer is None else answer
 
 

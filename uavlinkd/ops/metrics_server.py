@@ -26,7 +26,6 @@ CONTENT_AGE_S = 0.5
 """An answer is reused for this long: frequent requests must not take CPU time from the links."""
 
 _REQUEST_LINE = re.compile(rb"([A-Z]{1,16}) (/[!-~]*) HTTP/1\.[01]")
-_TEXT = "text/plain; charset=utf-8"
 
 
 class MetricsServer:
@@ -35,10 +34,9 @@ class MetricsServer:
     Without a free connection, a new one replaces the oldest: hung clients do not block others.
     """
 
-    def __init__(self, address: Address, content: Callable[[], bytes], content_type: str) -> None:
+    def __init__(self, address: Address, content: Callable[[], bytes]) -> None:
         self._address = address
         self._make_content = content
-        self._content_type = content_type
         self._content = b""
         self._made_at = -CONTENT_AGE_S
         self._server: asyncio.Server | None = None
@@ -69,7 +67,9 @@ class MetricsServer:
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         if len(self._connections) >= MAX_CONNECTIONS:
-            self._evict()
+            oldest = next(iter(self._connections))
+            del self._connections[oldest]
+            oldest.transport.abort()
         self._connections[writer] = None
         try:
             async with asyncio.timeout(REQUEST_TIMEOUT_S):
@@ -91,11 +91,6 @@ class MetricsServer:
             self._connections.pop(writer, None)
             writer.close()
 
-    def _evict(self) -> None:
-        oldest = next(iter(self._connections))
-        del self._connections[oldest]
-        oldest.transport.abort()
-
     def _respond(self, request: bytes) -> bytes:
         line, *headers = request.removesuffix(b"\r\n\r\n").split(b"\r\n")
         match = _REQUEST_LINE.fullmatch(line)
@@ -111,7 +106,7 @@ class MetricsServer:
         now = monotonic()
         if now >= self._made_at + CONTENT_AGE_S:
             self._content, self._made_at = self._make_content(), now
-        return _response(HTTPStatus.OK, self._content, self._content_type, with_body=method == b"GET")
+        return _response(HTTPStatus.OK, self._content, with_body=method == b"GET")
 
     def _is_addressed(self, headers: list[bytes]) -> bool:
         """On loopback: whether each Host header names this machine.
@@ -120,17 +115,13 @@ class MetricsServer:
         """
         fields = [header.partition(b":") for header in headers]
         hosts = [value for name, _, value in fields if name.lower() == b"host"]
-        return not self._address.is_loopback or all(_is_number_or_localhost(host) for host in hosts)
+        return not self._address.is_loopback or all(map(_is_number_or_localhost, hosts))
 
 
 async def serve_metrics(address: Address, status: Callable[[], Status]) -> MetricsServer:
-    """Start a server that answers with the metrics of ``status()``.
-
-    Raises:
-        BindError: the address cannot be used; the text has the address and the reason.
-    """
+    """Start a server that answers with the metrics of ``status()``. It may raise a BindError."""
     started_at = monotonic()
-    server = MetricsServer(address, lambda: exposition(status(), monotonic() - started_at), CONTENT_TYPE)
+    server = MetricsServer(address, lambda: exposition(status(), monotonic() - started_at))
     await server.start()
     return server
 
@@ -146,9 +137,8 @@ def _is_number_or_localhost(host: bytes) -> bool:
     return True
 
 
-def _response(
-    status: HTTPStatus, body: bytes = b"", content_type: str = _TEXT, *, with_body: bool = True, extra: str = ""
-) -> bytes:
+def _response(status: HTTPStatus, body: bytes = b"", *, with_body: bool = True, extra: str = "") -> bytes:
+    content_type = CONTENT_TYPE if body else "text/plain; charset=utf-8"
     body = body or f"{status.phrase}\n".encode()
     head = (
         f"HTTP/1.1 {status.value} {status.phrase}\r\n"

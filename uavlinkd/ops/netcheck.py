@@ -177,7 +177,7 @@ def _filtered(passes: set[bool | None]) -> Filtered:
 def meaning(mapped: Mapped, filtered: Filtered) -> str:
     """What both mean for direct paths."""
     match mapped, filtered:
-        case (Mapped.BY_ADDRESS | Mapped.BY_EITHER | Mapped.BY_PORT), _:
+        case ((Mapped.BY_ADDRESS | Mapped.BY_EITHER | Mapped.BY_PORT), _):
             return FEW_PEERS
         case Mapped.UNKNOWN, _:
             return ONE_VIEW

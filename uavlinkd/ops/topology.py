@@ -1,8 +1,9 @@
-"""The output of ``uavlinkd check``: the identity of the daemon, its peers, and its ports that the network reaches."""
+"""The output of ``uavlinkd check``: identity, peers, the ports that the network reaches, and the policies."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Final
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console, Group, RenderableType
@@ -10,137 +11,82 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from uavlinkd.config import Config, PeerConfig, RelayConfig, RelayServer, Routing
+from uavlinkd.config import Config, EndpointConfig, PeerConfig, PolicyData
 from uavlinkd.config.advice import exposure
 from uavlinkd.config.keys import encode_key, looks_private, short_form
 from uavlinkd.config.model import KEY_GRACE_S
 from uavlinkd.config.network_rules import used_networks
 from uavlinkd.core.crypto import x25519_public_key
 from uavlinkd.core.settings import Link
-from uavlinkd.ops.network_report import NetworkReport
-from uavlinkd.ops.policy_table import review
+from uavlinkd.mavlink import dialect
+from uavlinkd.mavlink.policy.compilation import Policy, PolicyRow
+from uavlinkd.mavlink.policy.roles import ROLES
+from uavlinkd.ops.surroundings import Surroundings
 
-_PLAIN_WIDTH = 100
+_PLAIN_WIDTH: Final = 100
 """Columns of the output if it is not a terminal: a pipe has no width."""
 
 
-def print_topology(
-    config: Config,
-    console: Console | None = None,
-    lacks: Sequence[str] = (),
-    networks: NetworkReport | None = None,
-) -> None:
-    """Print the topology: with colours on a terminal, as plain text elsewhere.
-
-    ``lacks``: what this machine lacks for it, see :mod:`uavlinkd.ops.surroundings`. ``networks``: what they reach
-    here.
-    """
+def print_topology(config: Config, here: Surroundings | None = None, console: Console | None = None) -> None:
+    """Print the topology: with colours on a terminal, as plain text elsewhere. ``here``: what this machine has."""
     if console is None:
         console = Console()
     if console.is_terminal:
-        console.print(describe(config, lacks, networks))
+        console.print(describe(config, here))
         return
     plain = Console(width=_PLAIN_WIDTH, no_color=True, force_terminal=False)
     with plain.capture() as captured:
-        plain.print(describe(config, lacks, networks))
+        plain.print(describe(config, here))
     # Tables pad their columns with spaces, which a file does not need.
     console.file.writelines(line.rstrip() + "\n" for line in captured.get().splitlines())
 
 
-def describe(config: Config, lacks: Sequence[str] = (), networks: NetworkReport | None = None) -> Group:
+def describe(config: Config, here: Surroundings | None) -> Group:
     """All tables, the most important first. A few peers fit on one screen.
 
     Text from the file is always a :class:`rich.text.Text`, so that it cannot act as markup.
     """
     parts: list[RenderableType] = [_identity(config)]
     if config.networks:
-        parts += [_heading("Networks"), _networks(config, networks)]
+        parts += [_heading("Networks"), _networks(config, here)]
     if config.peers:
-        parts += [_heading("Peers"), _peers(config)]
+        columns = "name", "key", "address", "suites", "mode, at least", "PSK"
+        parts += [_heading("Peers"), _table(columns, map(_peer, config.peers))]
     if config.relays:
-        parts += [_heading("Relays"), _relays(config.relays)]
+        relays = (
+            (
+                relay.name,
+                _whole(relay.settings.public_key),
+                "\n".join(map(str, relay.addresses)),
+                _yes(relay.settings.psk),
+            )
+            for relay in config.relays
+        )
+        parts += [_heading("Relays"), _table(("name", "public key", "address", "PSK"), relays)]
     if config.endpoints:
-        parts += [_heading("Local endpoints"), _endpoints(config)]
+        columns = "name", "URL", "RADIO_STATUS", "STATUSTEXT", "plain MAVLink is open to"
+        parts += [_heading("Local endpoints"), _table(columns, map(_endpoint, config.endpoints))]
     if config.relay_server is not None:
-        parts += [_heading("Members of this relay, and their limits"), _members(config.relay_server)]
-    parts += review(config)
-    parts.append(_verdict(config, lacks, () if networks is None else networks.errors))
+        members = (
+            (
+                member.name,
+                _whole(member.peer.public_key),
+                _yes(member.peer.psk),
+                f"{member.most_peers:,}",
+                f"{member.limits.datagrams_s:,}",
+                f"{member.limits.bits_s / 1000:,.0f}",
+            )
+            for member in config.relay_server.members
+        )
+        columns = "name", "public key", "PSK", "members", "datagrams/s", "kbit/s"
+        parts += [_heading("Members of this relay, and their limits"), _table(columns, members)]
+    parts += _policies(config)
+    parts.append(_verdict(config.warnings, here))
     return Group(*parts)
 
 
 def _heading(text: str) -> Text:
     return Text(f"\n{text}", style="bold")
-
-
-def _identity(config: Config) -> Table:
-    table = Table.grid(padding=(0, 2))
-    table.add_column(style="dim")
-    table.add_column(overflow="fold")
-    table.add_row("name", Text(config.name, style="bold"))
-    # Not shortened: the user copies it into the files of the peers.
-    table.add_row("public key", Text(encode_key(config.public_key)))
-    if config.previous_private_key is not None:
-        before = encode_key(x25519_public_key(config.previous_private_key.reveal()))
-        table.add_row("previous key", Text(f"{before}\n{_GRACE}"))
-    table.add_row("listens on", Text(_listening(config)))
-    if not config.is_only_relay:
-        table.add_row("routing", Text(_routing(config.routing)))
-    if config.metrics is not None:
-        table.add_row("metrics", Text(f"http://{config.metrics}/metrics"))
-    if config.recording is not None:
-        free = f"keeps {config.recording.min_free_bytes / 1e9:g} GB of the disk free"
-        table.add_row("recordings", Text(f"{config.recording.folder} ({free})"))
-    return table
-
-
-_GRACE = f"valid until the peer confirms the new key, at most {KEY_GRACE_S / 86400:g} days from each start"
-
-
-def _routing(routing: Routing) -> str:
-    return (
-        "between peers and endpoints, and from peer to peer" if routing.relay else "between peers and endpoints only"
-    )
-
-
-def _listening(config: Config) -> str:
-    if config.has_ip_networks and config.listen:
-        ports = (f"port {address.port} ({'IPv6' if ':' in address.host else 'IPv4'})" for address in config.listen)
-        return f"{', '.join(ports)} of each network (UDP; answers only senders that know the public key)"
-    if not config.listen:
-        return "nothing: it connects to its peers, from any free port"
-    where = ", ".join(str(address) for address in config.listen)
-    if all(address.is_loopback for address in config.listen):
-        return f"{where} (UDP, this machine only)"
-    return f"{where} (UDP, open to the network; answers only senders that know the public key)"
-
-
-def _networks(config: Config, report: NetworkReport | None) -> Table:
-    """Each network with the peers' addresses that are used on it; on this machine, those that it reaches now."""
-    table = Table.grid(padding=(0, 2))
-    table.add_column(style="bold")
-    table.add_column(overflow="fold")
-    for number, network in enumerate(config.networks):
-        budget = f"{network.budget_bits_s:,} bits/s" if network.budget_bits_s else "no budget"
-        text = Text(f"{network.exit}, {'metered' if network.metered else 'not metered'}, {budget}")
-        if network.serial is not None:
-            text = Text(network.exit)
-        if report is None:
-            used = [
-                f"{peer.name} {written.address}"
-                for peer in config.peers
-                for written in peer.addresses
-                if any(used_networks([network], written))
-            ]
-            text.append(f"\nused for {', '.join(used) or 'no address of a peer'}")
-        else:
-            reach = report.reaches[number]
-            text.append(f"; {reach.here}")
-            if reach.reached:
-                text.append(f"\nreaches {', '.join(reach.reached)}")
-            if reach.unreached:
-                text.append(f"\ndoes not reach {', '.join(reach.unreached)}", style="bold red")
-        table.add_row(Text(network.name), text)
-    return table
 
 
 def _table(columns: Sequence[str], rows: Iterable[Sequence[str | Text]]) -> Table:
@@ -156,103 +102,198 @@ def _yes(condition: object) -> str:
     return "yes" if condition else "no"
 
 
-def _peers(config: Config) -> Table:
-    return _table(
-        ("name", "key", "address", "suites", "mode, at least", "PSK"),
-        (
-            (
-                peer.name,
-                _keys(peer),
-                "\n".join([*map(str, peer.addresses), *(f"relayed via {name}" for name in peer.relays)])
-                or "(it connects)",
-                " ".join(suite.name for suite in peer.settings.link.suites),
-                _mode(peer.settings.link),
-                _yes(peer.settings.psk),
-            )
-            for peer in config.peers
-        ),
-    )
-
-
-def _keys(peer: PeerConfig) -> str:
-    """The peer's key, and below it the previous one while that is accepted."""
-    now, before = peer.settings.public_key, peer.previous_public_key
-    if looks_private(now):  # perhaps it is: then not even its beginning is printed
-        return "(private?)"
-    return short_form(now) if before is None else f"{short_form(now)}\nor {short_form(before)}"
-
-
-def _mode(link: Link) -> str:
-    if link.confidential:
-        return "encrypted"
-    key = "" if link.mac_key_bits == Link().mac_key_bits else f", {link.mac_key_bits}-bit key"
-    return f"authentic, {8 * link.tag_bytes}-bit tag{key}"
-
-
-def _endpoints(config: Config) -> Table:
-    return _table(
-        ("name", "URL", "RADIO_STATUS", "STATUSTEXT", "plain MAVLink is open to"),
-        (
-            (
-                endpoint.name,
-                str(endpoint.url),
-                _yes(endpoint.radio_status),
-                _yes(endpoint.status_text),
-                Text(exposure(endpoint), style="bold red" if endpoint.url.is_exposed else ""),
-            )
-            for endpoint in config.endpoints
-        ),
-    )
-
-
-def _members(server: RelayServer) -> Table:
-    return _table(
-        ("name", "public key", "PSK", "members", "datagrams/s", "kbit/s"),
-        (
-            (
-                member.name,
-                _whole(member.peer.public_key),
-                _yes(member.peer.psk),
-                f"{member.most_peers:,}",
-                f"{member.limits.datagrams_s:,}",
-                f"{member.limits.bits_s / 1000:,.0f}",
-            )
-            for member in server.members
-        ),
-    )
-
-
-def _relays(relays: Sequence[RelayConfig]) -> Table:
-    return _table(
-        ("name", "public key", "address", "PSK"),
-        (
-            (
-                relay.name,
-                _whole(relay.settings.public_key),
-                "\n".join(map(str, relay.addresses)),
-                _yes(relay.settings.psk),
-            )
-            for relay in relays
-        ),
-    )
-
-
 def _whole(public_key: bytes) -> str:
     """Not shortened: the user compares it with what the other machine printed."""
     return "(private?)" if looks_private(public_key) else encode_key(public_key)
 
 
-def _verdict(config: Config, lacks: Sequence[str], errors: Sequence[str]) -> RenderableType:
+def _identity(config: Config) -> Table:
+    table = Table.grid(padding=(0, 2))
+    table.add_column(style="dim")
+    table.add_column(overflow="fold")
+    table.add_row("name", Text(config.name, style="bold"))
+    # Not shortened: the user copies it into the files of the peers.
+    table.add_row("public key", Text(encode_key(config.public_key)))
+    if config.previous_private_key is not None:
+        before = encode_key(x25519_public_key(config.previous_private_key.reveal()))
+        grace = f"valid until the peer confirms the new key, at most {KEY_GRACE_S / 86400:g} days from each start"
+        table.add_row("previous key", Text(f"{before}\n{grace}"))
+    table.add_row("listens on", Text(_listening(config)))
+    if not config.is_only_relay:
+        others = ", and from peer to peer" if config.routing.relay else " only"
+        table.add_row("routing", f"between peers and endpoints{others}")
+    if config.metrics is not None:
+        table.add_row("metrics", Text(f"http://{config.metrics}/metrics"))
+    if config.recording is not None:
+        free = f"keeps {config.recording.min_free_bytes / 1e9:g} GB of the disk free"
+        table.add_row("recordings", Text(f"{config.recording.folder} ({free})"))
+    return table
+
+
+def _listening(config: Config) -> str:
+    if config.has_ip_networks and config.listen:
+        ports = (f"port {address.port} ({'IPv6' if ':' in address.host else 'IPv4'})" for address in config.listen)
+        return f"{', '.join(ports)} of each network (UDP; answers only senders that know the public key)"
+    if not config.listen:
+        return "nothing: it connects to its peers, from any free port"
+    where = ", ".join(str(address) for address in config.listen)
+    if all(address.is_loopback for address in config.listen):
+        return f"{where} (UDP, this machine only)"
+    return f"{where} (UDP, open to the network; answers only senders that know the public key)"
+
+
+def _networks(config: Config, here: Surroundings | None) -> Table:
+    """Each network with the peers' addresses that are used on it; on this machine, those that it reaches now."""
+    table = Table.grid(padding=(0, 2))
+    table.add_column(style="bold")
+    table.add_column(overflow="fold")
+    for number, network in enumerate(config.networks):
+        budget = f"{network.budget_bits_s:,} bits/s" if network.budget_bits_s else "no budget"
+        text = Text(f"{network.exit}, {'metered' if network.metered else 'not metered'}, {budget}")
+        if network.serial is not None:
+            text = Text(network.exit)
+        if here is None:
+            used = [
+                f"{peer.name} {written.address}"
+                for peer in config.peers
+                for written in peer.addresses
+                if any(used_networks([network], written))
+            ]
+            text.append(f"\nused for {', '.join(used) or 'no address of a peer'}")
+        else:
+            reach = here.reaches[number]
+            text.append(f"; {reach.here}")
+            if reach.reached:
+                text.append(f"\nreaches {', '.join(reach.reached)}")
+            if reach.unreached:
+                text.append(f"\ndoes not reach {', '.join(reach.unreached)}", style="bold red")
+        table.add_row(Text(network.name), text)
+    return table
+
+
+def _peer(peer: PeerConfig) -> tuple[str, ...]:
+    now, before, link = peer.settings.public_key, peer.previous_public_key, peer.settings.link
+    keys = short_form(now) if before is None else f"{short_form(now)}\nor {short_form(before)}"
+    mode = "encrypted"
+    if not link.confidential:
+        key = "" if link.mac_key_bits == Link().mac_key_bits else f", {link.mac_key_bits}-bit key"
+        mode = f"authentic, {8 * link.tag_bytes}-bit tag{key}"
+    return (
+        peer.name,
+        "(private?)" if looks_private(now) else keys,  # perhaps it is: then not even its beginning is printed
+        "\n".join([*map(str, peer.addresses), *(f"relayed via {name}" for name in peer.relays)]) or "(it connects)",
+        " ".join(suite.name for suite in link.suites),
+        mode,
+        _yes(peer.settings.psk),
+    )
+
+
+def _endpoint(endpoint: EndpointConfig) -> tuple[str | Text, ...]:
+    return (
+        endpoint.name,
+        str(endpoint.url),
+        _yes(endpoint.radio_status),
+        _yes(endpoint.status_text),
+        Text(exposure(endpoint), style="bold red" if endpoint.url.is_exposed else ""),
+    )
+
+
+def _verdict(warnings: Sequence[str], here: Surroundings | None) -> RenderableType:
     """All errors and warnings, or a line that says that there is no warning."""
-    if not config.warnings and not lacks and not errors:
+    lines = [("error:", error) for error in (here.errors if here else ())]
+    lines += [("warning:", warning) for warning in warnings]
+    lines += [("this machine:", lack) for lack in (here.lacks if here else ())]
+    if not lines:
         return Text("\nNo warnings.", style="green")
-    warnings = Table.grid(padding=(0, 1))
-    warnings.add_column(style="bold yellow", no_wrap=True)
-    warnings.add_column(overflow="fold")
-    for error in errors:
-        warnings.add_row(Text("error:", style="bold red"), Text(error))
-    for warning in config.warnings:
-        warnings.add_row("warning:", Text(warning))
-    for lack in lacks:
-        warnings.add_row("this machine:", Text(lack))
-    return Padding(warnings, (1, 0, 0, 0))
+    table = Table.grid(padding=(0, 1))
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+    for label, line in lines:
+        table.add_row(Text(label, style="bold red" if label == "error:" else "bold yellow"), Text(line))
+    return Padding(table, (1, 0, 0, 0))
+
+
+# Policies, for a review.
+
+_NOT_IN_TABLES: Final = frozenset({"role", "may speak as", "urgent"})
+"""Rows in the summary; and a group that sets only the order: each of its messages is in another group."""
+_WHOLE: Final = (("both directions", ("all", "passes")), ("no direction", ("none", "never", "refused")))
+
+_Rows = tuple[PolicyRow, ...]
+
+
+def _policies(config: Config) -> list[RenderableType]:
+    """A line for each peer and endpoint; then each policy once, with the names of its peers and endpoints."""
+    senders = [("peer", peer.name, peer.policy, peer.make_policy()) for peer in config.peers]
+    senders += [("endpoint", endpoint.name, endpoint.policy, endpoint.make_policy()) for endpoint in config.endpoints]
+    if not senders:
+        return []
+    summary: list[tuple[str | Text, ...]] = []
+    names_of: dict[_Rows, list[str]] = {}
+    for kind, name, data, policy in senders:
+        if not data:
+            summary.append((kind, name, "may send everything except SETUP_SIGNING", "any"))
+            continue
+        incoming = {row.subject: row.incoming for row in policy.describe()}
+        role: str | Text = incoming["role"]
+        if kind == "peer" and role == dialect.ALL:
+            role = Text("all: everything except SETUP_SIGNING", style="bold yellow")
+        summary.append((kind, name, role, incoming["may speak as"]))
+        names_of.setdefault(table_rows(policy, data), []).append(name)
+    parts: list[RenderableType] = [_heading("Roles"), _table(("", "name", "role", "system ids"), summary)]
+    for rows, names in names_of.items():
+        parts += [_heading(f"Policy of {', '.join(names)}"), *_policy_tables(rows)]
+    return parts
+
+
+def _policy_tables(rows: _Rows) -> list[RenderableType]:
+    """The groups that pass in both directions, those that pass in none, and a table of the rest."""
+    alike: dict[tuple[str, str], list[str]] = {}
+    for row in rows:
+        alike.setdefault((row.incoming, row.outgoing), []).append(row.subject)
+    whole = Table.grid(padding=(0, 2))
+    for title, verdicts in _WHOLE:
+        if subjects := [subject for verdict in verdicts for subject in alike.pop((verdict, verdict), ())]:
+            whole.add_row(Text(title), Text(", ".join(subjects)))
+    alike.pop(("-", "-"), None)
+    if not alike:
+        return [whole]
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False, expand=True)
+    widest = max(len(f"{word},") for subjects in alike.values() for subject in subjects for word in subject.split())
+    table.add_column("otherwise", width=widest, overflow="fold")
+    for column in ("from it", "to it"):
+        table.add_column(column, ratio=1, overflow="fold")
+    for sides, subjects in alike.items():
+        table.add_row(*map(Text, (", ".join(subjects), *sides)))
+    return [whole, table]
+
+
+def table_rows(policy: Policy, data: PolicyData) -> _Rows:
+    """The rows of the policy, whose source is ``data``.
+
+    A message passes in a direction if a row allows its group or its name, and no row refuses a whole group that
+    contains it.
+    """
+    rows = []
+    for row in policy.describe():
+        if row.subject == "rates":
+            # As in the file: a group may have a hundred messages, each with this rate.
+            role = ROLES.get(str(data.get("role")))
+            sides = _rates(data.get("rate_in"), role.rate_in if role else {}), _rates(data.get("rate_out"), {})
+            rows.append(PolicyRow(row.subject, *sides))
+        elif row.subject not in _NOT_IN_TABLES:
+            rows.append(row)
+    return tuple(rows)
+
+
+def _rates(written: object, by_role: Mapping[str, float]) -> str:
+    """The rates of the file, and those of the role that the file does not replace."""
+    own = written if isinstance(written, Mapping) else {}
+    replaced = {name for key in own for name in _members(str(key))}
+    left = {key: rate for key, rate in by_role.items() if not replaced.issuperset(_members(key))}
+    return ", ".join(f"{name} {rate:g}/s" for name, rate in {**own, **left}.items()) or "-"
+
+
+def _members(name: str) -> tuple[str, ...]:
+    """The messages that a rate applies to."""
+    return dialect.GROUPS.get(name, (name,))
