@@ -71,7 +71,8 @@ def status_of(peers: dict[str, dict[str, Any]], **facts: object) -> dict[str, An
         "frames_pass": all(peer["state"] == "up" for peer in peers.values()),
         **{key: [] for key in ("blocked", "findings")},
         "peers": peers,
-        **{key: {} for key in ("endpoints", "networks", "drops", "send_failures", "stale")},
+        **{key: {} for key in ("endpoints", "networks", "relays", "drops", "send_failures", "stale")},
+        "relay": None,
         **facts,
     }
 

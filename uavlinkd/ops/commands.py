@@ -141,7 +141,7 @@ def _status(options: argparse.Namespace) -> int:
         if options.json:
             print(json.dumps(status))
         else:
-            console.print(render_status(status))
+            console.print(render_status(status, console.width))
         return OK if status["frames_pass"] else FAILED
 
     return _for_each(options, "status", show)
@@ -168,7 +168,7 @@ def _watch(sockets: list[Path]) -> int:
                     screens.append(Text(str(error), style="bold red"))
                     passing.append(False)
                 else:
-                    screens.append(render_status(status))
+                    screens.append(render_status(status, live.console.width))
                     passing.append(bool(status["frames_pass"]))
             passes = all(passing)
             live.update(Group(*screens), refresh=True)

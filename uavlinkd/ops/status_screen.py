@@ -10,7 +10,7 @@ from itertools import chain
 from typing import Any, Final
 
 from rich.box import SIMPLE_HEAD
-from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
+from rich.console import Group, JustifyMethod, RenderableType
 from rich.table import Table
 from rich.text import Text
 
@@ -65,24 +65,19 @@ _COPIES: Final = frozenset[str]({DropReason.DUPLICATE, DropReason.LATE_COPY})
 """What several paths cause all the time."""
 
 
-def frames_pass(status: Status) -> bool:
-    """Whether every peer is up, and no traffic was wholly refused within the last 10 s."""
-    return bool(status["frames_pass"])
-
-
-def render_status(status: Status) -> RenderableType:
+def render_status(status: Status, width: int = 80) -> RenderableType:
     """One screen: a headline, the problems, the peers with the broken ones first, the endpoints, and other counts."""
     parts: list[RenderableType] = [_headline(status)]
     if status["findings"]:
         parts.append(_findings(status["findings"]))
-    relay = status.get("relay")
+    relay = status["relay"]
     if relay is None or status["peers"] or status["endpoints"]:
-        parts += [_peers(status), _endpoints(status)]
+        parts += [*_peers(status, width), _endpoints(status)]
     if relay is not None:
         parts.append(_members(relay))
         if text := _listed(_by_count(relay["dropped"], DropReason, RelayReason)):
             parts.append(Text(f"not forwarded: {text}", style="yellow"))
-    parts += [_used_relay(name, used) for name, used in status.get("relays", {}).items()]
+    parts += [_used_relay(name, used) for name, used in status["relays"].items()]
     if status["networks"]:
         parts.append(_networks(status))
     if dropped := _listed(_by_count(status["drops"], DropReason)):
@@ -107,12 +102,12 @@ def _headline(status: Status) -> Text:
     peers = status["peers"].values()
     up = sum(peer["state"] == "up" for peer in peers)
     text = Text(f"{status['name']}  ", style="bold")
-    relay = status.get("relay")  # an older daemon has none
+    relay = status["relay"]
     counts = [f"{up} of {len(peers)} peers up"] if peers or relay is None else []
     if relay is not None:
         members = relay["members"].values()
         counts.append(f"relay: {sum(member['is_up'] for member in members)} of {len(members)} members up")
-    text.append(", ".join(counts), style="bold green" if frames_pass(status) else "bold red")
+    text.append(", ".join(counts), style="bold green" if status["frames_pass"] else "bold red")
     for blocked in status["blocked"]:
         towards = "from" if blocked["direction"] == "in" else "to"
         text.append(f", all frames {towards} {blocked['name']} are refused", style="bold red")
@@ -127,23 +122,21 @@ def _findings(findings: list[dict[str, str]]) -> Table:
     security = [finding for finding in findings if finding["severity"] == "security"]
     others = [finding for finding in findings if finding["severity"] != "security"]
     for finding in [*security, *others[:_SHOWN_FINDINGS]]:
-        style = _STYLES[finding["severity"]]
         label = finding["severity"]
-        subject = {"peer": finding["name"], "endpoint": f"endpoint {finding['name']}"}.get(finding["subject"], "")
-        line = Text(f"{subject}: " if subject else "", style="bold")
-        line.append(finding["text"], style=style if label == "security" else "not bold")
+        style, is_security = _STYLES[label], label == "security"
+        subject = {"peer": f"{finding['name']}: ", "endpoint": f"endpoint {finding['name']}: "}
+        line = Text(subject.get(finding["subject"], ""), style="bold")
+        line.append(finding["text"], style=style if is_security else "not bold")
         line.append(f". Remedy: {finding['remedy']}", style="not bold")
-        table.add_row(Text(label.upper() if label == "security" else label, style=style), line)
-    if len(others) > _SHOWN_FINDINGS:
-        left = len(others) - _SHOWN_FINDINGS
+        table.add_row(Text(label.upper() if is_security else label, style=style), line)
+    if (left := len(others) - _SHOWN_FINDINGS) > 0:
         table.add_row("", Text(f"and {left} more: `uavlinkd status --json` has all of them"))
     return table
 
 
-def _peers(status: Status) -> Group:
-    """A table of link quality, a table of paths and sessions in the same order, and the problems.
-
-    Peers with several paths have a line for each path in a table of their own.
+def _peers(status: Status, width: int) -> list[RenderableType]:
+    """A table of link quality, a table of paths and sessions in the same order, one of the paths of peers that have
+    several, and the problems.
 
     The tables fit into 80 columns; long names and IPv6 addresses are folded.
     """
@@ -160,15 +153,17 @@ def _peers(status: Status) -> Group:
             _rate(peer["bytes_in_s"]),
             _rate(peer["bytes_out_s"]),
         )
-        if peer["repair"]["is_on"]:
-            problems.append(Text(_repair(name, peer["repair"])))
+        if (repair := peer["repair"])["is_on"]:
+            kilobytes = f"{repair['bytes'] / 1000:,.0f} kB repeated so far"
+            times = f"sends critical frames {repair['transmissions']} times"
+            problems.append(Text(f"{name} repair: on for {_age(repair['on_s'])}, {times}; {kilobytes}"))
         if dropped := _listed(_drops(peer)):
             problems.append(Text(f"{name} dropped: {dropped}"))
         session = peer["session"] or {}
         age = _age(peer["handshake_s"]) if session else "-"
         paths.add_row(Text(name), Text(peer["path"] or "-"), session.get("suite", "-"), session.get("mode", "-"), age)
-    several = {name: peer for name, peer in _by_state(status) if len(peer["paths"]) > 1}
-    return Group(health, paths, *([_PathTable(several)] if several else []), *problems)
+    several = [(name, peer["paths"]) for name, peer in _by_state(status) if len(peer["paths"]) > 1]
+    return [health, paths, *([_paths(several, width)] if several else []), *problems]
 
 
 def _by_state(status: Status) -> list[tuple[str, Status]]:
@@ -237,11 +232,10 @@ def _drops(peer: Status) -> list[_Count]:
 
 def _refused(part: Status) -> dict[str, int]:
     """Refused frames of a policy, summed by reason."""
-    sums: dict[str, int] = {}
+    sums = Counter[str]()
     for messages in part["refused"].values():
         for reasons in messages.values():
-            for reason, count in reasons.items():
-                sums[reason] = sums.get(reason, 0) + count
+            sums.update(reasons)
     return sums
 
 
@@ -275,12 +269,6 @@ def _loss(peer: Status) -> Text:
     worst = max(peer["loss_in"], peer["loss_out"])
     style = "bold red" if worst > 0.2 else "yellow" if worst > 0.02 else ""
     return Text(f"{100 * peer['loss_in']:.0f}/{100 * peer['loss_out']:.0f} %", style=style)
-
-
-def _repair(name: str, repair: Status) -> str:
-    times, kilobytes = repair["transmissions"], repair["bytes"] / 1000
-    since = _age(repair["on_s"])
-    return f"{name} repair: on for {since}, sends critical frames {times} times; {kilobytes:,.0f} kB repeated so far"
 
 
 def _age(seconds: float | None) -> str:
@@ -324,23 +312,15 @@ def addresses(paths: Sequence[Mapping[str, Any]]) -> list[str]:
     return names
 
 
-class _PathTable:
-    """The paths of all peers that have several; it fits into 80 columns. Pairs of numbers are in/out."""
-
-    def __init__(self, peers: Mapping[str, Status]) -> None:
-        self._peers = peers
-
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """The table with as many columns as have room."""
-        is_wide = options.max_width >= _WIDE
-        names = ["state", "carries", "rtt ms", "loss %", "kB/s"]
-        table = _table("path", whole=names + ["lag ms", "MB"] * is_wide)
-        for name, peer in self._peers.items():
-            table.add_row(Text(name, style="bold"))
-            for path, address in zip(peer["paths"], addresses(peer["paths"]), strict=True):
-                cells = _cells(path, address)
-                table.add_row(*(cells if is_wide else cells[: len(names) + 1]))
-        yield table
+def _paths(peers: Sequence[tuple[str, list[Status]]], width: int) -> Table:
+    """The paths of these peers, with as many columns as have room. Pairs of numbers are in/out."""
+    more = ("lag ms", "MB") if width >= _WIDE else ()
+    table = _table("path", whole=("state", "carries", "rtt ms", "loss %", "kB/s", *more))
+    for name, paths in peers:
+        table.add_row(Text(name, style="bold"))
+        for path, address in zip(paths, addresses(paths), strict=True):
+            table.add_row(*_cells(path, address)[: len(table.columns)])
+    return table
 
 
 def _cells(path: Status, address: str) -> list[Text]:
@@ -380,10 +360,10 @@ def _short(number: float) -> str:
 def _members(relay: dict[str, Any]) -> Table:
     """A line per member, those that are down first."""
     table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=0)
-    for title in ("member", "state", "address"):
-        table.add_column(title, overflow="fold", no_wrap=title == "state")
-    for title in ("bound", "waiting", "forwarded", "over\nlimit"):
-        table.add_column(title, justify="right", overflow="fold")
+    for title in ("member", "state", "address", "bound", "waiting", "forwarded", "over\nlimit"):
+        is_text = title in ("member", "state", "address")
+        justify: JustifyMethod = "left" if is_text else "right"
+        table.add_column(title, justify=justify, overflow="fold", no_wrap=title == "state")
     members = sorted(relay["members"].items(), key=lambda item: (item[1]["is_up"], item[0]))
     for name, member in members[:_SHOWN_MEMBERS]:
         table.add_row(
