@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -162,6 +162,8 @@ def _fill_by_lab(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
+    import asyncio
+
     from uavlinkd.system.core_dumps import forbid_core_dumps
 
     forbid_core_dumps()
@@ -180,28 +182,19 @@ def _run(options: argparse.Namespace) -> int:
     async def work() -> None:
         await Daemon(config).run()
 
+    loop: Callable[[], asyncio.AbstractEventLoop] = asyncio.SelectorEventLoop  # Windows' default watches no sockets
+    with suppress(ImportError):
+        import uvloop
+
+        loop = uvloop.new_event_loop
     try:
-        _run_loop(work())
+        with asyncio.Runner(loop_factory=loop) as runner:
+            runner.run(work())
     except CommandError as error:
         raise CommandError(f"{options.config}: {error}") from None
     except KeyboardInterrupt:
         pass  # before the daemon handled signals
     return OK
-
-
-def _run_loop(work: Coroutine[None, None, None]) -> None:
-    """Run a coroutine on uvloop if it is installed, else on asyncio's loop."""
-    import asyncio
-
-    try:
-        import uvloop
-    except ImportError:
-        # Not Windows' default loop: it watches no sockets.
-        with asyncio.Runner(loop_factory=asyncio.SelectorEventLoop) as runner:
-            runner.run(work)
-    else:
-        with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
-            runner.run(work)
 
 
 def _check(options: argparse.Namespace) -> int:

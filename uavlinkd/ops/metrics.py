@@ -22,7 +22,7 @@ from operator import getitem
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from prometheus_client import CONTENT_TYPE_PLAIN_0_0_4, CollectorRegistry, generate_latest
+from prometheus_client import CONTENT_TYPE_PLAIN_0_0_4, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
@@ -66,9 +66,8 @@ class MetricSection(NamedTuple):
 
 def exposition(status: Status, uptime_s: float) -> bytes:
     """Write a status (:func:`uavlinkd.link.status.daemon_status`) as the text that Prometheus reads."""
-    registry = CollectorRegistry()  # not the global one of the library, which measures the process its own way
-    registry.register(_StatusCollector({**status, "uptime_s": uptime_s}))
-    return generate_latest(registry)
+    # Not the global registry of the library, which measures the process its own way.
+    return generate_latest(_StatusCollector({**status, "uptime_s": uptime_s}))
 
 
 class _StatusCollector(Collector):
@@ -98,19 +97,14 @@ def _daemon(status: Status) -> Iterator[Part]:
     resident = None
     with suppress(OSError, ValueError, IndexError):
         resident = int(_STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    findings = {tuple(finding[label] for label in _FINDING): 1 for finding in status["findings"]}
-    build = {(status["name"], *_BUILD.values()): 1}
-    yield (
-        (),
-        {
-            **status,
-            "cpu_s": time.process_time(),
-            "resident": resident,
-            "finding": findings,
-            "build": build,
-            "schemas": {tuple(_SCHEMAS.values()): 1},
-        },
-    )
+    facts = {
+        "cpu_s": time.process_time(),
+        "resident": resident,
+        "finding": {tuple(finding[label] for label in _FINDING): 1 for finding in status["findings"]},
+        "build": {(status["name"], *_BUILD.values()): 1},
+        "schemas": {tuple(_SCHEMAS.values()): 1},
+    }
+    yield (), status | facts
 
 
 def _dropping(status: Status) -> Iterator[Part]:
@@ -165,18 +159,18 @@ def _endpoints(status: Status) -> Iterator[Part]:
         yield (name,), endpoint | {"clients": len(endpoint["clients"]), "refusals": _refusals(endpoint)}
 
 
-def _one(key: str) -> Callable[[Status], Iterable[Part]]:
-    """A part that the daemon may have."""
-    return lambda status: [] if status[key] is None else [((), status[key])]
+def _recording(status: Status) -> Iterator[Part]:
+    if (recording := status["recording"]) is not None:
+        yield (), recording
 
 
 def _relay(status: Status) -> Iterator[Part]:
-    for _, relay in _one("relay")(status):
+    if (relay := status["relay"]) is not None:
         yield (), relay | {"drops": {reason: relay["dropped"].get(reason, 0) for reason in _RELAY_REASONS}}
 
 
 def _members(status: Status) -> Iterator[Part]:
-    for _, relay in _one("relay")(status):
+    for _, relay in _relay(status):
         yield from (((name,), member) for name, member in relay["members"].items())
 
 
@@ -337,5 +331,5 @@ _SECTIONS = (
     MetricSection((), _relay, _OF_RELAY),
     MetricSection(("member",), _members, _OF_MEMBER),
     MetricSection(("relay",), _used_relays, _OF_USED_RELAY),
-    MetricSection((), _one("recording"), _OF_RECORDING),
+    MetricSection((), _recording, _OF_RECORDING),
 )

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from uavlinkd import __version__
 from uavlinkd.ops.control import ControlError, ask
@@ -35,13 +35,6 @@ uavlinkd report. Keys are replaced by key-1, …, the addresses of peers by peer
 address-1, …. The names of peers and this machine's own addresses are readable. Read it before you send it."""
 
 
-class ReportPart(NamedTuple):
-    """A part of the report."""
-
-    title: str
-    text: str
-
-
 def make_report(configs: Sequence[Path], sockets: Sequence[Path]) -> str:
     """Collect everything, and redact it."""
     interfaces = _run("ip", "-brief", "address")
@@ -51,41 +44,41 @@ def make_report(configs: Sequence[Path], sockets: Sequence[Path]) -> str:
     for host in [*_hosts_of_configs(configs), *_hosts_of_statuses(statuses), *_hosts_of_log(log)]:
         redactor.add_peer(host)
     sections = [
-        ReportPart("versions", _versions()),
-        *(ReportPart(f"configuration {path}", _without_comments(path)) for path in configs),
-        *(ReportPart(f"check {path}", _check(path)) for path in configs),
-        *(ReportPart(f"status at {path}", text) for path, text in zip(sockets, map(_as_text, statuses), strict=True)),
-        ReportPart("log", log),
-        ReportPart("sockets", _run("ss", "--no-header", "-lntup")),
-        ReportPart("network interfaces", interfaces),
-        ReportPart("routes", _run("ip", "route") + _run("ip", "-6", "route")),
+        ("versions", _versions()),
+        *((f"configuration {path}", _without_comments(path)) for path in configs),
+        *((f"check {path}", _check(path)) for path in configs),
+        *(
+            (f"status at {path}", status if isinstance(status, str) else json.dumps(status, indent=1))
+            for path, status in zip(sockets, statuses, strict=True)
+        ),
+        ("log", log),
+        ("sockets", _run("ss", "--no-header", "-lntup")),
+        ("network interfaces", interfaces),
+        ("routes", _run("ip", "route") + _run("ip", "-6", "route")),
     ]
     # Redacted before it is cut: the rest of a cut key has no form that shows what it is.
     parts = [
-        f"## {redactor.redact(section.title)}\n\n{redactor.redact(section.text.strip())[-MAX_SECTION:]}"
-        for section in sections
+        f"## {redactor.redact(title)}\n\n{redactor.redact(text.strip())[-MAX_SECTION:]}" for title, text in sections
     ]
     return printable("\n\n".join([_INTRODUCTION, *parts]) + "\n", keep="\n")
 
 
 def _versions() -> str:
+    release = dict[str, str]()
+    with suppress(OSError):
+        release = platform.freedesktop_os_release()
     lines = [
         f"uavlinkd {__version__}, Python {platform.python_version()}, {platform.system()} {platform.release()}"
         f" {platform.machine()}",
         f"written at {time.strftime('%Y-%m-%d %H:%M:%S %z')}",
+        release.get("PRETTY_NAME", "no /etc/os-release"),
     ]
-    lines += [
-        line for line in _read(Path("/etc/os-release")).splitlines() if line.startswith(("PRETTY_NAME", "VERSION_ID"))
-    ]
-    return "\n".join([*lines, *_packages()])
-
-
-def _packages() -> Iterator[str]:
     for name in _PACKAGES:
         try:
-            yield f"{name} {metadata.version(name)}"
+            lines.append(f"{name} {metadata.version(name)}")
         except metadata.PackageNotFoundError:
-            yield f"{name}: not installed"
+            lines.append(f"{name}: not installed")
+    return "\n".join(lines)
 
 
 def _check(path: Path) -> str:
@@ -99,10 +92,6 @@ def _status(socket: Path) -> dict[str, Any] | str:
         return ask(socket, "status")
     except ControlError as error:
         return str(error)
-
-
-def _as_text(status: dict[str, Any] | str) -> str:
-    return status if isinstance(status, str) else json.dumps(status, indent=1)
 
 
 def _log() -> str:
