@@ -47,7 +47,7 @@ async def test_pymavlink_reads_a_recording(tmp_path: Path) -> None:
     recorder = Recorder(Recording(tmp_path / "flights", 9, 0), log(), lambda: NOW_S)
     recorder.add("drone1", [frame(1), frame(2)], FROM_PEER, 0.0)
     recorder.add("drone1", [frame(3)], TO_PEER, 1.5)
-    recorder.stop(2.0)
+    await recorder.stop(2.0)
     (path,) = (tmp_path / "flights").iterdir()
     reader = mavutil.mavlink_connection(str(path))
     seen = [(message.value, message._link, message._timestamp) for message in iter(reader.recv_msg, None)]
@@ -61,7 +61,7 @@ async def test_secrets_are_not_recorded(tmp_path: Path) -> None:
     recorder = Recorder(Recording(tmp_path / "flights", 9, 0), log())
     recorder.add("drone1", [frame(1), setup_signing(), frame(2)], FROM_PEER, 0.0)
     recorder.add("drone1", [setup_signing()], TO_PEER, 0.0)
-    recorder.stop(0.0)
+    await recorder.stop(0.0)
     (path,) = (tmp_path / "flights").iterdir()
     assert b"secret" not in path.read_bytes()
     assert [entry.frame for entry in read_tlog(path).records] == [frame(1), frame(2)]
@@ -75,7 +75,7 @@ async def test_clock_change_begins_a_file_and_drift_does_not(tmp_path: Path) -> 
         clock[0] = time_s
         recorder.do_housekeeping(now)
         recorder.add("drone1", [frame(1)], FROM_PEER, now)
-    recorder.stop(31.0)
+    await recorder.stop(31.0)
     times = [[time // 4 * 4 / 1e6 for time, _ in file] for file in recorded(tmp_path)]
     assert times == [pytest.approx([5.0, 15.0], abs=1e-5), pytest.approx([NOW_S, NOW_S + 10], abs=1e-5)]
 
@@ -101,9 +101,11 @@ async def test_full_disk_stops_recording_and_room_resumes_it(tmp_path: Path, mon
             recorder.add("drone1", [frame(1), frame(2)], FROM_PEER, now)
             recorder.do_housekeeping(now)
             lost += 2 * is_full[0]
-            await until(lambda lost=lost: recorder.frames_lost == lost and not recorder._is_writing)  # type: ignore[misc]
+            if recorder._writing is not None:
+                await recorder._writing
+            assert recorder.frames_lost == lost
         assert recorder.is_recording
-        recorder.stop(3 * RETRY_S)
+        await recorder.stop(3 * RETRY_S)
     assert tries == [0.0, RETRY_S, 2 * RETRY_S]
     assert (recorder.frames, recorder.frames_lost, recorder.failures) == (2, 6, {"ENOSPC": 2})
     assert [line["event"] for line in logs] == ["recording_stopped", "recording_resumed"]
@@ -123,6 +125,6 @@ async def test_hanging_disk_delays_nothing(tmp_path: Path, monkeypatch: pytest.M
         recorder.do_housekeeping(1.0)
     assert recorder._buffered_bytes < MAX_BUFFERED_BYTES + sum(8 + len(raw) for raw in batch)
     assert recorder.frames_lost == len(batch)
-    recorder.stop(2.0)
+    await recorder.stop(2.0)
     answer.set()
-    await until(lambda: not recorder._thread.is_alive())
+    await until(lambda: recorder._thread._free == 1)

@@ -198,15 +198,11 @@ class Routing:
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """Recordings of the frames on the link: the newest ``max_files`` files of up to ``max_file_bytes``.
-
-    ``min_free_bytes``: free space to keep on the disk.
-    """
+    """Recordings of the frames on the link: the newest ``max_files``. ``min_free_bytes`` stay free on the disk."""
 
     folder: Path
     max_files: int
     min_free_bytes: int
-    max_file_bytes: int = 64_000_000
 
 
 @dataclass(frozen=True, slots=True)

@@ -138,7 +138,7 @@ class Daemon:
         parts.drops.close()
         parts.events.close()
         if parts.recorder is not None:
-            parts.recorder.stop(now)
+            await parts.recorder.stop(now)
         counted = {**parts.drops.plain_totals(), **parts.events.totals, **parts.peer_sockets.serial.totals}
         self.log.info("daemon_stopped", uptime_s=round(now - self._started_at, 1), counted=counted)
 

@@ -11,13 +11,10 @@ peer, 1 to the peer. MAVProxy and pymavlink store the number of a link there.
 from __future__ import annotations
 
 import asyncio
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from queue import SimpleQueue
-from typing import NamedTuple
 
 from structlog.typing import FilteringBoundLogger
 
@@ -27,6 +24,8 @@ from uavlinkd.mavlink.dialect import SETUP_SIGNING
 from uavlinkd.mavlink.frames import MAVLINK2
 from uavlinkd.ops.tlog_files import STAMP_BYTES, FolderInUseError, TlogFolder
 from uavlinkd.system.error_meanings import meaning_of
+from uavlinkd.system.tasks import keep_running
+from uavlinkd.system.threads import Threads
 
 MAX_BUFFERED_BYTES = 4 << 20
 """Limit of the buffer of all peers. Frames beyond it are not recorded."""
@@ -43,13 +42,6 @@ _SETUP_SIGNING = SETUP_SIGNING.to_bytes(3, "little")
 
 _Batch = dict[tuple[str, int], list[bytes]]
 """Records by peer and epoch."""
-
-
-class _Written(NamedTuple):
-    frames: int
-    size: int
-    lost_frames: int
-    error: OSError | None
 
 
 class Recorder:
@@ -69,17 +61,14 @@ class Recorder:
         self._log = log
         self._clock = clock
         self._folder = str(settings.folder)
-        self._loop = asyncio.get_running_loop()
         self._batch: _Batch = {}
         self._buffered_bytes = 0
         self._epoch = 0
         self._offset_s: float | None = None  # system time minus monotonic time
-        self._is_writing = False
         self._paused_until = 0.0
-        self._jobs: SimpleQueue[tuple[_Batch, float] | None] = SimpleQueue()
-        # A daemon thread: a hanging disk must not delay the end of the process.
-        self._thread = threading.Thread(target=self._write_jobs, args=(TlogFolder(settings),), daemon=True)
-        self._thread.start()
+        self._writing: asyncio.Task[None] | None = None
+        self._files = TlogFolder(settings)
+        self._thread = Threads(1, "recorder")  # a hanging disk must not delay the end of the process
 
     @property
     def is_recording(self) -> bool:
@@ -95,74 +84,55 @@ class Recorder:
             self._offset_s = self._clock() - now
         time_us = max(0, int((self._offset_s + now) * 1_000_000))
         stamp = (time_us & ~_LINK_BITS | link).to_bytes(STAMP_BYTES)
-        records = self._batch.setdefault((peer, self._epoch), [])
-        for frame in frames:
-            if frame[0] == MAVLINK2 and frame[7:10] == _SETUP_SIGNING:
-                continue
-            records.append(stamp + frame)
-            self._buffered_bytes += STAMP_BYTES + len(frame)
+        records = [stamp + frame for frame in frames if frame[0] != MAVLINK2 or frame[7:10] != _SETUP_SIGNING]
+        if records:
+            self._batch.setdefault((peer, self._epoch), []).extend(records)
+            self._buffered_bytes += sum(map(len, records))
 
     def do_housekeeping(self, now: float) -> None:
-        """Pass the buffer to the thread, unless it still writes the one before."""
-        if not self._is_writing and self._buffered_bytes:
-            self._submit(now)
+        """Write the buffer in the thread, unless that still writes the one before."""
+        if (self._writing is None or self._writing.done()) and self._buffered_bytes:
+            self._writing = keep_running(self._write(now), "recorder")
         offset_s = self._clock() - now
         if self._offset_s is not None and abs(offset_s - self._offset_s) >= CLOCK_STEP_S:
             self._epoch += 1
             self._offset_s = offset_s
 
-    def stop(self, now: float) -> None:
+    async def stop(self, now: float) -> None:
         """Write the rest of the buffer, within :data:`STOP_WAIT_S`."""
-        self._submit(now)
-        self._jobs.put(None)
-        self._thread.join(STOP_WAIT_S)
+        with suppress(TimeoutError):
+            async with asyncio.timeout(STOP_WAIT_S):
+                if self._writing is not None:
+                    await self._writing
+                await self._write(now)
+                await self._thread.run(self._files.close)
 
-    def _submit(self, now: float) -> None:
-        self._is_writing = True
-        self._jobs.put((self._batch, now))
-        self._batch = {}
-        self._buffered_bytes = 0
-
-    def _on_written(self, written: _Written, now: float) -> None:
-        self._is_writing = False
-        self.frames += written.frames
-        self.bytes += written.size
-        self.frames_lost += written.lost_frames
-        if written.error is not None:
-            reason = "folder_in_use" if isinstance(written.error, FolderInUseError) else failure_name(written.error)
-            self.failures[reason] += 1
-            if self.is_recording:
-                self._log.warning(
-                    "recording_stopped",
-                    reason=reason,
-                    error=written.error.strerror or str(written.error),
-                    folder=self._folder,
-                    retried_every_s=RETRY_S,
-                    meaning=meaning_of(reason),
-                )
+    async def _write(self, now: float) -> None:
+        batch, self._batch, self._buffered_bytes = self._batch, {}, 0
+        left = sum(map(len, batch.values()))
+        try:
+            for (peer, epoch), records in batch.items():
+                self.bytes += await self._thread.run(self._files.append, peer, records, epoch, now)
+                self.frames += len(records)
+                left -= len(records)
+        except OSError as error:
+            self.frames_lost += left
+            self._on_failure(error)
             self._paused_until = now + RETRY_S
-        elif not self.is_recording:
+            return
+        if not self.is_recording:
             self._paused_until = 0.0
             self._log.info("recording_resumed", frames_lost=self.frames_lost)
 
-    # These run in the thread.
-
-    def _write_jobs(self, folder: TlogFolder) -> None:
-        while (job := self._jobs.get()) is not None:
-            written = _write(folder, *job)
-            with suppress(RuntimeError):  # the loop has ended
-                self._loop.call_soon_threadsafe(self._on_written, written, job[1])
-        folder.close()
-
-
-def _write(folder: TlogFolder, batch: _Batch, now: float) -> _Written:
-    frames = size = 0
-    total = sum(map(len, batch.values()))
-    for (peer, epoch), records in batch.items():
-        try:
-            size += folder.append(peer, records, epoch, now)
-        except OSError as error:
-            folder.close()
-            return _Written(frames, size, total - frames, error)
-        frames += len(records)
-    return _Written(frames, size, 0, None)
+    def _on_failure(self, error: OSError) -> None:
+        reason = "folder_in_use" if isinstance(error, FolderInUseError) else failure_name(error)
+        self.failures[reason] += 1
+        if self.is_recording:
+            self._log.warning(
+                "recording_stopped",
+                reason=reason,
+                error=error.strerror or str(error),
+                folder=self._folder,
+                retried_every_s=RETRY_S,
+                meaning=meaning_of(reason),
+            )

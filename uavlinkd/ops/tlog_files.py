@@ -21,6 +21,8 @@ from dataclasses import dataclass
 
 from uavlinkd.config.model import Recording
 
+MAX_FILE_BYTES = 64_000_000
+"""The records after this size are in another file."""
 SYNC_INTERVAL_S = 5.0
 """A power cut loses at most this much."""
 STAMP_BYTES = 8
@@ -60,25 +62,26 @@ class TlogFolder:
         Raises:
             OSError: not all records were written. The file still ends with a whole record.
         """
-        if self._folder < 0:
-            self._open_folder()
-        written = 0
-        for chunk in _chunks(records, self._settings.max_file_bytes):
-            data = b"".join(chunk)
+        data = b"".join(records)
+        try:
+            if self._folder < 0:
+                self._open_folder()
             file = self._open.get(peer)
-            if file is not None and not self._fits(file, len(data), epoch):
+            if file is not None and not self._goes_on(file, epoch):
                 self._close_file(peer)
                 file = None
             self._make_room(len(data))
             if file is None:
-                file = self._new_file(peer, chunk[0], epoch)
+                file = self._new_file(peer, data, epoch)
             self._write(peer, file, data)
-            written += len(data)
-        if now >= self._synced_at + SYNC_INTERVAL_S:
-            self._synced_at = now
-            for file in self._open.values():
-                os.fdatasync(file.descriptor)
-        return written
+            if now >= self._synced_at + SYNC_INTERVAL_S:
+                self._synced_at = now
+                for file in self._open.values():
+                    os.fdatasync(file.descriptor)
+        except OSError:
+            self.close()
+            raise
+        return len(data)
 
     def close(self) -> None:
         """Close all files. Errors of the disk are ignored."""
@@ -107,13 +110,9 @@ class TlogFolder:
         self._closed = dict(sorted(files))
         self._next_number = max(self._closed, default=0) + 1
 
-    def _fits(self, file: _File, size: int, epoch: int) -> bool:
-        """Whether records of this epoch fit into the file, and the file is still in the folder."""
-        return (
-            file.epoch == epoch
-            and file.size + size <= self._settings.max_file_bytes
-            and os.fstat(file.descriptor).st_nlink > 0
-        )
+    def _goes_on(self, file: _File, epoch: int) -> bool:
+        """Whether the file is of this epoch, not full, and still in the folder."""
+        return file.epoch == epoch and file.size < MAX_FILE_BYTES and os.fstat(file.descriptor).st_nlink > 0
 
     def _make_room(self, size: int) -> None:
         """Delete our oldest files until min_free_bytes stay free.
@@ -167,16 +166,3 @@ class TlogFolder:
             os.fdatasync(file.descriptor)
         with suppress(OSError):
             os.close(file.descriptor)
-
-
-def _chunks(records: Sequence[bytes], limit: int) -> list[list[bytes]]:
-    """Split records into chunks, in their order, that each fit into one file."""
-    chunks: list[list[bytes]] = []
-    size = limit
-    for record in records:
-        if size + len(record) > limit:
-            chunks.append([])
-            size = 0
-        chunks[-1].append(record)
-        size += len(record)
-    return chunks
