@@ -41,16 +41,13 @@ def make_report(configs: Sequence[Path], sockets: Sequence[Path]) -> str:
     redactor = Redactor(re.findall(r"[0-9A-Fa-f:.]+(?=/\d)", interfaces))
     statuses = [_status(socket) for socket in sockets]
     log = _log()
-    for host in [*_hosts_of_configs(configs), *_hosts_of_statuses(statuses), *_hosts_of_log(log)]:
-        redactor.add_peer(host)
+    for address in _addresses_of_peers(configs, statuses, log):
+        redactor.add_peer(address.rpartition(":")[0] or address)
     sections = [
         ("versions", _versions()),
         *((f"configuration {path}", _without_comments(path)) for path in configs),
         *((f"check {path}", _check(path)) for path in configs),
-        *(
-            (f"status at {path}", status if isinstance(status, str) else json.dumps(status, indent=1))
-            for path, status in zip(sockets, statuses, strict=True)
-        ),
+        *((f"status at {path}", json.dumps(one, indent=1)) for path, one in zip(sockets, statuses, strict=True)),
         ("log", log),
         ("sockets", _run("ss", "--no-header", "-lntup")),
         ("network interfaces", interfaces),
@@ -87,11 +84,11 @@ def _check(path: Path) -> str:
     return _run(sys.executable, "-m", "uavlinkd", "check", "--config", str(path), *keys)
 
 
-def _status(socket: Path) -> dict[str, Any] | str:
+def _status(socket: Path) -> dict[str, Any]:
     try:
         return ask(socket, "status")
     except ControlError as error:
-        return str(error)
+        return {"error": str(error)}
 
 
 def _log() -> str:
@@ -146,36 +143,23 @@ _NETWORK = re.compile(r"""["']?network["']?\s*=\s*["'][^"']*["']""")
 """The network of an address, whose name is readable."""
 
 
-def _hosts_of_configs(paths: Sequence[Path]) -> Iterator[str]:
-    for path in paths:
+def _addresses_of_peers(configs: Sequence[Path], statuses: Sequence[dict[str, Any]], log: str) -> Iterator[str]:
+    for path in configs:
         for listed in re.findall(r"""(?ms)^\s*["']?addresses["']?\s*=\s*\[(.*?)\]\s*(?:#[^\n]*)?$""", _read(path)):
-            yield from (host for host, _ in map(_split, _ADDRESS.findall(_NETWORK.sub("", listed))))
-
-
-def _hosts_of_statuses(statuses: Sequence[dict[str, Any] | str]) -> Iterator[str]:
+            yield from _ADDRESS.findall(_NETWORK.sub("", listed))
     for status in statuses:
-        if isinstance(status, dict):
-            yield from (_split(peer["path"])[0] for peer in status["peers"].values() if peer["path"])
-
-
-def _hosts_of_log(log: str) -> Iterator[str]:
+        yield from (peer["path"] for peer in status.get("peers", {}).values() if peer["path"])
     for line in log.splitlines():
-        try:
+        event = None
+        with suppress(ValueError):
             event = json.loads(line)
-        except ValueError:
+        if not isinstance(event, dict):
             continue
-        if isinstance(event, dict) and "peer" in event:
-            named = event.get("addresses")
-            for text in [*(named if isinstance(named, list) else ()), event.get("path")]:
-                if isinstance(text, str):
-                    yield _split(text)[0]
-        if isinstance(event, dict) and event.get("event") == "name_not_resolved":
-            yield str(event.get("host", ""))
-
-
-def _split(address: str) -> tuple[str, str]:
-    host, _, port = address.rpartition(":")
-    return (host, port) if host else (address, "")
+        named = event.get("addresses")
+        values = [*(named if isinstance(named, list) else ()), event.get("path")] if "peer" in event else []
+        if event.get("event") == "name_not_resolved":
+            values.append(event.get("host"))
+        yield from (value for value in values if isinstance(value, str))
 
 
 # The command.
