@@ -22,13 +22,15 @@ class Supervisor:
     """The service manager. Times are monotonic seconds."""
 
     def __init__(self, environ: Mapping[str, str], process_id: int) -> None:
-        self._address = _socket_address(environ.get("NOTIFY_SOCKET", ""))
+        name = environ.get("NOTIFY_SOCKET", "")
+        # The path of a Unix socket, or the name of an abstract one, where @ stands for the first zero byte.
+        self._address = f"\0{name[1:]}" if name.startswith("@") else name
         self._socket: socket.socket | None = None
         self._line = self._note = ""
         self._unsent: deque[str] = deque(maxlen=UNSENT_MESSAGES)
         self._ping_interval_s = _watchdog_s(environ, process_id) / 2
         self._ping_at = NEVER if self._ping_interval_s == NEVER else 0.0
-        if self._address is not None:
+        if len(name) > 1 and name[0] in "@/":
             self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
             self._socket.setblocking(False)
 
@@ -57,8 +59,6 @@ class Supervisor:
 
         ``systemctl status`` shows ``status``.
         """
-        if self._socket is None:
-            return
         self._send_unsent()
         line = status + self._note
         if line != self._line and self._send(f"STATUS={line}"):
@@ -68,29 +68,21 @@ class Supervisor:
 
     def _send_in_order(self, message: str) -> None:
         """Send a message that must arrive in order. If the socket is full, it waits for the next turn."""
-        if self._socket is not None:
-            self._unsent.append(message)
-            self._send_unsent()
+        self._unsent.append(message)
+        self._send_unsent()
 
     def _send_unsent(self) -> None:
         while self._unsent and self._send(self._unsent[0]):
             self._unsent.popleft()
 
     def _send(self, message: str) -> bool:
-        assert self._socket is not None
-        assert self._address is not None
+        """Send a message to the service manager, if there is one. Returns False if its socket is full."""
         try:
-            self._socket.sendto(message.encode(), self._address)
+            if self._socket is not None:
+                self._socket.sendto(message.encode(), self._address)
         except OSError:
             return False
         return True
-
-
-def _socket_address(name: str) -> str | None:
-    """The path of a Unix socket, or the name of an abstract one, where ``@`` stands for the first zero byte."""
-    if name.startswith("@") and len(name) > 1:
-        return "\0" + name[1:]
-    return name if name.startswith("/") else None
 
 
 def _watchdog_s(environ: Mapping[str, str], process_id: int) -> float:

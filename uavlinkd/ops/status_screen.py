@@ -115,13 +115,12 @@ def _headline(status: Status) -> Text:
 
 
 def _findings(findings: list[dict[str, str]]) -> Table:
-    """A line per problem with its cause and remedy, security first. Too many others never push those out."""
+    """A line per problem with its cause and remedy. Security is first, and all of it is shown."""
     table = Table.grid(padding=(0, 1, 0, 0))
     table.add_column(no_wrap=True)
     table.add_column(overflow="fold")
-    security = [finding for finding in findings if finding["severity"] == "security"]
-    others = [finding for finding in findings if finding["severity"] != "security"]
-    for finding in [*security, *others[:_SHOWN_FINDINGS]]:
+    shown = sum(finding["severity"] == "security" for finding in findings) + _SHOWN_FINDINGS
+    for finding in findings[:shown]:
         label = finding["severity"]
         style, is_security = _STYLES[label], label == "security"
         subject = {"peer": f"{finding['name']}: ", "endpoint": f"endpoint {finding['name']}: "}
@@ -129,7 +128,7 @@ def _findings(findings: list[dict[str, str]]) -> Table:
         line.append(finding["text"], style=style if is_security else "not bold")
         line.append(f". Remedy: {finding['remedy']}", style="not bold")
         table.add_row(Text(label.upper() if is_security else label, style=style), line)
-    if (left := len(others) - _SHOWN_FINDINGS) > 0:
+    if (left := len(findings) - shown) > 0:
         table.add_row("", Text(f"and {left} more: `uavlinkd status --json` has all of them"))
     return table
 
