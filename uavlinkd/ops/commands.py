@@ -10,15 +10,12 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from uavlinkd.system.terminal import FAILED, OK, CommandError, UsageError, printable
-
-if TYPE_CHECKING:
-    from rich.console import RenderableType
 
 RUNTIME_FOLDER: Final = Path("/run/uavlinkd")
 """Where the systemd units put the control sockets."""
@@ -104,23 +101,32 @@ def _control_socket(options: argparse.Namespace) -> Path:
     return socket
 
 
+def _answers(sockets: Sequence[Path], request: str) -> Iterator[dict[str, Any] | CommandError]:
+    """The answer of each daemon, or why it does not answer."""
+    from uavlinkd.ops.control import ControlError, ask
+
+    for socket in sockets:
+        try:
+            yield ask(socket, request)
+        except ControlError as error:
+            yield error
+
+
 def _for_each(options: argparse.Namespace, request: str, show: Callable[[dict[str, Any]], int]) -> int:
     """Show the answer of each daemon, also after one that does not answer. The worst exit status counts.
 
     Raises:
         CommandError: there is no daemon, or the only one does not answer.
     """
-    from uavlinkd.ops.control import ControlError, ask
-
     sockets = _control_sockets(options)
     worst = OK
-    for socket in sockets:
-        try:
-            worst = max(worst, show(ask(socket, request)))
-        except ControlError as error:
-            if len(sockets) == 1:
-                raise
-            print(printable(str(error)), file=sys.stderr)
+    for answer in _answers(sockets, request):
+        if not isinstance(answer, CommandError):
+            worst = max(worst, show(answer))
+        elif len(sockets) == 1:
+            raise answer
+        else:
+            print(printable(str(answer)), file=sys.stderr)
             worst = FAILED
     return worst
 
@@ -147,30 +153,25 @@ def _status(options: argparse.Namespace) -> int:
     return _for_each(options, "status", show)
 
 
-def _watch(sockets: list[Path]) -> int:
+def _watch(sockets: Sequence[Path]) -> int:
     """Refresh the screen until interrupted, also while the daemon restarts."""
     from rich.console import Group
     from rich.live import Live
     from rich.text import Text
 
-    from uavlinkd.ops.control import ControlError, ask
     from uavlinkd.ops.status_screen import render_status
 
     passes = False
     with suppress(KeyboardInterrupt), Live(auto_refresh=False, screen=True, vertical_overflow="crop") as live:
         while True:
-            screens: list[RenderableType] = []
-            passing = []
-            for socket in sockets:
-                try:
-                    status = ask(socket, "status")
-                except ControlError as error:
-                    screens.append(Text(str(error), style="bold red"))
-                    passing.append(False)
-                else:
-                    screens.append(render_status(status, live.console.width))
-                    passing.append(bool(status["frames_pass"]))
-            passes = all(passing)
+            answers = list(_answers(sockets, "status"))
+            passes = all(not isinstance(answer, CommandError) and answer["frames_pass"] for answer in answers)
+            screens = [
+                Text(str(answer), style="bold red")
+                if isinstance(answer, CommandError)
+                else render_status(answer, live.console.width)
+                for answer in answers
+            ]
             live.update(Group(*screens), refresh=True)
             time.sleep(WATCH_INTERVAL_S)
     return OK if passes else FAILED
