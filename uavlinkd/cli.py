@@ -77,6 +77,22 @@ def _flush() -> None:
         raise CommandError(f"standard output: {error.strerror}") from None
 
 
+def mitm(arguments: Sequence[str] | None = None) -> int:
+    """Run ``uavlink-mitm``: a man in the middle, an emulated radio, or a hostile relay. Return the exit status."""
+    return _to_the_end(lambda: _mitm(sys.argv[1:] if arguments is None else arguments))
+
+
+def _mitm(words: Sequence[str]) -> int:
+    _need_lab("uavlink-mitm")
+    if words[:1] == ["relay"]:
+        from uavlinkd.lab.hostile.relay_cli import relay_main  # the man in the middle itself cannot import a key
+
+        return relay_main(words[1:])
+    from uavlinkd.lab.mitm.cli import main as mitm_main
+
+    return mitm_main(words)
+
+
 def _need_lab(command: str) -> None:
     """Refuse a command whose extra is not installed. The Debian package has no ``uavlinkd.lab``."""
     from importlib.util import find_spec

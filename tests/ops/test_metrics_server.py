@@ -88,7 +88,7 @@ async def test_prometheus_is_answered(server: MetricsServer) -> None:
         request = b"GET /metrics HTTP/1.1\r\nHost: 127.0.0.1:9790\r\nAccept: */*\r\n\r\n"
         response = await exchange(server, request, end=end)
         assert status(response) == 200
-        assert b"\r\nContent-Type: text/plain; version=0.0.4\r\n" in response
+        assert b"\r\nContent-Type: text/plain; version=0.0.4; charset=utf-8\r\n" in response
         assert response.endswith(b"\r\n\r\n" + BODY)
 
 

@@ -50,8 +50,8 @@ def describe(config: Config, here: Surroundings | None) -> Group:
     if config.networks:
         parts += [_heading("Networks"), _networks(config, here)]
     if config.peers:
-        columns = "name", "key", "address", "suites", "mode, at least", "PSK"
-        parts += [_heading("Peers"), _table(columns, map(_peer, config.peers))]
+        titles = ("name", "key", "address", "suites", "mode, at least", "PSK")
+        parts += [_heading("Peers"), _table(titles, map(_peer, config.peers))]
     if config.relays:
         relays = (
             (
@@ -64,7 +64,7 @@ def describe(config: Config, here: Surroundings | None) -> Group:
         )
         parts += [_heading("Relays"), _table(("name", "public key", "address", "PSK"), relays)]
     if config.endpoints:
-        columns = "name", "URL", "RADIO_STATUS", "STATUSTEXT", "plain MAVLink is open to"
+        columns = ("name", "URL", "RADIO_STATUS", "STATUSTEXT", "plain MAVLink is open to")
         parts += [_heading("Local endpoints"), _table(columns, map(_endpoint, config.endpoints))]
     if config.relay_server is not None:
         members = (
@@ -78,8 +78,8 @@ def describe(config: Config, here: Surroundings | None) -> Group:
             )
             for member in config.relay_server.members
         )
-        columns = "name", "public key", "PSK", "members", "datagrams/s", "kbit/s"
-        parts += [_heading("Members of this relay, and their limits"), _table(columns, members)]
+        titles = ("name", "public key", "PSK", "members", "datagrams/s", "kbit/s")
+        parts += [_heading("Members of this relay, and their limits"), _table(titles, members)]
     parts += _policies(config)
     parts.append(_verdict(config.warnings, here))
     return Group(*parts)
