@@ -19,7 +19,6 @@ from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import ANY_OTHER, REFUSALS, Refusal
 from uavlinkd.ops import STATUS_SCHEMA
 from uavlinkd.ops.log import shown
-from uavlinkd.ops.recorder import Recorder
 from uavlinkd.relay.service import RelayMember, RelayService
 from uavlinkd.system.addresses import Address
 
