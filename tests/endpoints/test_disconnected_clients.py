@@ -14,7 +14,7 @@ import pytest
 from tests.daemon.udp import open_socket
 from tests.endpoints.clients import LOOPS, NewLoop, Recorder, frame, heartbeat, run_in, write
 from tests.waiting import until
-from uavlinkd.endpoints.error_queue import SEND_ATTEMPTS
+from uavlinkd.endpoints.error_queue import SEND_ATTEMPTS, ErrorReports
 from uavlinkd.endpoints.sockets import udp_socket
 from uavlinkd.endpoints.udp import UdpServer
 from uavlinkd.system.addresses import Address
@@ -123,7 +123,7 @@ async def test_other_errors_of_earlier_datagrams_forget_no_client(hub: Hub, monk
     client = await hub.connect()
     address = client.getsockname()
     errors = [(address, errno.EHOSTUNREACH), (("192.0.2.1", 9), errno.ECONNREFUSED)]
-    monkeypatch.setattr("uavlinkd.endpoints.udp.read_error_queue", lambda sock: errors)
+    monkeypatch.setattr(ErrorReports, "take", lambda reports: errors)
     assert hub.endpoint._take_errors()
     await asyncio.sleep(0)
     assert hub.endpoint.failures == {"EHOSTUNREACH": 1, "ECONNREFUSED": 1}

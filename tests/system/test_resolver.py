@@ -54,40 +54,29 @@ def names(monkeypatch: pytest.MonkeyPatch) -> Names:
 
 
 async def test_order_is_kept_and_duplicates_are_removed(names: Names) -> None:
-    """The result has all addresses of all names, in the order of the file, each once."""
-    names["drone1.test"] = ["10.0.0.9", "::1"]
-    names["alias.test"] = ["10.0.0.9"]
-    resolved, failed = await resolve(
-        [Address("10.0.0.1", 5790), Address("drone1.test", 5790), Address("alias.test", 5790), Address("::1", 5791)]
-    )
-    assert resolved == [
-        (V4, ("10.0.0.1", 5790)),
-        (V4, ("10.0.0.9", 5790)),
-        (V6, ("::1", 5790, 0, 0)),
-        (V6, ("::1", 5791, 0, 0)),
-    ]
-    assert failed == []
+    """The result has all addresses of the name, in the order of the name service, each once."""
+    names["drone1.test"] = ["10.0.0.9", "::1", "10.0.0.9"]
+    assert await resolve(Address("drone1.test", 5790)) == [(V4, ("10.0.0.9", 5790)), (V6, ("::1", 5790, 0, 0))]
 
 
 async def test_link_local_address_keeps_its_zone() -> None:
     """Sending to it needs the interface."""
     interface = next((name for number, name in socket.if_nameindex() if number == 1), None)
     need(interface is not None, "an interface with number 1, as a loopback has")
-    resolved, failed = await resolve([Address(f"fe80::1%{interface}", 5790)])
-    assert (resolved, failed) == ([(V6, ("fe80::1", 5790, 0, 1))], [])
+    assert await resolve(Address(f"fe80::1%{interface}", 5790)) == [(V6, ("fe80::1", 5790, 0, 1))]
 
 
 class Following:
     """A task that keeps resolving, and its results."""
 
-    def __init__(self, addresses: list[Address]) -> None:
+    def __init__(self, address: Address) -> None:
         self.results: list[Resolved] = []
         self.can_use = True
         self.interval_s = 0.0
         self.wake = asyncio.Event()
         self.asked = 0
         self._task = asyncio.create_task(
-            keep_resolving(addresses, self._ask, self._on_resolved, structlog.get_logger(), wake=self.wake)
+            keep_resolving(address, self._ask, self._on_resolved, structlog.get_logger(), wake=self.wake)
         )
 
     async def stop(self) -> None:
@@ -108,7 +97,7 @@ class Following:
 async def test_only_new_results_are_reported(names: Names) -> None:
     """While the name is urgent, after an interval, and when woken; a failing name does not end the last result."""
     names["drone1.test"] = ["10.0.0.1"]
-    following = Following([Address("drone1.test", 5790)])
+    following = Following(Address("drone1.test", 5790))
     await until(lambda: bool(following.results))
     asked = following.asked
     await until(lambda: following.asked > asked + 3)
@@ -167,7 +156,7 @@ def test_silent_server_gets_a_query_every_second(monkeypatch: pytest.MonkeyPatch
             raise socket.gaierror(socket.EAI_AGAIN, "Temporary failure in name resolution")
 
     async def follow() -> None:
-        following = Following([Address("drone1.test", 5790)])
+        following = Following(Address("drone1.test", 5790))
         await asyncio.sleep(60.0)
         await following.stop()
 
@@ -194,13 +183,13 @@ async def test_names_without_answer_do_not_delay_others(monkeypatch: pytest.Monk
 
     monkeypatch.setattr(socket, "getaddrinfo", look_up)
     monkeypatch.setattr(resolver, "LONGEST_WAIT_S", 0.01)
-    gone = [Following([Address(f"gone{number}.test", 1)]) for number in range(10)]
+    gone = [Following(Address(f"gone{number}.test", 1)) for number in range(10)]
     share = resolver.MAX_THREADS // 10
     try:
         await until(lambda: len(asked) >= 10 * share)
         await asyncio.sleep(0.1)  # enough time for ten times more queries
         assert Counter(asked) == {f"gone{number}.test": share for number in range(10)}
-        there = Following([Address("there.test", 1)])
+        there = Following(Address("there.test", 1))
         await until(lambda: bool(there.results))
         await there.stop()
     finally:

@@ -22,38 +22,12 @@ MOST_ERRORS = 128
 """Read at once. The kernel bounds the queue by the receive buffer."""
 
 
-def enable_error_queue(sock: socket.socket) -> None:
-    """Have the kernel report ICMP errors of earlier datagrams. Without this an unconnected socket gets none.
-
-    From then on any call on the socket may fail with the error of an earlier datagram.
-    """
-    _set_error_queue(sock, is_on=True)
-
-
-def _set_error_queue(sock: socket.socket, *, is_on: bool) -> None:
-    if sys.platform == "linux":
-        sock.setsockopt(*_RECVERR[sock.family], int(is_on))
-
-
-def read_error_queue(sock: socket.socket) -> Iterator[tuple[tuple[Any, ...], int]]:
-    """The receiver's socket address and the error's number, of each datagram with an error. Clears pending errors."""
-    if sys.platform != "linux":
-        return
-    for _ in range(MOST_ERRORS):
-        try:
-            _, control, _, address = sock.recvmsg(0, _CONTROL_BYTES, socket.MSG_ERRQUEUE)
-        except OSError:  # the queue is empty
-            return
-        for level, kind, data in control:
-            if (level, kind) == _RECVERR[sock.family]:
-                yield address, _ERROR.unpack_from(data)[0]
-
-
 class ErrorReports:
     """The ICMP errors of a UDP socket whose datagrams they must not delay: at most :data:`REPORTS_PER_S`.
 
-    Beyond that the kernel reports none until the next :meth:`renew`, so that a flood of forged ICMP messages, or a
-    client that is closed for hours, costs no work per datagram.
+    Without IP_RECVERR an unconnected socket gets none. With it, any call on the socket may fail with the error of an
+    earlier datagram. Beyond the limit the kernel reports none until the next :meth:`renew`, so that a flood of forged
+    ICMP messages, or a client that is closed for hours, costs no work per datagram.
     """
 
     __slots__ = ("_left", "_sock")
@@ -66,17 +40,34 @@ class ErrorReports:
     def renew(self) -> None:
         """Have the kernel report errors again. Call it about once a second."""
         if self._left <= 0:
-            enable_error_queue(self._sock)
+            self._switch(is_on=True)
         self._left = REPORTS_PER_S
 
     def take(self) -> list[tuple[tuple[Any, ...], int]]:
         """The receiver's socket address and the error's number, of each datagram with an error."""
-        reports = list(read_error_queue(self._sock))
+        reports = list(self._read())
         self._left -= len(reports)
         if reports and self._left <= 0:
-            _set_error_queue(self._sock, is_on=False)
-            reports += read_error_queue(self._sock)  # those that arrived meanwhile: none may stay
+            self._switch(is_on=False)
+            reports += self._read()  # those that arrived meanwhile: none may stay
         return reports
+
+    def _switch(self, *, is_on: bool) -> None:
+        if sys.platform == "linux":
+            self._sock.setsockopt(*_RECVERR[self._sock.family], int(is_on))
+
+    def _read(self) -> Iterator[tuple[tuple[Any, ...], int]]:
+        """Read the queue. Clears pending errors."""
+        if sys.platform != "linux":
+            return
+        for _ in range(MOST_ERRORS):
+            try:
+                _, control, _, address = self._sock.recvmsg(0, _CONTROL_BYTES, socket.MSG_ERRQUEUE)
+            except OSError:  # the queue is empty
+                return
+            for level, kind, data in control:
+                if (level, kind) == _RECVERR[self._sock.family]:
+                    yield address, _ERROR.unpack_from(data)[0]
 
 
 def send_again(

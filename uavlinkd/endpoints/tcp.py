@@ -13,15 +13,16 @@ import struct
 import sys
 from contextlib import suppress
 from secrets import SystemRandom
+from typing import Any
 
 from uavlinkd.endpoints.ports import PortHandler, failure_name
 from uavlinkd.endpoints.sockets import bind, cannot_listen, unbound_socket
 from uavlinkd.endpoints.stream_endpoint import STALLED_S, StreamEndpoint
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic
+from uavlinkd.system.resolver import resolve
 from uavlinkd.system.stall import Backlog
 from uavlinkd.system.tasks import keep_running
-from uavlinkd.system.threads import Threads
 
 CLIENTS_PER_ENDPOINT = 32
 """Most clients of one ``tcpin`` endpoint."""
@@ -48,8 +49,6 @@ _WRITE_BYTES = 1400
 """Most bytes of one write: a segment. The kernel accepts a write whole or not at all."""
 _OWN_SEGMENT = socket.MSG_EOR if sys.platform == "linux" else 0
 _BACKLOG = 32
-_Sockaddr = tuple[str | int, ...]  # of either family
-_Resolved = tuple[socket.AddressFamily, _Sockaddr]
 
 # A web page can have a browser on this machine send any bytes to any local port, but only after these: an HTTP
 # method, or the start of TLS, whose session ticket may be any bytes.
@@ -200,8 +199,6 @@ class TcpClient(StreamEndpoint):
         super().__init__(name, handler)
         self._address = address
         self._task: asyncio.Task[None] | None = None
-        # An own thread: a silent name server must not delay the look-ups of others.
-        self._threads = Threads(1, f"look-up-{name}")
 
     def start(self) -> None:
         """Begin to connect."""
@@ -230,48 +227,37 @@ class TcpClient(StreamEndpoint):
 
     async def _connect(self) -> socket.socket | None:
         """Connect a socket to the first address that answers. Returns None if no address does."""
-        for family, sockaddr in await self._resolve():
+        resolved = await resolve(self._address)
+        if not resolved:
+            self.could_not_open("not_resolved")
+        for family, sockaddr in resolved[:MAX_ADDRESSES]:
             try:
-                sock = socket.socket(family, socket.SOCK_STREAM)
-            except OSError as error:
-                self.could_not_open(failure_name(error))
-                continue
-            try:
-                await self._connect_socket(sock, sockaddr)
+                return await _connected(family, sockaddr)
             except TimeoutError:
                 self.could_not_open("connect_timeout")
             except OSError as error:
                 self.could_not_open(failure_name(error))
-            except BaseException:
-                sock.close()
-                raise
-            else:
-                return sock
-            sock.close()
         return None
 
-    async def _connect_socket(self, sock: socket.socket, sockaddr: _Sockaddr) -> None:
-        sock.setblocking(False)
+
+async def _connected(family: socket.AddressFamily, sockaddr: tuple[Any, ...]) -> socket.socket:
+    """A socket that is connected there.
+
+    Raises:
+        OSError: the kernel's error; TimeoutError if there is no answer.
+    """
+    sock = socket.socket(family, socket.SOCK_STREAM)
+    try:
         _prepare(sock)
         async with asyncio.timeout(CONNECT_TIMEOUT_S):
             await asyncio.get_running_loop().sock_connect(sock, sockaddr)
         if sock.getsockname() == sock.getpeername():
             # When no process listens on a local port, the kernel may choose that port for our own side.
             raise ConnectionRefusedError(errno.ECONNREFUSED, "connected to itself")
-
-    async def _resolve(self) -> list[_Resolved]:
-        try:
-            if self._address.ip is not None:
-                return _look_up(self._address, socket.AI_NUMERICHOST)
-            return await self._threads.run(_look_up, self._address, 0)
-        except (OSError, UnicodeError):
-            self.could_not_open("not_resolved")
-            return []
-
-
-def _look_up(address: Address, flags: int) -> list[_Resolved]:
-    answers = socket.getaddrinfo(*address.sockaddr, type=socket.SOCK_STREAM, flags=flags)[:MAX_ADDRESSES]
-    return [(family, (str(host), int(port), *rest)) for family, _, _, _, (host, port, *rest) in answers]
+    except BaseException:
+        sock.close()
+        raise
+    return sock
 
 
 _EXHAUSTED = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})

@@ -15,7 +15,7 @@ from typing import Any
 
 import structlog
 
-from uavlinkd.endpoints.error_queue import ErrorReports, enable_error_queue, read_error_queue, send_again
+from uavlinkd.endpoints.error_queue import ErrorReports, send_again
 from uavlinkd.endpoints.ports import Endpoint, LocalPort, PortHandler, failure_name
 from uavlinkd.endpoints.reader import Datagrams, Reader
 from uavlinkd.endpoints.sockets import BindError, udp_socket
@@ -80,11 +80,15 @@ class UdpPort(LocalPort):
 
 
 class UdpEndpoint(Endpoint):
-    """A UDP socket and the clients at its other side."""
+    """A UDP socket and the clients at its other side.
+
+    ``failures`` counts the kernel's errors: of those by ICMP, some of each second, not all.
+    """
 
     def __init__(self, name: str, sock: socket.socket, handler: PortHandler) -> None:
         super().__init__(name, handler)
         self._sock = sock
+        self._reports = ErrorReports(sock)
         self._epoch = handler.stall.epoch  # of the last read
         self._gather_s = 0.0
         self._reader: Reader | None = None
@@ -182,7 +186,8 @@ class UdpEndpoint(Endpoint):
         self.frames_sent += frames
 
     def do_housekeeping(self, now: float) -> None:
-        """Give up incomplete frames whose rest does not arrive."""
+        """Give up incomplete frames whose rest does not arrive, and have the kernel report errors again."""
+        self._reports.renew()
         if self.handler.stall.epoch != self._epoch:
             self._age(self.handler.stall.epoch)
         for address, splitter in self._splitters.items():
@@ -216,9 +221,19 @@ class UdpEndpoint(Endpoint):
         if not self._take_errors():
             self.failures[failure_name(error)] += 1
 
-    @abstractmethod
     def _take_errors(self) -> bool:
         """Count the errors of earlier datagrams. Returns whether there were any."""
+        reports = self._reports.take()
+        for address, number in reports:
+            self.failures[errno.errorcode.get(number, "OSError")] += 1
+            if number == errno.ECONNREFUSED and (port := self._ports.get(address)) is not None:
+                self._on_refused(port)
+        if self._reader is not None:
+            self._reader.renew()
+        return bool(reports)
+
+    def _on_refused(self, port: UdpPort) -> None:
+        """No process listens at a client's address."""
 
 
 class UdpServer(UdpEndpoint):
@@ -228,11 +243,6 @@ class UdpServer(UdpEndpoint):
     would add work for every frame. An attacker that forges the ICMP message can have a client forgotten until its
     next frame. Such an attacker could forge the client's frames too.
     """
-
-    def __init__(self, name: str, sock: socket.socket, handler: PortHandler) -> None:
-        super().__init__(name, sock, handler)
-        self._refusing: set[UdpPort] = set()  # to be forgotten in the loop's next turn
-        enable_error_queue(sock)
 
     def share_socket(self) -> socket.socket:
         """A duplicate of the socket, for another endpoint in place of this one. Each endpoint closes its own."""
@@ -263,22 +273,11 @@ class UdpServer(UdpEndpoint):
             self._forget(silent)
         return self._open(address, now)
 
-    def _take_errors(self) -> bool:
-        has_errors = False
-        for address, number in read_error_queue(self._sock):
-            has_errors = True
-            self.failures[errno.errorcode.get(number, "OSError")] += 1
-            port = self._ports.get(address)
-            if number == errno.ECONNREFUSED and port is not None and port not in self._refusing:
-                # Not within this call: it may be forwarding a frame of that client.
-                self._refusing.add(port)
-                asyncio.get_running_loop().call_soon(self._forget_refusing, port)
-        if self._reader is not None:
-            self._reader.renew()
-        return has_errors
+    def _on_refused(self, port: UdpPort) -> None:
+        # Not within this call: it may be forwarding a frame of that client.
+        asyncio.get_running_loop().call_soon(self._forget_refusing, port)
 
     def _forget_refusing(self, port: UdpPort) -> None:
-        self._refusing.discard(port)
         if self._ports.get(port.address) is port:
             self._forget(port)
 
@@ -286,12 +285,11 @@ class UdpServer(UdpEndpoint):
 class UdpClient(UdpEndpoint):
     """``udpout``: one client, at the configured address. Datagrams from other addresses are counted and dropped.
 
-    If no process listens there, the kernel's ``ECONNREFUSED`` is counted: some of each second, not all.
+    If no process listens there, the kernel's ``ECONNREFUSED`` is counted.
     """
 
     def __init__(self, name: str, remote: Address, handler: PortHandler) -> None:
         super().__init__(name, udp_socket(_ANY.get(remote.family, _ANY[socket.AF_INET])), handler)
-        self._reports = ErrorReports(self._sock)
         self._remote = remote
         self._task: asyncio.Task[None] | None = None
 
@@ -299,7 +297,7 @@ class UdpClient(UdpEndpoint):
         """Read whenever datagrams are there, and resolve the name again when its address is silent."""
         super().start()
         log = structlog.get_logger().bind(endpoint=self.name)
-        following = keep_resolving((self._remote,), self._interval_s, self._on_resolved, log)
+        following = keep_resolving(self._remote, self._interval_s, self._on_resolved, log)
         self._task = keep_running(following, f"the search for {self._remote}")
 
     def close(self) -> None:
@@ -307,19 +305,6 @@ class UdpClient(UdpEndpoint):
         if self._task is not None:
             self._task.cancel()
         super().close()
-
-    def do_housekeeping(self, now: float) -> None:
-        """Have the kernel report errors again."""
-        super().do_housekeeping(now)
-        self._reports.renew()
-
-    def _take_errors(self) -> bool:
-        reports = self._reports.take()
-        for _, number in reports:
-            self.failures[errno.errorcode.get(number, "OSError")] += 1
-        if self._reader is not None:
-            self._reader.renew()
-        return bool(reports)
 
     def _interval_s(self) -> float:
         """The interval between look-ups: none while the client answers."""

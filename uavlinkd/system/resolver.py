@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from math import inf
 from typing import Any
@@ -21,7 +21,7 @@ from uavlinkd.system.threads import Threads
 
 Resolved = list[tuple[socket.AddressFamily, Any]]
 """Family and socket address of each address, as the kernel takes them."""
-Query = asyncio.Task[tuple[Resolved, list[str]]]
+Query = asyncio.Task[Resolved]
 
 FIRST_WAIT_S = 0.5
 LONGEST_WAIT_S = 1.0
@@ -45,70 +45,60 @@ def _share() -> int:
     return max(1, min(MAX_QUERIES, MAX_THREADS // max(1, len(_active))))
 
 
-async def resolve(addresses: Sequence[Address]) -> tuple[Resolved, list[str]]:
-    """Return every numeric address of ``addresses``, in their order, and the names that do not resolve now."""
-    resolved: Resolved = []
-    failed: list[str] = []
-    for address in addresses:
-        try:
-            if address.ip is None:
-                answers = await _THREADS.run(_look_up, address, 0)
-            else:
-                answers = _look_up(address, socket.AI_NUMERICHOST)  # sends no query
-        except (OSError, UnicodeError):
-            failed.append(address.host)
-            continue
-        for family, _, _, _, sockaddr in answers:
-            if (family, sockaddr) not in resolved:
-                resolved.append((family, sockaddr))
-    return resolved, failed
+async def resolve(address: Address) -> Resolved:
+    """Every numeric address of ``address``, each once; empty if it does not resolve now."""
+    if address.ip is not None:
+        return numeric(address)
+    try:
+        return await _THREADS.run(_look_up, address, 0)
+    except (OSError, UnicodeError):
+        return []
 
 
 def numeric(address: Address) -> Resolved:
     """The socket address of a numeric address, without a query; empty if this machine lacks its family."""
     try:
-        answers = _look_up(address, socket.AI_NUMERICHOST)
+        return _look_up(address, socket.AI_NUMERICHOST)
     except (OSError, UnicodeError):
         return []
-    return [(family, sockaddr) for family, _, _, _, sockaddr in answers]
 
 
-def _look_up(address: Address, flags: int) -> list[tuple[Any, ...]]:
-    return socket.getaddrinfo(*address.sockaddr, type=socket.SOCK_DGRAM, flags=flags)
+def _look_up(address: Address, flags: int) -> Resolved:
+    answers = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_DGRAM, flags=flags)
+    return list(dict.fromkeys((family, sockaddr) for family, _, _, _, sockaddr in answers))
 
 
 async def keep_resolving(
-    addresses: Sequence[Address],
+    address: Address,
     interval_s: Callable[[], float],
     on_resolved: Callable[[Resolved], bool],
     log: FilteringBoundLogger,
     unresolved: set[str] | None = None,
     wake: asyncio.Event | None = None,
 ) -> None:
-    """Resolve the names now and repeatedly. Runs until cancelled.
+    """Resolve an address now and repeatedly. Runs until cancelled.
 
     ``interval_s`` returns the interval between look-ups as of now: :data:`LONGEST_WAIT_S` if the addresses so far do
-    not answer. Then the first intervals are shorter. While a name fails, the interval is at most
-    :data:`RELAXED_WAIT_S`. Set ``wake`` to have the names resolved at once.
+    not answer. Then the first intervals are shorter. While the name fails, the interval is at most
+    :data:`RELAXED_WAIT_S`. Set ``wake`` to have the name resolved at once.
 
     ``on_resolved`` is called with each new result. If it returns False, it could not use the result, and is called
-    with it again later. A name is logged once each time that it begins to fail. ``unresolved`` always has the names
-    that did not resolve at the last attempt.
+    with it again later. The name is logged once each time that it begins to fail. It is in ``unresolved`` while the
+    last attempt failed.
     """
     known: Resolved = []
-    failing = set[str]() if unresolved is None else unresolved
+    unresolved = set() if unresolved is None else unresolved
     wake = asyncio.Event() if wake is None else wake
     wait_s = 0.0
     queries: set[Query] = set()
     loop = asyncio.get_running_loop()
     queried_at = answered_at = -inf
     me = object()
-    needs_threads = any(address.ip is None for address in addresses)
     try:
         while True:
             asked_s, now = interval_s(), loop.time()
-            is_urgent, is_failing = asked_s <= LONGEST_WAIT_S, bool(failing) or not known
-            if needs_threads and (is_urgent or is_failing):
+            is_urgent, is_failing = asked_s <= LONGEST_WAIT_S, address.host in unresolved or not known
+            if address.ip is None and (is_urgent or is_failing):
                 _active.add(me)
             else:
                 _active.discard(me)
@@ -122,10 +112,12 @@ async def keep_resolving(
             if may_query and (now >= due_at or wake.is_set()):
                 wake.clear()
                 queried_at = now
-                queries.add(asyncio.ensure_future(resolve(addresses)))
+                queries.add(asyncio.ensure_future(resolve(address)))
                 continue
             if not queries:
-                await _rest(wake, min(due_at - now, FIRST_WAIT_S))
+                with suppress(TimeoutError):
+                    async with asyncio.timeout(min(due_at - now, FIRST_WAIT_S)):
+                        await wake.wait()
                 continue
             answered, queries = await asyncio.wait(
                 queries,
@@ -135,15 +127,15 @@ async def keep_resolving(
             if not answered:
                 continue
             # A server that is back may answer several at once: use the result with the most addresses.
-            resolved, failed = max((query.result() for query in answered), key=lambda result: len(result[0]))
-            for name in set(failed) - failing:
-                log.warning("name_not_resolved", host=name, meaning=meaning_of(NAME_NOT_RESOLVED))
-            failing.clear()
-            failing.update(failed)
-            if resolved and resolved != known and on_resolved(resolved):
-                known = resolved
-            if not failed:
+            resolved = max((query.result() for query in answered), key=len)
+            if resolved:
+                unresolved.discard(address.host)
                 _cancel(queries)
+                if resolved != known and on_resolved(resolved):
+                    known = resolved
+            elif address.host not in unresolved:
+                unresolved.add(address.host)
+                log.warning("name_not_resolved", host=address.host, meaning=meaning_of(NAME_NOT_RESOLVED))
             answered_at, wait_s = loop.time(), max(FIRST_WAIT_S, min(2 * wait_s, RELAXED_WAIT_S))
     finally:
         _active.discard(me)
@@ -155,12 +147,6 @@ def _interval_s(asked_s: float, wait_s: float, *, is_failing: bool) -> float:
     if asked_s <= LONGEST_WAIT_S:
         return min(wait_s, LONGEST_WAIT_S)
     return min(asked_s, wait_s) if is_failing else asked_s
-
-
-async def _rest(wake: asyncio.Event, seconds: float) -> None:
-    with suppress(TimeoutError):
-        async with asyncio.timeout(seconds):
-            await wake.wait()
 
 
 def _cancel(queries: set[Query]) -> None:
