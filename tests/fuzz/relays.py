@@ -181,7 +181,7 @@ class FuzzedRelay:
         """Data along the relay: forwarded once, or counted once."""
         forwarding = self.service.forwarding
         counted, sent = forwarding.dropped.total(), len(self.forwarded)
-        self.service.take(path.socket, data, path.address)
+        self.service.forwarding.take(path.socket, data, path.address)
         added = self.forwarded[sent:]
         assert len(added) + forwarding.dropped.total() - counted == 1, "not forwarded or counted once"
         for datagram, to in added:

@@ -86,7 +86,7 @@ class Relay(Drone):
         assert self.service is not None
         if datagram[:1] == RELAYED_START:
             self._arrived = path, len(datagram)
-            self.service.take(path.socket, datagram, path.address)
+            self.service.forwarding.take(path.socket, datagram, path.address)
             self._arrived = None
         else:
             super().receive(datagram, path)

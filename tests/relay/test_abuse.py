@@ -281,7 +281,7 @@ def test_removed_member_with_several_paths_is_cut_off(relay: FuzzedRelay) -> Non
     relay.set_members(0b110, 3)
     for path in paths[1]:
         for handle in range(2**16):
-            relay.service.take(path.socket, wrap(handle, DATA), path.address)
+            relay.service.forwarding.take(path.socket, wrap(handle, DATA), path.address)
     assert relay.forwarded == []
     assert len(relay.service.forwarding) == 0
 

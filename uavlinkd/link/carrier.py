@@ -171,7 +171,7 @@ class FrameCarrier:
             if isinstance(inside, tuple):
                 return inside
             if relay is not None:
-                relay.take(socket, data, source)
+                relay.forwarding.take(socket, data, source)
                 return None
             if inside is not None:
                 self._drop_datagram(inside, path=path)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import product, takewhile
 from typing import NamedTuple
 
@@ -19,8 +20,6 @@ from uavlinkd.core.path import Path
 HANDLE_BYTES = 2
 QUARANTINED_PER_MEMBER = 4096
 """Quarantined handles of one member. A member that changes its paths fast must not use up the handles of another."""
-
-
 FEWEST_PEERS = 16
 """A member that may ask for fewer has the budget for new wishes of one that may ask for so many."""
 
@@ -40,43 +39,39 @@ class MemberConnection(NamedTuple):
     other: ConnectionEnd
 
 
-class Changes(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class Changes:
     """What a call changed. ``concerned``: by member and path, the keys whose handles there the member must get.
 
     No connection is both opened and closed.
     """
 
-    opened: list[MemberConnection]
-    closed: list[MemberConnection]
-    concerned: dict[tuple[bytes, Path], dict[bytes, None]]
-
-    @classmethod
-    def none(cls) -> Changes:
-        """No changes, to be filled."""
-        return cls([], [], {})
+    opened: list[MemberConnection] = field(default_factory=list)
+    closed: list[MemberConnection] = field(default_factory=list)
+    concerned: dict[tuple[bytes, Path], dict[bytes, None]] = field(default_factory=dict)
 
     def concern(self, member: bytes, path: Path, key: bytes) -> None:
         """The member must get the handles of this key on this path."""
         self.concerned.setdefault((member, path), {})[key] = None
 
+    def concern_both(self, connection: MemberConnection) -> None:
+        """Both members must get theirs."""
+        for end, other in (connection, connection[::-1]):
+            self.concern(end.member, end.path, other.member)
 
+
+@dataclass(eq=False, slots=True)
 class _Wish:
-    """Of a member, to reach a key along a path. Compared by identity."""
+    """Of a member, to reach a key along a path. ``number`` grows from one wish to the next."""
 
-    __slots__ = ("key", "member", "number", "path", "until")
-
-    def __init__(self, member: bytes, key: bytes, path: Path, number: int) -> None:
-        self.member = member
-        self.key = key
-        self.path = path
-        self.number = number
-        """Grows from one wish to the next."""
-        self.until = 0.0
+    member: bytes
+    key: bytes
+    path: Path
+    number: int
+    until: float = 0.0
 
 
 class _Member:
-    __slots__ = ("handles", "most_peers", "new_wishes", "paths", "quarantine", "refused", "wishes")
-
     def __init__(self, most_peers: int) -> None:
         self.set_most_peers(most_peers)
         self.wishes: dict[bytes, dict[Path, _Wish]] = {}  # by key
@@ -106,10 +101,13 @@ class Bindings:
         self._pairs: dict[_Pair, dict[tuple[Path, Path], MemberConnection]] = {}
         self._by_age: OrderedDict[_Wish, None] = OrderedDict()  # the next to end first
         self._wishes = 0  # so far
-        self.connections = 0
-        """How many there are."""
 
     # Facts.
+
+    @property
+    def connections(self) -> int:
+        """How many there are."""
+        return sum(map(len, self._pairs.values()))
 
     def handles(self, member: bytes, path: Path, key: bytes) -> tuple[int, ...]:
         """The handles of a member on a path for a key. Empty: waiting."""
@@ -129,11 +127,6 @@ class Bindings:
     def refused(self, member: bytes) -> int:
         """How many wishes of a member were ignored so far, because it had or made as many as it may."""
         return self._members[member].refused
-
-    @property
-    def next_expiry(self) -> float:
-        """When the next wish ends."""
-        return next(iter(self._by_age)).until if self._by_age else c.NEVER
 
     # Members.
 
@@ -155,7 +148,7 @@ class Bindings:
 
     def bind(self, member: bytes, path: Path, keys: Sequence[bytes], now: float) -> Changes:
         """A member wishes to reach these keys along a path that the relay has validated."""
-        changes = Changes.none()
+        changes = Changes()
         for key in dict.fromkeys(keys):
             changes.concern(member, path, key)  # the answer, the same for a key that is not a member
             # A key without a member counts as much: what is left for others must not tell which keys are members.
@@ -178,7 +171,7 @@ class Bindings:
         for wish in wishes:
             self._remove(wish)
             pairs[_pair(wish.member, wish.key)] = None
-        changes = Changes.none()
+        changes = Changes()
         for pair in pairs:
             self._match(pair, changes, now)
         return changes
@@ -221,7 +214,7 @@ class Bindings:
         """Connect the paths of two members after their wishes have changed."""
         before = self._pairs.get(pair, {})
         one, other = (self._wishes_of(member, key) for member, key in (pair, pair[::-1]))
-        chosen = _choose(list(product(one.values(), other.values())), before)
+        chosen = _choose(product(one.values(), other.values()), before)
         for paths in [paths for paths in before if paths not in chosen]:
             self._close(before.pop(paths), changes, now)
         for paths in chosen:
@@ -237,14 +230,11 @@ class Bindings:
         return {} if of_member is None else of_member.wishes.get(key, {})
 
     def _open(self, pair: _Pair, paths: tuple[Path, Path], changes: Changes, now: float) -> MemberConnection:
-        one, other = (
-            ConnectionEnd(member, path, self._new_handle(member, now))
-            for member, path in zip(pair, paths, strict=True)
-        )
-        connection = MemberConnection(one, other)
+        members = zip(pair, paths, strict=True)
+        ends = (ConnectionEnd(member, path, self._new_handle(member, now)) for member, path in members)
+        connection = MemberConnection(*ends)
         changes.opened.append(connection)
-        _note(connection, changes)
-        self.connections += 1
+        changes.concern_both(connection)
         return connection
 
     def _close(self, connection: MemberConnection, changes: Changes, now: float) -> None:
@@ -255,8 +245,7 @@ class Bindings:
             if len(of_member.quarantine) > QUARANTINED_PER_MEMBER:
                 del of_member.quarantine[next(iter(of_member.quarantine))]
         changes.closed.append(connection)
-        _note(connection, changes)
-        self.connections -= 1
+        changes.concern_both(connection)
 
     def _new_handle(self, member: bytes, now: float) -> int:
         of_member = self._members[member]
@@ -272,12 +261,6 @@ class Bindings:
 
 def _pair(one: bytes, other: bytes) -> _Pair:
     return (one, other) if one < other else (other, one)
-
-
-def _note(connection: MemberConnection, changes: Changes) -> None:
-    one, other = connection
-    changes.concern(one.member, one.path, other.member)
-    changes.concern(other.member, other.path, one.member)
 
 
 def _choose(choices: Iterable[_Choice], before: Mapping[tuple[Path, Path], object]) -> list[tuple[Path, Path]]:

@@ -17,7 +17,7 @@ from uavlinkd.core.drops import DropReason, Reason
 from uavlinkd.core.limits import TokenBucket
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import LinkedPeer, Output
-from uavlinkd.core.path import Path, SocketAddress
+from uavlinkd.core.path import Path
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.relay_records import Bind, FilterTest, FilterTested, bounds_of, token_datagram
 from uavlinkd.relay.bindings import Bindings, Changes
@@ -264,10 +264,6 @@ class RelayService:
                 if member.peer.paths.find(path) is None:
                     self._apply(self.bindings.end_path(key, path, now))
         self.settle(now)
-
-    def take(self, socket: int, data: bytes, source: SocketAddress) -> None:
-        """Forward data that begins with 0x50, or drop it."""
-        self.forwarding.take(socket, data, source)
 
     def count_drops(self) -> Iterator[tuple[Reason, str, int]]:
         """How many datagrams were dropped since the last call: reason, member or an empty name, count."""

@@ -268,7 +268,7 @@ class HostileRelay(ChannelService):
             except OSError:  # an earlier datagram was refused
                 continue
             if data.startswith(_START):
-                self._service.take(number, data, source)
+                self._service.forwarding.take(number, data, source)
             else:
                 self._perform(self._node.receive(data, Path(number, source), monotonic()))
         self._settle()
