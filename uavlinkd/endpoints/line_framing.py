@@ -25,6 +25,7 @@ from binascii import crc_hqx
 from collections import Counter
 from dataclasses import dataclass
 from enum import StrEnum
+from struct import Struct
 from typing import Final
 
 from cobs import cobs
@@ -44,13 +45,11 @@ REPORTS_CUT_OUT: Final = 2
 
 REPORT_STARTS: Final = bytes((MAVLINK1, MAVLINK2))
 """A report starts with one of these bytes."""
-_PAYLOAD_BYTES = 9
 _CRC_EXTRA: Final = {109: 185, 166: 21}
 """By message: RADIO_STATUS, and RADIO of old firmware."""
-_FIXED: Final = {MAVLINK1: {1: 9}, MAVLINK2: {1: 9, 2: 0, 3: 0, 8: 0, 9: 0}}
-"""Bytes of the header with one value, by their places."""
-_SIZES: Final = {MAVLINK1: 17, MAVLINK2: 21}
-_MESSAGE_AT: Final = {MAVLINK1: 5, MAVLINK2: 7}
+_HEADERS: Final = {MAVLINK1: (17, 5, {1: 9}), MAVLINK2: (21, 7, {1: 9, 2: 0, 3: 0, 8: 0, 9: 0})}
+"""By first byte: length of a report, place of the message, and the bytes that have one value, by their places."""
+_FIGURES: Final = Struct("<HH5B")
 _REPORT_START: Final = re.compile(b"[" + re.escape(REPORT_STARTS) + b"]")
 
 
@@ -72,14 +71,11 @@ class RadioReport:
 
 def report_bytes(data: bytes, at: int) -> int | None:
     """The length of the report that begins at a place; 0 if no report begins there; None if too few bytes follow."""
-    start = data[at]
-    if start not in _SIZES:
+    if data[at] not in _HEADERS:
         return 0
-    size, left = _SIZES[start], len(data) - at
-    for place, value in _FIXED[start].items():
-        if place < left and data[at + place] != value:
-            return 0
-    message_at = _MESSAGE_AT[start]
+    (size, message_at, fixed), left = _HEADERS[data[at]], len(data) - at
+    if any(place < left and data[at + place] != value for place, value in fixed.items()):
+        return 0
     if message_at < left and data[at + message_at] not in _CRC_EXTRA:
         return 0
     if left < size:
@@ -91,9 +87,8 @@ def report_bytes(data: bytes, at: int) -> int | None:
 
 def parse_report(frame: bytes) -> RadioReport:
     """The figures of a whole report."""
-    payload = frame[-2 - _PAYLOAD_BYTES : -2]
-    rxerrors, fixed = (int.from_bytes(payload[at : at + 2], "little") for at in (0, 2))
-    rssi, remrssi, txbuf, noise, remnoise = payload[4:]
+    at = len(frame) - _FIGURES.size - CRC_BYTES
+    rxerrors, fixed, rssi, remrssi, txbuf, noise, remnoise = _FIGURES.unpack_from(frame, at)
     return RadioReport(rssi, remrssi, txbuf, noise, remnoise, rxerrors, fixed)
 
 
@@ -180,34 +175,30 @@ class LineDecoder:
             if self._is_skipping:  # the piece is counted already
                 self._is_skipping = False
                 self.discarded_bytes[Noise.TOO_LONG] += len(piece)
-            elif piece and (noise := self._take(piece, datagrams)) is not None:
-                is_searched = self._cuts < REPORTS_CUT_OUT and len(piece) <= MAX_ENCODED
-                start, size = _find_report(data, at, end) if is_searched else (0, 0)
-                if size is None:
-                    break
-                if size:
-                    self._note(data[start : start + size])
-                    self.reports_inside += 1
-                    data, at = data[at:start] + data[start + size :], 0
-                    self._cuts += 1
-                    continue
-                self._discard(noise, len(piece))
+            elif piece:
+                result = _decode(piece)
+                if isinstance(result, Noise):
+                    is_searched = self._cuts < REPORTS_CUT_OUT and len(piece) <= MAX_ENCODED
+                    start, size = _find_report(data, at, end) if is_searched else (0, 0)
+                    if size is None:
+                        break
+                    if size:
+                        self._note(data[start : start + size])
+                        self.reports_inside += 1
+                        data, at = data[at:start] + data[start + size :], 0
+                        self._cuts += 1
+                        continue
+                    self._discard(result, len(piece))
+                else:
+                    datagrams.append(result)
             at, self._cuts = end + 1, 0
         self._keep(data[at:])
+        self.datagrams += len(datagrams)
         return datagrams
 
     def reset(self) -> None:
         """Forget the bytes that wait: the device was closed."""
         self._rest, self._is_skipping, self._cuts = b"", False, 0
-
-    def _take(self, piece: bytes, datagrams: list[bytes]) -> Noise | None:
-        """Decode what is between two delimiters. Returns why it is not a datagram."""
-        datagram = _decode(piece)
-        if isinstance(datagram, Noise):
-            return datagram
-        datagrams.append(datagram)
-        self.datagrams += 1
-        return None
 
     def _discard(self, noise: Noise, size: int) -> None:
         self.discarded[noise] += 1

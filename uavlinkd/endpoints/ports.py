@@ -6,6 +6,7 @@ exception because of what a client does, and queues a bounded count of bytes.
 
 from __future__ import annotations
 
+import asyncio
 import errno
 from abc import ABC, abstractmethod
 from collections import Counter
@@ -79,6 +80,7 @@ class Endpoint(ABC):
         """Errors by name: the kernel's (``ECONNREFUSED``), and the endpoint's own reasons."""
         self.bytes_received = self.bytes_sent = self.frames_sent = 0
         self.delivered = DeliveredStreams()
+        self._task: asyncio.Task[None] | None = None  # connects, opens or resolves
 
     @property
     @abstractmethod
@@ -96,9 +98,11 @@ class Endpoint(ABC):
     def do_housekeeping(self, now: float) -> None:
         """Forget clients that have gone. The daemon calls this each second."""
 
-    @abstractmethod
     def close(self) -> None:
         """Stop and close everything. Reports no port as closed any more."""
+        if self._task is not None:
+            self._task.cancel()
+            self._task = None  # it may hold a lost device, and freeing that closes it
 
 
 def failure_name(error: OSError) -> str:

@@ -59,20 +59,8 @@ class Reader:
     """
 
     __slots__ = (
-        "_deliver",
-        "_done_at",
-        "_found_several",
-        "_gather_s",
-        "_is_burst",
-        "_is_watched",
-        "_loop",
-        "_on_failure",
-        "_pause_s",
-        "_sock",
-        "_stall",
-        "_timer",
-        "_waiting",
-        "backlog",
+        *("_deliver", "_done_at", "_found_several", "_is_burst", "_is_watched", "_loop", "_on_failure", "_pause_s"),
+        *("_sock", "_stall", "_timer", "_waiting", "backlog", "gather_s"),
     )
 
     def __init__(
@@ -92,20 +80,12 @@ class Reader:
         self._loop = asyncio.get_running_loop()
         self._is_watched = False  # by the loop
         self._timer: asyncio.TimerHandle | None = None  # reads the socket next, and not the loop
-        self._gather_s = 0.0
+        self.gather_s = 0.0
+        """Datagrams are read so long after the first of them arrived; 0: at once."""
         self._done_at = -inf  # when the last batch had been delivered
         self._is_burst = False  # the last read was soon after the one before it
         self._found_several = False  # the last read found more than one datagram
         self._waiting = array("i", [0])
-
-    @property
-    def is_paused(self) -> bool:
-        """Whether datagrams gather, and a timer reads them."""
-        return self._timer is not None
-
-    def gather(self, seconds: float) -> None:
-        """Read ``seconds`` after a datagram arrives; 0: at once."""
-        self._gather_s = seconds
 
     def start(self) -> None:
         """Read whenever datagrams are there."""
@@ -131,7 +111,7 @@ class Reader:
         stall = self._stall
         is_quiet = now - self._done_at >= BUSY_S
         has_paused = now - stall.turned_at > STALL_S or self.backlog.left
-        if not is_quiet or self._found_several or self._gather_s or has_paused:
+        if not is_quiet or self._found_several or self.gather_s or has_paused:
             self._on_several(now, is_quiet=is_quiet)
             return
         # At most rates a datagram comes alone. Each call costs, so this case has none of its own.
@@ -148,8 +128,8 @@ class Reader:
 
     def _on_several(self, now: float, *, is_quiet: bool) -> None:
         """Several datagrams may be there, or may soon be."""
-        if self._gather_s:
-            self._pause(self._gather_s)
+        if self.gather_s:
+            self._pause(self.gather_s)
         elif is_quiet:
             self._is_burst = False
             self.read(now, drains=False)
@@ -170,7 +150,7 @@ class Reader:
         finally:
             if self._timer is not None:  # the handler of the datagrams did not stop this reader
                 self._timer = None
-                if count < 2 or self._gather_s:
+                if count < 2 or self.gather_s:
                     self.start()
                 else:
                     seconds = self._pause_s if count < DATAGRAMS_PER_WAKE_UP else 0.0

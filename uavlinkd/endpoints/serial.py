@@ -127,10 +127,7 @@ class SerialChannel:
         )
         self._sent_by = -inf  # when the line will have carried all written bytes, at its rate
         self._fd = device.fileno()
-
-    def fileno(self) -> int:
-        """For the event loop."""
-        return self._fd
+        self.fileno = device.fileno
 
     def read(self, size: int) -> bytes:
         """The received bytes; no bytes, or an error, once the device is unplugged."""
@@ -138,14 +135,10 @@ class SerialChannel:
 
     def write(self, data: bytes) -> int:
         """Pass bytes to the kernel."""
-        count = self.hand_over(data)
+        count = os.write(self._fd, data)
         if self._bytes_per_s is not None:
             self._sent_by = max(self._sent_by, monotonic()) + count / self._bytes_per_s
         return count
-
-    def hand_over(self, data: bytes) -> int:
-        """The system call of :meth:`write`."""
-        return os.write(self._fd, data)
 
     def capacity(self) -> int:
         """The limit of the kernel's queue for a terminal, at any rate."""
@@ -184,7 +177,6 @@ class SerialEndpoint(StreamEndpoint):
         super().__init__(name, handler)
         self._url = url
         self._opener = Opener(f"serial-{name}", url)
-        self._task: asyncio.Task[None] | None = None
 
     def start(self) -> None:
         """Open the device as soon as it is present."""
@@ -194,9 +186,6 @@ class SerialEndpoint(StreamEndpoint):
     def close(self) -> None:
         """Stop, and close the device."""
         self._opener.is_closed = True
-        if self._task is not None:
-            self._task.cancel()
-            self._task = None  # it may hold a lost device, and freeing that closes it
         super().close()
 
     def dispose(self, connection: Connection) -> None:

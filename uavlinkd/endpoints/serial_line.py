@@ -50,13 +50,10 @@ LINE_FULL: Final = "LINE_FULL"
 CTS_STUCK: Final = "CTS_STUCK"
 """In place of an error's name: see :data:`STUCK_S`."""
 _BITS_PER_BYTE: Final = 10  # with start and stop bit
-TOO_LONG: Final = "EMSGSIZE"
 
 
 class CtsHold:
     """Looks at a line in which the modem can stop this end by the CTS wire."""
-
-    __slots__ = ("_noted_at", "_since", "total_s")
 
     def __init__(self) -> None:
         self.total_s = 0.0
@@ -64,8 +61,11 @@ class CtsHold:
         self._since: float | None = None
         self._noted_at = 0.0
 
-    def note(self, now: float, *, is_held: bool) -> None:
-        """A look: ``is_held`` if the kernel has bytes that the wire should have carried by now."""
+    def note(self, now: float, *, is_held: bool) -> float:
+        """A look: ``is_held`` if the kernel has bytes that the wire should have carried by now.
+
+        Returns for how long they are held.
+        """
         if self._since is not None:
             self.total_s += now - self._noted_at
         if not is_held:
@@ -73,9 +73,6 @@ class CtsHold:
         elif self._since is None:
             self._since = now
         self._noted_at = now
-
-    def lasts_s(self, now: float) -> float:
-        """How long it has lasted; 0 if the last look found nothing held."""
         return 0.0 if self._since is None else now - self._since
 
     def end(self) -> None:
@@ -113,7 +110,8 @@ class SerialLine:
         self.bytes_received = 0
         self.bytes_written = 0
         self._name = name
-        self._bytes_s = bytes_s
+        self.bytes_s = bytes_s
+        """The rate at which it is written: this end's part of the air."""
         self._on_datagrams = on_datagrams
         self._on_change = on_change
         self._stall = stall
@@ -133,10 +131,6 @@ class SerialLine:
     def is_open(self) -> bool:
         """Whether the device is there."""
         return self._device is not None
-
-    def set_rate(self, bytes_s: float) -> None:
-        """Write at another rate from now on."""
-        self._bytes_s = bytes_s
 
     def start(self) -> None:
         """Open the device as soon as it is present."""
@@ -173,9 +167,9 @@ class SerialLine:
         try:
             line = encode(datagram)
         except ValueError:
-            self.failures[TOO_LONG] += 1
+            self.failures["EMSGSIZE"] += 1
             return
-        if self._queue and self._queued_bytes + len(line) > QUEUE_BYTES + QUEUE_S * self._bytes_s:
+        if self._queue and self._queued_bytes + len(line) > QUEUE_BYTES + QUEUE_S * self.bytes_s:
             self.failures[LINE_FULL] += 1
             return
         self._queue.append(line)
@@ -192,23 +186,21 @@ class SerialLine:
             except OSError as error:
                 self._lose(failure_name(error))
                 return
-            self.cts.note(now, is_held=self.uses_cts and in_kernel > 0 and now > self._wire_by + WIRE_LATE_S)
-            if self.cts.lasts_s(now) > STUCK_S:
+            is_held = self.uses_cts and in_kernel > 0 and now > self._wire_by + WIRE_LATE_S
+            if self.cts.note(now, is_held=is_held) > STUCK_S:
                 self._lose(CTS_STUCK)
                 return
-            held_s = self._held_s(in_kernel, now)
-            if held_s > 0 and held_s + len(self._queue[0]) / self._bytes_s > MODEM_S:
-                wait_s = min(held_s, max(held_s + len(self._queue[0]) / self._bytes_s - MODEM_S, 0.0)) + LATE_S
+            # For so long the radio has something to send; at least as long as the kernel holds bytes.
+            held_s = max(0.0, self._sent_by - now, in_kernel / self.bytes_s)
+            over_s = held_s + len(self._queue[0]) / self.bytes_s - MODEM_S
+            if held_s > 0 and over_s > 0:
+                wait_s = min(held_s, over_s) + LATE_S
                 self._timer = asyncio.get_running_loop().call_later(wait_s, self._write_waiting)
                 return
             line = self._queue.popleft()
             self._queued_bytes -= len(line)
             if not self._write(device, line, now):
                 return
-
-    def _held_s(self, in_kernel: int, now: float) -> float:
-        """For how long the radio has something to send; at least as long as the kernel holds bytes."""
-        return max(0.0, self._sent_by - now, in_kernel / self._bytes_s)
 
     def _write(self, device: BaseSerial, line: bytes, now: float) -> bool:
         """Pass bytes to the kernel. Returns whether the device is still there."""
@@ -222,7 +214,7 @@ class SerialLine:
         if count < len(line):  # the kernel's queue is full: the other end drops the torn datagram
             self.failures[LINE_FULL] += 1
         self.bytes_written += count
-        self._sent_by = max(self._sent_by, now) + count / self._bytes_s
+        self._sent_by = max(self._sent_by, now) + count / self.bytes_s
         self._wire_by = max(self._wire_by, now) + count * _BITS_PER_BYTE / self.url.baud
         return True
 
@@ -230,7 +222,13 @@ class SerialLine:
 
     async def _use(self, device: BaseSerial, epoch: int) -> None:
         self._lost.clear()
-        self._attach(device, epoch)
+        self._device = device
+        self.reason = ""
+        self._sent_by = self._wire_by = -inf
+        self.decoder.reset()
+        self._backlog = Backlog(self._stall, device.fileno(), lambda: TERMINAL_BYTES, epoch)
+        asyncio.get_running_loop().add_reader(device.fileno(), self._on_readable)
+        self._on_change()
         await self._lost.wait()
 
     def _could_not_open(self, error: str) -> None:
@@ -242,15 +240,6 @@ class SerialLine:
         """Use CTS if the modem has it; in the opener's thread."""
         os.set_blocking(device.fileno(), False)
         self.uses_cts = not self._ignores_cts and _has_cts(device) and _set_cts(device, on=True)
-
-    def _attach(self, device: BaseSerial, epoch: int) -> None:
-        self._device = device
-        self.reason = ""
-        self._sent_by = self._wire_by = -inf
-        self.decoder.reset()
-        self._backlog = Backlog(self._stall, device.fileno(), lambda: TERMINAL_BYTES, epoch)
-        asyncio.get_running_loop().add_reader(device.fileno(), self._on_readable)
-        self._on_change()
 
     def _on_readable(self) -> None:
         device, backlog = self._device, self._backlog

@@ -5,7 +5,8 @@ from __future__ import annotations
 import errno
 import socket
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any, Final, NamedTuple
 
 import structlog
@@ -34,16 +35,17 @@ class BindError(CommandError):
     """Whether another socket is bound there."""
 
 
-def unbound_socket(address: Address, kind: socket.SocketKind) -> tuple[socket.socket, tuple[Any, ...]]:
-    """Make a socket of one address family that does not block. Returns it with the numeric address to bind it to.
+@contextmanager
+def new_socket(address: Address, kind: socket.SocketKind) -> Iterator[tuple[socket.socket, tuple[Any, ...]]]:
+    """A socket of one address family that does not block, and the numeric address to bind it to.
 
     Raises:
-        BindError: the address cannot be used; with the reason.
+        BindError: the address cannot be used, or the body fails; with the reason. The socket is closed.
     """
     try:
         # This only turns a zone ("%wlan0") into its number. A host name is an error here.
         family, _, proto, _, sockaddr = socket.getaddrinfo(
-            *address.sockaddr, type=kind, flags=socket.AI_NUMERICHOST | socket.AI_PASSIVE
+            address.host, address.port, type=kind, flags=socket.AI_NUMERICHOST | socket.AI_PASSIVE
         )[0]
         sock = socket.socket(family, kind, proto)
     except OSError as error:
@@ -52,10 +54,13 @@ def unbound_socket(address: Address, kind: socket.SocketKind) -> tuple[socket.so
         sock.setblocking(False)
         if family == socket.AF_INET6:
             sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+        yield sock, sockaddr
     except OSError as error:
         sock.close()
-        raise BindError(f"cannot use {address}: {error.strerror or error}") from None
-    return sock, sockaddr
+        raise _cannot_listen(address, error) from None
+    except BindError:
+        sock.close()
+        raise
 
 
 def udp_socket(address: Address, *, may_come_later: bool = False) -> socket.socket:
@@ -64,13 +69,9 @@ def udp_socket(address: Address, *, may_come_later: bool = False) -> socket.sock
     Raises:
         BindError: the address cannot be used; with the reason.
     """
-    sock, sockaddr = unbound_socket(address, socket.SOCK_DGRAM)
-    try:
+    with new_socket(address, socket.SOCK_DGRAM) as (sock, sockaddr):
         _enlarge(sock)
         bind(sock, sockaddr, may_come_later=may_come_later)
-    except OSError as error:
-        sock.close()
-        raise cannot_listen(address, error) from None
     return sock
 
 
@@ -105,9 +106,8 @@ def network_socket(address: Address, interface: str | None, others: Iterable[soc
     Raises:
         BindError: the address or the interface cannot be used; with the reason.
     """
-    sock, sockaddr = unbound_socket(address, socket.SOCK_DGRAM)
-    sharing = [sock, *others]
-    try:
+    with new_socket(address, socket.SOCK_DGRAM) as (sock, sockaddr):
+        sharing = [sock, *others]
         if interface is not None:
             _bind_to_interface(sock, interface)
         _enlarge(sock)
@@ -118,12 +118,6 @@ def network_socket(address: Address, interface: str | None, others: Iterable[soc
         finally:
             for one in sharing:
                 one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 0)
-    except OSError as error:
-        sock.close()
-        raise cannot_listen(address, error) from None
-    except BindError:
-        sock.close()
-        raise
     return sock
 
 
@@ -213,16 +207,14 @@ def look(interface: str | None, address: str | None) -> Presence:
 
 
 def _look_for_address(host: str) -> Presence:
-    absent = Presence(reason=f"no interface has {host}")
     try:
-        family, _, _, _, sockaddr = socket.getaddrinfo(host, 0, type=socket.SOCK_DGRAM, flags=socket.AI_NUMERICHOST)[
-            0
-        ]
+        answers = socket.getaddrinfo(host, 0, type=socket.SOCK_DGRAM, flags=socket.AI_NUMERICHOST)
     except OSError:  # the interface of a link-local address is absent
-        return absent
-    if not is_here(family, sockaddr):
-        return absent
-    return Presence(sockaddr[3] if len(sockaddr) > 3 else 0, (host,))
+        answers = []
+    for family, _, _, _, sockaddr in answers:
+        if is_here(family, sockaddr):
+            return Presence(int(sockaddr[3]) if len(sockaddr) > 3 else 0, (host,))
+    return Presence(reason=f"no interface has {host}")
 
 
 def family_of(host: str) -> socket.AddressFamily:
@@ -236,7 +228,7 @@ _REMEDIES = {
 }
 
 
-def cannot_listen(address: Address, error: OSError) -> BindError:
+def _cannot_listen(address: Address, error: OSError) -> BindError:
     """The error for the operator, with a remedy if one is known."""
     remedy = _REMEDIES.get(error.errno or 0)
     bind_error = BindError(f"cannot listen on {address}: {error.strerror or error}{f': {remedy}' if remedy else ''}")

@@ -334,6 +334,7 @@ class StreamEndpoint(Endpoint):
 
     def close(self) -> None:
         """Stop and close every connection."""
+        super().close()
         connections, self._connections = self._connections, []
         for connection in connections:
             connection.stop()

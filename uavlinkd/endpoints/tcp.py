@@ -16,7 +16,7 @@ from secrets import SystemRandom
 from typing import Any
 
 from uavlinkd.endpoints.ports import PortHandler, failure_name
-from uavlinkd.endpoints.sockets import bind, cannot_listen, unbound_socket
+from uavlinkd.endpoints.sockets import bind, new_socket
 from uavlinkd.endpoints.stream_endpoint import STALLED_S, StreamEndpoint
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic
@@ -61,14 +61,10 @@ def tcp_listener(address: Address) -> socket.socket:
     Raises:
         BindError: the address cannot be used; with the reason.
     """
-    sock, sockaddr = unbound_socket(address, socket.SOCK_STREAM)
-    try:
+    with new_socket(address, socket.SOCK_STREAM) as (sock, sockaddr):
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # earlier connections may still be closing
         bind(sock, sockaddr, may_come_later=True)
         sock.listen(_BACKLOG)
-    except OSError as error:
-        sock.close()
-        raise cannot_listen(address, error) from None
     return sock
 
 
@@ -198,17 +194,10 @@ class TcpClient(StreamEndpoint):
     def __init__(self, name: str, address: Address, handler: PortHandler) -> None:
         super().__init__(name, handler)
         self._address = address
-        self._task: asyncio.Task[None] | None = None
 
     def start(self) -> None:
         """Begin to connect."""
         self._task = keep_running(self._keep_connected(), f"the endpoint {self.name}")
-
-    def close(self) -> None:
-        """Stop connecting and close the connection."""
-        if self._task is not None:
-            self._task.cancel()
-        super().close()
 
     async def _keep_connected(self) -> None:
         rng = SystemRandom()

@@ -110,14 +110,14 @@ class UdpEndpoint(Endpoint):
     def start(self) -> None:
         """Read whenever datagrams are there."""
         self._reader = Reader(self._sock, self.take, self._on_read_error, self.handler.stall)
-        self._reader.gather(self._gather_s)
+        self._reader.gather_s = self._gather_s
         self._reader.start()
 
     def gather(self, seconds: float) -> None:
         """Read once for all datagrams that arrive within ``seconds``, and not for each of them."""
         self._gather_s = seconds
         if self._reader is not None:
-            self._reader.gather(seconds)
+            self._reader.gather_s = seconds
 
     def take(self, datagrams: Datagrams, now: float, epoch: int, waited_s: float = 0.0) -> None:
         """Deliver the frames of each client, in their order."""
@@ -196,7 +196,12 @@ class UdpEndpoint(Endpoint):
                 self.handler.on_frames(self._ports[address], frames, now, epoch)
 
     def close(self) -> None:
-        """Close the socket."""
+        """Stop, and close the socket."""
+        super().close()
+        self._ports.clear()
+        self._close_socket()
+
+    def _close_socket(self) -> None:
         if self._reader is not None:
             self._reader.stop()
         self._sock.close()
@@ -248,11 +253,6 @@ class UdpServer(UdpEndpoint):
         """A duplicate of the socket, for another endpoint in place of this one. Each endpoint closes its own."""
         return self._sock.dup()
 
-    def close(self) -> None:
-        """Close the socket."""
-        self._ports.clear()
-        super().close()
-
     def do_housekeeping(self, now: float) -> None:
         """Forget idle clients, and report those that became silent."""
         super().do_housekeeping(now)
@@ -291,7 +291,6 @@ class UdpClient(UdpEndpoint):
     def __init__(self, name: str, remote: Address, handler: PortHandler) -> None:
         super().__init__(name, udp_socket(_ANY.get(remote.family, _ANY[socket.AF_INET])), handler)
         self._remote = remote
-        self._task: asyncio.Task[None] | None = None
 
     def start(self) -> None:
         """Read whenever datagrams are there, and resolve the name again when its address is silent."""
@@ -299,12 +298,6 @@ class UdpClient(UdpEndpoint):
         log = structlog.get_logger().bind(endpoint=self.name)
         following = keep_resolving(self._remote, self._interval_s, self._on_resolved, log)
         self._task = keep_running(following, f"the search for {self._remote}")
-
-    def close(self) -> None:
-        """Close the socket."""
-        if self._task is not None:
-            self._task.cancel()
-        super().close()
 
     def _interval_s(self) -> float:
         """The interval between look-ups: none while the client answers."""
@@ -322,7 +315,7 @@ class UdpClient(UdpEndpoint):
             except BindError:
                 self.failures["family_unavailable"] += 1
                 return False
-            super().close()
+            self._close_socket()
             self._sock = sock
             self._reports = ErrorReports(sock)
             super().start()

@@ -295,7 +295,7 @@ class SerialNetworks:
         has_changed = False
         for line in self.networks:
             budget, bits_s = budgets[line.number], line.rate.bits_s(now)
-            line.line.set_rate(bits_s / 8)
+            line.line.bytes_s = bits_s / 8
             budget.set_rate(bits_s, now)
             has_changed |= budget.update_core(bits_s)
         return {line.number: budgets[line.number].core_bits_s for line in self.networks} if has_changed else {}

@@ -37,7 +37,8 @@ class StallWatch:
         self._on_pause = on_pause
         self.turned_at = now
         """The time of the last turn. A read within STALL_S of it may set it, instead of a call of :meth:`turn`."""
-        self._backlogs: WeakSet[Backlog] = WeakSet()
+        self.backlogs: WeakSet[Backlog] = WeakSet()
+        """Checked after each pause, as long as they exist."""
 
     def turn(self, now: float) -> int:
         """Report a turn of the loop and return its epoch. ``now`` is the present monotonic time in seconds."""
@@ -49,24 +50,15 @@ class StallWatch:
             self._on_pause(elapsed_s)
         return self.epoch
 
-    def add(self, backlog: Backlog) -> None:
-        """Check this backlog after each pause, as long as it exists."""
-        self._backlogs.add(backlog)
-
-    @property
-    def has_stale(self) -> bool:
-        """Whether any backlog is stale."""
-        return any(backlog.is_stale for backlog in self._backlogs)
-
     def _mark_readable(self) -> None:
         """Mark the queues that are readable now. In an empty queue, the first frame after the pause is new."""
         if not hasattr(select, "poll"):  # Windows
-            for backlog in self._backlogs:
+            for backlog in self.backlogs:
                 backlog.mark()
             return
         by_fd: dict[int, list[Backlog]] = {}
         poll = select.poll()
-        for backlog in self._backlogs:
+        for backlog in self.backlogs:
             by_fd.setdefault(backlog.fd, []).append(backlog)
             poll.register(backlog.fd, select.POLLIN)
         for fd, events in poll.poll(0):
@@ -95,9 +87,9 @@ class Backlog:
         self.left = 0
         """How much of the queue may still be from before a pause."""
         is_older = opened_in is not None and opened_in != watch.turn(monotonic())
-        if is_older or watch.has_stale:
+        if is_older or any(backlog.is_stale for backlog in watch.backlogs):
             self.mark()
-        watch.add(self)
+        watch.backlogs.add(self)
 
     @property
     def is_stale(self) -> bool:
