@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pymavlink.dialects.v20 import all as mavlink
 
 from uavlinkd.core.settings import Class
-from uavlinkd.mavlink.classes import KINDS, UNKNOWN
+from uavlinkd.mavlink.dialect import KINDS, UNKNOWN
 
 STX = (0xFE, 0xFD)
 SETTLED_S = 1.5

@@ -24,7 +24,7 @@ from uavlinkd.core.path import Path
 from uavlinkd.core.path_state import PathCondition, PathState
 from uavlinkd.link.drop_summary import ShellReason
 from uavlinkd.link.networks import LARGEST_BYTES, NetworkBudget, wire_bytes
-from uavlinkd.mavlink.classes import Lane
+from uavlinkd.mavlink.dialect import Lane
 from uavlinkd.mavlink.egress.bucket import Bucket
 from uavlinkd.mavlink.flows import FlowKey, flow_key
 from uavlinkd.mavlink.frames import Frame

@@ -16,8 +16,7 @@ from uavlinkd.endpoints.url import EndpointKind, EndpointUrl, NetworkUrl, Serial
 from uavlinkd.link.event_log import EventLog
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.switch import Switch
-from uavlinkd.mavlink.classes import KINDS, UNKNOWN
-from uavlinkd.mavlink.dialect import IDS, command_name, name_of
+from uavlinkd.mavlink.dialect import IDS, KINDS, UNKNOWN, command_name, name_of
 from uavlinkd.mavlink.frames import SplitCounters, split_payload
 from uavlinkd.mavlink.own_frames import (
     TEXT_BYTES,

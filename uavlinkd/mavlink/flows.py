@@ -1,6 +1,6 @@
 """Flows: frames that replace or follow one another.
 
-* Of a state: one message of one sender to one target, of one instance (:mod:`.classes`).
+* Of a state: one message of one sender to one target, of one instance (:mod:`.dialect`).
 * Of an event: one message of one sender, for any target. But requests for immediate action and their answers
   (COMMAND_LONG, COMMAND_INT, SET_MODE, COMMAND_ACK …) are one flow of a sender, because arming comes before take-off.
 
@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from uavlinkd.mavlink.classes import Lane
+from uavlinkd.mavlink.dialect import Lane
 from uavlinkd.mavlink.frames import MAVLINK2, Frame
 
 FlowKey = tuple[int | bytes, ...]

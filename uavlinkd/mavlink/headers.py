@@ -9,8 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple, final
 
-from uavlinkd.mavlink.classes import KINDS, UNKNOWN, MessageKind
-from uavlinkd.mavlink.dialect import MESSAGES, Row
+from uavlinkd.mavlink.dialect import KINDS, MESSAGES, UNKNOWN, MessageKind, Row
 
 MAX_SENDER_MESSAGES: Final = 2048
 """Messages of one sender each whose headers are kept."""

@@ -1,4 +1,4 @@
-"""Two messages whose facts depend on their payload too, not only on the table in :mod:`.classes`.
+"""Two messages whose facts depend on their payload too, not only on the table in :mod:`.dialect`.
 
 A HEARTBEAT of a ground station silences the failsafe, so it must be new. That of a vehicle is a report.
 
@@ -11,8 +11,7 @@ from __future__ import annotations
 from typing import Final
 
 from uavlinkd.core.settings import Class
-from uavlinkd.mavlink.classes import KINDS
-from uavlinkd.mavlink.dialect import IDS
+from uavlinkd.mavlink.dialect import IDS, KINDS
 from uavlinkd.mavlink.frames import Frame, SplitCounters, payload_bytes, split_payload
 
 HEARTBEAT: Final = 0

@@ -15,8 +15,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from tests.mavlink.egress.links import MAKERS, SLOW, Link, every, flow_of, id_of, play
 from tests.samples import ID, attitude, battery, command, frame, heartbeat, parameter, raws, read
-from uavlinkd.mavlink.classes import Lane
-from uavlinkd.mavlink.dialect import name_of
+from uavlinkd.mavlink.dialect import Lane, name_of
 from uavlinkd.mavlink.egress.bucket import BURST_S
 from uavlinkd.mavlink.egress.budgeted import MAX_FLOWS, MIN_LANE_BYTES, Egress, EgressSettings, EnvelopeShape
 from uavlinkd.mavlink.egress.lanes import EgressDrop

@@ -30,8 +30,7 @@ from uavlinkd.lab.mitm.radio import RadioSettings
 from uavlinkd.lab.sim.drone_process import DroneProcess
 from uavlinkd.lab.sim.links import MavlinkConnection, open_connection
 from uavlinkd.lab.sim.loopback_ports import free_ports
-from uavlinkd.mavlink.classes import KINDS
-from uavlinkd.mavlink.dialect import COMMANDS, IDS, MESSAGES
+from uavlinkd.mavlink.dialect import COMMANDS, IDS, KINDS, MESSAGES
 from uavlinkd.mavlink.frames import SplitCounters, split_datagram
 from uavlinkd.system.addresses import Address
 

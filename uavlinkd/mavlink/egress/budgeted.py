@@ -31,7 +31,7 @@ from dataclasses import dataclass, field
 from math import inf
 from typing import Final
 
-from uavlinkd.mavlink.classes import Lane
+from uavlinkd.mavlink.dialect import Lane
 from uavlinkd.mavlink.egress.bucket import Supply
 from uavlinkd.mavlink.egress.lanes import EgressDrop, Lanes, Waiting, by_number
 from uavlinkd.mavlink.frames import Frame

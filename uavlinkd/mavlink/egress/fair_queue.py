@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from heapq import heappop, heappush, heapreplace
 from typing import Final
 
-from uavlinkd.mavlink.classes import Lane
+from uavlinkd.mavlink.dialect import Lane
 from uavlinkd.mavlink.egress.lanes import EgressDrop, Lanes, OnDrop, Waiting
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.mavlink.policy.delivery import Source

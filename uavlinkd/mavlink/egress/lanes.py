@@ -14,7 +14,7 @@ from operator import attrgetter
 from typing import Final
 
 from uavlinkd.core.drops import Reason
-from uavlinkd.mavlink.classes import Lane, MessageKind
+from uavlinkd.mavlink.dialect import Lane, MessageKind
 from uavlinkd.mavlink.flows import FlowKey, flow_key
 from uavlinkd.mavlink.frames import Frame
 

@@ -28,7 +28,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final, final
 
-from uavlinkd.mavlink.classes import Lane
+from uavlinkd.mavlink.dialect import Lane
 from uavlinkd.mavlink.frames import MAVLINK1, MAX_FRAME_BYTES, Frame
 from uavlinkd.mavlink.headers import Header
 from uavlinkd.mavlink.policy import hidden

@@ -10,8 +10,7 @@ from functools import lru_cache
 from typing import Final, Literal, NamedTuple
 
 from uavlinkd.mavlink import dialect
-from uavlinkd.mavlink.classes import SAID_ONCE
-from uavlinkd.mavlink.dialect import COMMANDS
+from uavlinkd.mavlink.dialect import COMMANDS, SAID_ONCE
 from uavlinkd.mavlink.policy.roles import ROLES
 
 MAX_MSGID: Final = 0xFFFFFF
