@@ -183,7 +183,7 @@ PLANTS: Final = {
         "_open_payload",
         lambda _: lambda payload, header: wire.parse_parameters(payload[len(header) - 1 :]),
     ),
-    "any checksum fits": Plant("stream", frames, "_STEPS", lambda _: range(0x10000)),
+    "any checksum fits": Plant("stream", frames, "CHECKSUM_STEPS", lambda _: range(0x10000)),
     "a byte is skipped that belongs to the next frame": Plant(
         "frames", frames, "_length_of_frame", lambda right: lambda data, position: right(data, position) + 1
     ),

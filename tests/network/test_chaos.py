@@ -23,7 +23,6 @@ from uavlinkd.core.path import Path, SocketFacts
 from uavlinkd.core.paths import PathSet
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.session import Session
-from uavlinkd.core.sessions import Indices
 from uavlinkd.core.settings import Class
 
 pytestmark = pytest.mark.long
@@ -104,6 +103,10 @@ def _leads_nowhere(facts: SocketFacts, _peer: Any, path: Path) -> None:
 _set_routes = PathSet._set_routes
 
 
+def _keeps_the_index(initiator: Initiator, index: int) -> None:
+    del initiator.pending[index]
+
+
 def _copies_nothing(paths: PathSet, now: float) -> None:
     _set_routes(paths, now)
     paths.routes = dict.fromkeys(Class, paths.routes[Class.BULK])
@@ -124,7 +127,7 @@ def _raises(peer: Peer, *_: Any) -> None:
 PLANTS: dict[str, tuple[Any, str, Any, str, Plan]] = {
     "no replay window": (ReplayWindow, "is_used", _nothing, "delivered twice", BUSY),
     "a removed peer keeps its keys": (Node, "remove_peer", _keeps_a_removed_peer, "owned, 0 by a peer", BUSY),
-    "indices leak": (Indices, "forget", _nothing, "indices are owned", BUSY),
+    "indices leak": (Initiator, "_forget", _keeps_the_index, "indices are owned", BUSY),
     "one initiation is all": (Initiator, "begin_try", _initiates_once, "not within", BUSY),
     "an exception": (establish, "receive_hint", _raises, "KeyError", BUSY),
     "no copies": (PathSet, "_set_routes", _copies_nothing, "was lost although paths", PATHS),
