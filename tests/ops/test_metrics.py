@@ -191,12 +191,6 @@ def test_counters_of_attacks_start_at_zero() -> None:
         assert all(f'{part},reason="{reason}"}}' in names for reason in Refusal)
 
 
-def test_names_with_special_characters_are_escaped() -> None:
-    """The configuration refuses such names, but the format must not depend on that."""
-    status = STATUS | {"peers": {'a"} 1\nb\\': PEER | {"freshness_unverified_s": 12.5}}}
-    assert samples(status)[r'peer_freshness_unverified{peer="a\"} 1\nb\\"}'] == 1
-
-
 def test_daemon_without_metrics_does_not_load_the_library() -> None:
     """Its start time and memory do not pay for `prometheus_client`."""
     script = "import sys, uavlinkd.link.daemon; sys.exit('prometheus_client' in sys.modules)"

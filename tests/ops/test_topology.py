@@ -1,8 +1,9 @@
-"""The output of ``uavlinkd check``: what is open to the network, whole keys to compare, and no secret."""
+"""The output of ``uavlinkd check``: what is open to the network, whole keys, no secret, and what passes."""
 
 from __future__ import annotations
 
 import io
+import re
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,11 @@ from rich.console import Console
 
 from tests.config.files import load
 from uavlinkd.config import Config, keys
-from uavlinkd.ops.topology import print_topology
+from uavlinkd.mavlink import dialect
+from uavlinkd.mavlink.policy.compilation import Policy
+from uavlinkd.mavlink.policy.gate import Gate, Refusal
+from uavlinkd.mavlink.policy.roles import ROLES
+from uavlinkd.ops.topology import print_topology, table_rows
 
 _PUBLIC = [keys.public_key_text(keys.generate_private_key()) for _ in range(2)]
 _FILE = f"""
@@ -85,3 +90,53 @@ def test_key_of_a_relay_or_member_is_printed_whole(tmp_path: Path, section: str,
         assert (public in rows) is (key == public)
         assert ("(private?)" in rows) is (key == private)
         assert private[:8] not in printed
+
+
+_POLICIES: dict[str, dict[str, object]] = {
+    **{role: {"role": role} for role in ROLES},
+    "all but commands": {"role": "all", "deny_in": ["commands"], "deny_out": ["commands", "shell"]},
+    "nothing": {"allow_in": ["all"], "deny_in": ["all"], "allow_out": []},
+    "a mission's half": {
+        "allow_in": ["mission-reads", "PING", "PARAM_SET"],
+        "deny_in": ["MISSION_ACK"],
+        "allow_out": ["all"],
+    },
+    "some of telemetry": {
+        "allow_in": ["telemetry"],
+        "deny_in": ["position", "STATUSTEXT", "RAW_IMU"],
+        "allow_out": ["files-read"],
+    },
+}
+
+
+def _read(cells: dict[str, str]) -> set[str]:
+    """The messages that pass, as a reader understands one side of a table."""
+    passing: set[str] = set()
+    refused: set[str] = set()
+    for group, cell in cells.items():
+        members = set(dialect.GROUPS[group])
+        listed = set(re.findall(r"[A-Z][A-Z0-9_]+", cell.partition(" (")[0]))
+        assert listed <= members
+        if cell.startswith("only "):
+            passing |= listed
+        elif cell.startswith("all"):
+            passing |= members - listed
+        else:
+            assert cell in ("none", "never")
+            refused |= members
+    return passing - refused
+
+
+def _passing(gate: Gate) -> set[str]:
+    ids = dialect.IDS
+    return {name for name, msgid in ids.items() if not isinstance(gate.decide(msgid, is_known=True), Refusal)}
+
+
+@pytest.mark.parametrize("case", _POLICIES)
+def test_table_agrees_with_the_gates(case: str) -> None:
+    """Read back, it allows what the gates allow."""
+    data = {"system_ids": [1], **_POLICIES[case]}
+    policy = Policy(data)
+    rows = [row for row in table_rows(policy, data) if row.subject in dialect.GROUPS]
+    assert _read({row.subject: row.incoming for row in rows}) == _passing(policy.incoming)
+    assert _read({row.subject: row.outgoing for row in rows}) == _passing(policy.outgoing)

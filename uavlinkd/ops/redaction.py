@@ -54,7 +54,7 @@ class Redactor:
         text = _IPV4.sub(lambda match: self._address(match[0]), text)
         text = _IPV6.sub(lambda match: self._address(match[0]), text)
         for host, name in sorted(self._peers.items(), key=lambda item: -len(item[0])):
-            if not _is_numeric(host):
+            if _ip(host) is None:
                 text = re.sub(rf"(?i)(?<![\w.-]){re.escape(host)}(?![\w-])", name, text)
         return text
 
@@ -74,7 +74,7 @@ class Redactor:
         return f"{quote}{self._key(bare)}{quote}"
 
     def _address(self, text: str) -> str:
-        if not _is_numeric(text):
+        if _ip(text) is None:
             return text
         address = _normal(text)
         if address in self._peers:
@@ -84,9 +84,8 @@ class Redactor:
         return self._others.setdefault(address, f"address-{len(self._others) + 1}")
 
     def _is_readable(self, address: str) -> bool:
-        if not _is_numeric(address):
+        if (number := _ip(address)) is None:
             return address == "localhost"
-        number = ipaddress.ip_address(address)
         return number.is_loopback or number.is_unspecified or address in self._own
 
 
@@ -94,17 +93,14 @@ def _is_mixed(text: str) -> bool:
     return bool(re.search("[a-z]", text) and re.search("[A-Z]", text) and re.search("[0-9]", text))
 
 
-def _is_numeric(text: str) -> bool:
+def _ip(text: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+    """An address without its zone."""
     try:
-        ipaddress.ip_address(text)
+        return ipaddress.ip_address(text.partition("%")[0])
     except ValueError:
-        return False
-    return True
+        return None
 
 
 def _normal(text: str) -> str:
-    """An address without its zone, in its one short form; another text in small letters."""
-    try:
-        return str(ipaddress.ip_address(text.partition("%")[0]))
-    except ValueError:
-        return text.lower()
+    """An address in its one short form; another text in small letters."""
+    return str(_ip(text) or text.lower())
