@@ -141,7 +141,7 @@ def test_every_number_of_the_status_is_exported() -> None:
     """Once by its metric. Only the time since when repair is on is in the status alone."""
     exported = samples()
     assert set(exported.values()) >= ALL_NUMBERS
-    for _, _, rows in metrics._SECTIONS:
+    for rows in (part["metrics"] for part in metrics._METRICS):
         assert len({key for _, key, *_ in rows}) == len(rows)
         for name, key, *_ in rows:  # Prometheus's words, and those of the status
             assert ("receive_" in name) is ("received" in key and "last" not in key) or "radio" in name, name
