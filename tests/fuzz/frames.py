@@ -265,7 +265,7 @@ def _check_tables(router: Router[Port], switch: Switch, policies: list[Policy]) 
         assert len(received_at) <= routing.MAX_ADDRESSES_PER_PORT, "too many addresses"
     assert len(router._seen) <= routing.MAX_FRAMES_REMEMBERED
     assert len(router._decisions) <= routing.MAX_DECISIONS
-    for flows in switch._flows.values():
+    for flows in (known.flows for known in switch._ports.values()):
         assert len(flows) <= switching.MAX_FLOWS
     for client_policy in policies:
         for gate in (client_policy.incoming, client_policy.outgoing):

@@ -236,7 +236,7 @@ def test_waiting_copies_are_bounded_and_the_least_important_go_first() -> None:
         scene.send([sent], 0.0)
     size = scene.copies.count * (SEAL_BYTES + len(parameter(1).raw))
     assert MAX_WAITING_BYTES - 200 < size <= MAX_WAITING_BYTES + 50
-    waiting = scene.copies._waiting
+    waiting = scene.copies.waiting
     assert command(1).raw in waiting[0].datagram
     assert parameters[-1].raw in waiting[-1].datagram
     assert scene.copies.dropped == {ShellReason.COPY_OVER_BUDGET: 201 - scene.copies.count}

@@ -153,7 +153,7 @@ def test_repeats_are_spaced_and_numbered() -> None:
     scene.put(b"a", [command(1)], 1.0)
     scene.run(1.0, 5.0)
     assert scene.sent == [(1.005, b"a", 2), (1.015, b"a", 3), (1.035, b"a", 4), (1.075, b"a", 5)]
-    assert not scene.copies.is_waiting
+    assert not scene.copies.waiting
     assert (scene.copies.repeats_sent, scene.copies.repeat_bytes) == (4, 4 * 128)
 
 
@@ -175,7 +175,7 @@ def test_repeats_behind_copies_that_wait_need_no_polling() -> None:
     assert len(scene.copies.pick(pair, [command(1)], 0.0)) == 1
     scene.put(b"a", [command(1)], 0.0, along=THERE)
     now, wakeups = 0.0, 0
-    while scene.copies.is_waiting:
+    while scene.copies.waiting:
         now = scene.copies.next_deadline(now)
         scene.sent += [(now, b"a", number) for _, number in scene.copies.release((THERE,), now) if number > 1]
         wakeups += 1
@@ -191,9 +191,9 @@ def test_nothing_is_repeated_along_a_path_that_is_gone() -> None:
     scene.copies.repeat(b"there", [THERE], [command(1)], 5, 0.0)
     ((repeat, _),) = scene.copies.release((HERE,), SPACING_S)
     assert (repeat.datagram, repeat.path) == (b"both", HERE)
-    assert (scene.copies.repeats_sent, len(scene.copies._waiting)) == (1, 1)
+    assert (scene.copies.repeats_sent, len(scene.copies.waiting)) == (1, 1)
     assert scene.copies.release((), 1.0) == []
-    assert not scene.copies.is_waiting
+    assert not scene.copies.waiting
 
 
 def test_rate_of_repeats_is_limited_on_average() -> None:
@@ -202,12 +202,12 @@ def test_rate_of_repeats_is_limited_on_average() -> None:
     for tick in range(3000):
         scene.put(b"%d" % tick, [command(tick)], tick / 100)
         scene.run(tick / 100, (tick + 1) / 100)
-    assert len(scene.copies._waiting) <= MAX_ENVELOPES
+    assert len(scene.copies.waiting) <= MAX_ENVELOPES
     assert 0.95 * 30 <= scene.copies.repeat_bytes / (LEAST_BITS_S / 8) <= 30.5 + AVERAGE_S
     many = Scene()
     for tick in range(MAX_ENVELOPES + 10):
         many.put(b"%d" % tick, [command(tick)], 0.0)
-    assert len(many.copies._waiting) == MAX_ENVELOPES
+    assert len(many.copies.waiting) == MAX_ENVELOPES
     assert many.copies.dropped == {ShellReason.COPY_OVER_BUDGET: 10}
     many.copies.clear()
-    assert not many.copies.is_waiting
+    assert not many.copies.waiting

@@ -205,7 +205,7 @@ def test_memory_is_bounded(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(switch_module, "MAX_FLOWS", 16)
     for system in range(1, 200):
         stage.forward(stage.a.port, [attitude(1, system)], 0.0)
-        assert len(stage.switch._flows[stage.a.port]) <= 16
+        assert len(stage.switch._ports[stage.a.port].flows) <= 16
     assert stage.delivered() == (0, 199, 199)
 
 

@@ -160,7 +160,9 @@ class Conditions(Generic[K]):
             condition.count += count
             condition.seen_at = now
             return
-        condition = self._open[key] = OpenCondition(now, now, self._quiet_after(key, now), now, count)
+        ended_at, quiet_s = self._ended.pop(key, (now - HOUR_S, self._quiet_s))
+        quiet_s = min(HOUR_S, 2 * quiet_s) if now - ended_at < HOUR_S else self._quiet_s
+        condition = self._open[key] = OpenCondition(now, now, quiet_s, now, count)
         self._begin(key, condition, now)
 
     def check(self, now: float) -> None:
@@ -188,10 +190,6 @@ class Conditions(Generic[K]):
         for key in [key for key in self._known if is_closed(key)]:
             self._known.remove(key)
             self._ended.pop(key, None)
-
-    def _quiet_after(self, key: K, now: float) -> float:
-        ended_at, quiet_s = self._ended.pop(key, (now - HOUR_S, self._quiet_s))
-        return min(HOUR_S, 2 * quiet_s) if now - ended_at < HOUR_S else self._quiet_s
 
     def _begin(self, key: K, condition: OpenCondition, now: float) -> None:
         if key not in self._known and self._limit_of(key)[1]:

@@ -114,17 +114,13 @@ class Copies:
         self._budgets = budgets
         self._rate = Bucket(LEAST_BITS_S, now, LARGEST_BYTES)
         self._average = Bucket(LEAST_BITS_S, now, AVERAGE_S * LEAST_BITS_S / 8)  # of copies and repeats
-        self._waiting: list[_Waiting] = []  # the oldest first
-
-    @property
-    def is_waiting(self) -> bool:
-        """Whether copies or repeats wait."""
-        return bool(self._waiting)
+        self.waiting: list[_Waiting] = []
+        """Copies and repeats, the oldest first."""
 
     @property
     def count(self) -> int:
         """How many copies wait."""
-        return sum(one.is_copy for one in self._waiting)
+        return sum(one.is_copy for one in self.waiting)
 
     def set_stream_rate(self, bytes_s: float, now: float, most_bytes_s: float = inf) -> None:
         """Copies may use as much as the stream of this peer, which has so many bytes a second.
@@ -144,7 +140,7 @@ class Copies:
         picked: list[Transmit] = []
         waiting: list[Transmit] = []
         for transmit in outputs:
-            is_next = not picked or not self._waits_for(transmit.path)
+            is_next = not picked or not any(one.is_copy and transmit.path in one.paths for one in self.waiting)
             has_room = is_next and self._has_room(transmit, now, self._rate if picked else None)
             (picked if has_room else waiting).append(transmit)
         if waiting and not picked:
@@ -170,13 +166,13 @@ class Copies:
 
         What waited too long is dropped. Repeats go along ``usable`` paths only.
         """
-        self._drop([one for one in self._waiting if now >= one.put_at + MAX_WAIT_S], ShellReason.COPY_OVER_BUDGET)
-        for one in self._waiting:
+        self._drop([one for one in self.waiting if now >= one.put_at + MAX_WAIT_S], ShellReason.COPY_OVER_BUDGET)
+        for one in self.waiting:
             if not one.is_copy:
                 one.paths = [path for path in one.paths if path in usable]
         released: list[tuple[Transmit, int]] = []
         blocked: set[Path] = set()  # copies wait for these
-        due = [one for one in self._waiting if one.due_at <= now]
+        due = [one for one in self.waiting if one.due_at <= now]
         for one in sorted(due, key=lambda one: (not one.is_copy, one.rank, one.number)):
             number, rate = one.number, self._rate if one.is_copy else self._average
             for path in one.paths:
@@ -192,19 +188,19 @@ class Copies:
                 released.append((transmit, number))
                 one.number = number + 1
                 one.due_at = now + SPACING_S * 2 ** (number - 1)
-        self._waiting = [one for one in self._waiting if one.number <= one.last and one.paths]
+        self.waiting = [one for one in self.waiting if one.number <= one.last and one.paths]
         return released
 
     def next_deadline(self, now: float) -> float:
         """When :meth:`release` has something to do; infinity while nothing waits."""
         copies_at: dict[Path, float] = {}
-        for one in self._waiting:
+        for one in self.waiting:
             if one.is_copy:
                 (path,) = one.paths
                 at = min(one.put_at + MAX_WAIT_S, now + self._wait_s(path, now, self._rate))
                 copies_at[path] = min(at, copies_at.get(path, inf))
         at = min(copies_at.values(), default=inf)
-        for one in self._waiting:
+        for one in self.waiting:
             if one.due_at > now:
                 at = min(at, one.due_at)
             elif not one.is_copy:
@@ -217,12 +213,9 @@ class Copies:
     def clear(self) -> None:
         """Drop all that waits: the peer is lost. Repeats are not counted: their envelopes were sent."""
         self.dropped[ShellReason.COPY_OVER_BUDGET] += self.count
-        self._waiting = []
+        self.waiting = []
 
     # Room.
-
-    def _waits_for(self, path: Path) -> bool:
-        return any(one.is_copy and path in one.paths for one in self._waiting)
 
     def _wait_s(self, path: Path, now: float, rate: Bucket) -> float:
         """How long until there may be room along a path."""
@@ -259,12 +252,12 @@ class Copies:
         """Let it wait. It replaces older states of its kind, and the least important of too many are dropped."""
         rivals = [
             one
-            for one in self._waiting
+            for one in self.waiting
             if one.is_copy == newer.is_copy and (not newer.is_copy or one.paths == newer.paths)
         ]
         replaced = [one for one in rivals if one.is_replaceable and one.states <= newer.states]
         self._drop(replaced, ShellReason.COPY_REPLACED)
-        self._waiting.append(newer)
+        self.waiting.append(newer)
         rivals = [one for one in rivals if one not in replaced] + [newer]
         size = sum(len(one.datagram) for one in rivals)
         while size > MAX_WAITING_BYTES if newer.is_copy else len(rivals) > MAX_ENVELOPES:
@@ -275,15 +268,8 @@ class Copies:
 
     def _drop(self, gone: Sequence[_Waiting], reason: ShellReason) -> None:
         if gone:
-            self._waiting = [one for one in self._waiting if one not in gone]
+            self.waiting = [one for one in self.waiting if one not in gone]
             self.dropped[reason] += len(gone)
-
-
-def transmissions_for(loss: float) -> int:
-    """How often to send an envelope along paths that lose this share together, the first time included."""
-    if loss <= RESIDUAL_LOSS:
-        return 1
-    return TRANSMISSIONS if loss >= 1 else min(TRANSMISSIONS, ceil(log(RESIDUAL_LOSS) / log(loss)))
 
 
 class Repair:
@@ -322,7 +308,9 @@ class Repair:
             self.is_on, self.began_at = True, now
         elif highest < END_LOSS:
             self.is_on = False
-        self.transmissions = max(2, transmissions_for(highest)) if self.is_on else 1
+        # So often that what is lost each time is less than RESIDUAL_LOSS.
+        most = TRANSMISSIONS if highest >= 1 else ceil(log(RESIDUAL_LOSS) / log(max(highest, RESIDUAL_LOSS)))
+        self.transmissions = max(2, min(TRANSMISSIONS, most)) if self.is_on else 1
 
     def end(self) -> None:
         """Stop at once: the peer is lost, or its configuration has changed."""

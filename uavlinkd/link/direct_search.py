@@ -190,7 +190,9 @@ class DirectSearch:
 
 def own_sockets(sockets: PeerSockets) -> list[OwnSocket]:
     """The open UDP sockets, with the addresses of this machine that lead to them."""
-    routes, of_machine = specific_routes(), _machine_hosts()
+    routes = specific_routes()
+    states = ((name, find_interface(name)) for name in interface_names())
+    of_machine = {name: state.hosts for name, state in states if state is not None and state.is_up}
     own = []
     for number, sock in sockets.open_sockets().items():
         host, port = sock.getsockname()[:2]
@@ -208,8 +210,3 @@ def own_sockets(sockets: PeerSockets) -> list[OwnSocket]:
         places = tuple((own_host, port) for own_host in hosts)
         own.append(OwnSocket(number, is_ipv6, places, partial(leads_to, routes, interface=interface)))
     return own
-
-
-def _machine_hosts() -> dict[str, tuple[str, ...]]:
-    states = ((name, find_interface(name)) for name in interface_names())
-    return {name: interface.hosts for name, interface in states if interface is not None and interface.is_up}

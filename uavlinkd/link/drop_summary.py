@@ -171,10 +171,11 @@ class DropSummary:
 
     def _facts(self, key: Key, *, with_meaning: bool = True) -> dict[str, str]:
         kind = self._kinds[key]
+        meaning = kind.reason.meaning if isinstance(kind.reason, Reason) else meaning_of(kind.reason)
         facts = {
             "reason": kind.reason,
             "who": key[2],
-            "meaning": _meaning(kind.reason) if with_meaning else "",
+            "meaning": "" if not with_meaning else meaning,
             "last": _describe(kind.last),
         }
         return {field: fact for field, fact in facts.items() if fact}
@@ -188,26 +189,16 @@ class DropSummary:
             loop.default_exception_handler(context)
 
 
-def _meaning(reason: str) -> str:
-    return reason.meaning if isinstance(reason, Reason) else meaning_of(reason)
-
-
 def _describe(fact: Fact) -> str:
     match fact:
         case str():
             return fact
         case Header():
             return f"{name_of(fact.msgid)} of system {fact.system}"
-        case detail, path:
-            return f"{_about(detail)} from {shown(path.address)}".strip()
-
-
-def _about(detail: Detail) -> str:
-    match detail:
-        case bytes():
-            return f"key {encode_key(detail)}"
-        case int():
-            age = "older" if detail < PROTOCOL_VERSION else "newer"
-            return f"uavlink/{detail}, {age} than uavlink/{PROTOCOL_VERSION} of this daemon,"
-        case _:
-            return detail and f"suite {detail}"
+        case bytes(key), path:
+            return f"key {encode_key(key)} from {shown(path.address)}"
+        case int(version), path:
+            age = f"{'older' if version < PROTOCOL_VERSION else 'newer'} than uavlink/{PROTOCOL_VERSION}"
+            return f"uavlink/{version}, {age} of this daemon, from {shown(path.address)}"
+        case suite, path:
+            return f"suite {suite} from {shown(path.address)}" if suite else f"from {shown(path.address)}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from operator import itemgetter, sub
+from operator import sub
 from typing import NamedTuple
 
 from uavlinkd.config import PeerConfig
@@ -18,7 +18,7 @@ from uavlinkd.core.refusals import LARGEST_REPORT
 from uavlinkd.core.settings import PeerSettings, link_name
 from uavlinkd.core.timers import Deadline, Schedule
 from uavlinkd.link.networks import NetworkBudget
-from uavlinkd.link.peer_output import PeerOutput
+from uavlinkd.link.peer_output import RAW, PeerOutput
 from uavlinkd.mavlink.flows import NewestStates
 from uavlinkd.mavlink.frames import Frame, SplitCounters
 from uavlinkd.mavlink.own_frames import LinkFigures, worst
@@ -34,9 +34,6 @@ NOT_CONNECTING_S = 10.0
 
 RELAYED_LEAST = 3
 """Slots for configured paths that relayed ones have at least: one for each relay."""
-
-_RAW = itemgetter(0)
-"""The bytes of a frame."""
 
 
 class KeyPairing(NamedTuple):
@@ -209,7 +206,7 @@ class PeerLink:
             if self.output.send(peer, frames, now, waited_s):
                 self.send_waiting(now)
             return
-        raws = list(map(_RAW, frames))
+        raws = list(map(RAW, frames))
         outputs = self._node.send(peer, raws, now)
         if self.recorder is not None:
             self._on_sent(raws, outputs, now)

@@ -22,7 +22,7 @@ from uavlinkd.mavlink.egress.budgeted import EgressSettings, EnvelopeShape
 from uavlinkd.mavlink.egress.by_class import ClassOf, PeerEgress, split_by_class
 from uavlinkd.mavlink.frames import Frame
 
-_RAW = itemgetter(0)
+RAW = itemgetter(0)
 """The bytes of a frame."""
 
 
@@ -68,7 +68,7 @@ class PeerOutput:
             return True
         for cls, part in split_by_class(frames, self._class_of, now):
             self._send_class(peer, part, cls, now)
-        return self.copies.is_waiting
+        return bool(self.copies.waiting)
 
     def send_waiting(self, peer: Peer, peers: Iterable[Peer], now: float) -> None:
         """Send the waiting frames and copies that are due. ``peers``: all those that the budget is charged for."""
@@ -79,7 +79,7 @@ class PeerOutput:
                 self._send_class(peer, batch, cls, now)
                 self.charge(peers, now)
                 cls, batch = self.egress.take(now)
-        if self.copies.is_waiting:
+        if self.copies.waiting:
             usable = {
                 state.path for state in peer.paths.states if not state.is_off and state not in self.repair.left_out
             }
@@ -94,7 +94,7 @@ class PeerOutput:
     def next_deadline(self, now: float) -> float:
         """When :meth:`send_waiting` is due."""
         at = NEVER if self.egress is None else self.egress.next_deadline()
-        return min(at, self.copies.next_deadline(now)) if self.copies.is_waiting else at
+        return min(at, self.copies.next_deadline(now)) if self.copies.waiting else at
 
     def has_room(self, payload_bytes: int, now: float) -> bool:
         """Whether an envelope with this payload may go out now."""
@@ -200,7 +200,7 @@ class PeerOutput:
         yield part
 
     def _send_part(self, peer: Peer, frames: Sequence[Frame], cls: Class, now: float) -> None:
-        raws = list(map(_RAW, frames))
+        raws = list(map(RAW, frames))
         outputs = self._node.send(peer, raws, now, cls)
         if cls is not Class.CRITICAL:
             self._stream_bytes += sum(map(len, raws))

@@ -90,7 +90,9 @@ class LineRate:
         shortest = self._shortest
         while shortest and shortest[0][0] < now - SHORTEST_OF_S:
             shortest.popleft()
-        is_late = bool(shortest) and round_trip_s > shortest[0][1] + self._allowed_s(now)
+        # At a low rate, an envelope alone takes longer than 0.5 s.
+        allowed_s = LATER_S + ENVELOPES * self._envelope_bits / self.bits_s(now)
+        is_late = bool(shortest) and round_trip_s > shortest[0][1] + allowed_s
         while shortest and shortest[-1][1] >= round_trip_s:
             shortest.pop()
         shortest.append((now, round_trip_s))
@@ -106,10 +108,6 @@ class LineRate:
         self._unanswered += count
         if self._unanswered >= UNANSWERED:
             self._bits_s = min(self.bits_s(now), SHARE_UNANSWERED * self.full_bits_s)
-
-    def _allowed_s(self, now: float) -> float:
-        """How much longer a round trip may take. At a low rate, an envelope alone takes longer than 0.5 s."""
-        return LATER_S + ENVELOPES * self._envelope_bits / self.bits_s(now)
 
 
 class SerialNetwork:

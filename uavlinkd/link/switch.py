@@ -8,6 +8,7 @@ flow costs a look-up. Where a frame can arrive by two routes, it costs the check
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import count
 from typing import NamedTuple
@@ -39,6 +40,17 @@ class Route(NamedTuple):
     """A policy decides about each frame, by its contents or by a rate limit. Otherwise all of them pass."""
 
 
+@dataclass(slots=True, eq=False)
+class _Known:
+    """What the switch knows of a port."""
+
+    policy: Policy
+    source: Source
+    number: int
+    """What a policy's rate limits know it by. A number is never used again."""
+    flows: dict[Header, Route] = field(default_factory=dict)
+
+
 class Switch:
     """Knows every port and its policy. It drops frames from before a pause. All times are monotonic seconds."""
 
@@ -47,12 +59,8 @@ class Switch:
         self.stall = stall
         self._drops = drops
         self._report = partial(drops.add_refused, to_them=False)
-        self._policies: dict[Port, Policy] = {}
-        self._sources: dict[Port, Source] = {}
-        self._numbers: dict[Port, int] = {}
-        """What a policy's rate limits know each port by. A number is never used again."""
+        self._ports: dict[Port, _Known] = {}
         self._unused = count()
-        self._flows: dict[Port, dict[Header, Route]] = {}
         self._edition = -1
         """That of the router's results in the flows."""
         self._senders: dict[int, int] = {}
@@ -60,18 +68,16 @@ class Switch:
 
     def add(self, port: Port, policy: Policy) -> None:
         """Accept frames from this port, and send frames to it, as far as its policy allows."""
-        self._policies[port] = policy
-        self._sources[port] = Source(_owner(port), policy.incoming, self._report, self.router.forget_frame)
+        source = Source(_owner(port), policy.incoming, self._report, self.router.forget_frame)
+        self._ports[port] = _Known(policy, source, next(self._unused))
         _set_outgoing(port, policy)
-        self._numbers[port] = next(self._unused)
-        self._flows[port] = {}
         self._senders.clear()
         self.router.add_port(port, is_peer=isinstance(port, PeerLink))
 
     def set_policy(self, port: Port, policy: Policy) -> None:
         """Change the rules of a port. Systems whose frames it may no longer send are not looked for behind it."""
-        self._policies[port] = policy
-        self._sources[port].gate = policy.incoming
+        self._ports[port].policy = policy
+        self._ports[port].source.gate = policy.incoming
         self._senders.clear()
         _set_outgoing(port, policy)
         self.router.forget_systems(port, lambda system: not policy.incoming.may_speak_as(system))
@@ -79,10 +85,7 @@ class Switch:
 
     def remove(self, port: Port) -> None:
         """Forget the port."""
-        del self._policies[port]
-        del self._sources[port]
-        del self._numbers[port]
-        del self._flows[port]
+        del self._ports[port]
         self._senders.clear()
         self.router.remove_port(port)
 
@@ -104,7 +107,8 @@ class Switch:
         if now >= router.refresh_at or router.edition != self._edition:
             router.refresh(now)
             self._forget_flows()
-        routes = self._flows[source]
+        known = self._ports[source]
+        routes = known.flows
         batches: dict[Port, list[Frame]] = {}
         for frame in frames:
             route = routes.get(frame.header)
@@ -122,12 +126,13 @@ class Switch:
                 else:
                     batches[port] = [frame]
         for port, batch in batches.items():
-            port.send(batch, self._sources[source], now, waited_s)
+            port.send(batch, known.source, now, waited_s)
 
     def _route(self, frame: Frame, source: Port, now: float) -> tuple[Port, ...]:
         """The ports where the first frame of a flow goes. Remember them for the next one."""
         header = frame.header
-        incoming = self._policies[source].incoming
+        known = self._ports[source]
+        incoming = known.policy.incoming
         refusal = incoming.check(frame, now)
         if refusal is not None:
             self._report(_owner(source), header, refusal, now)
@@ -136,17 +141,16 @@ class Switch:
         if ports:
             if self.router.edition != self._edition:
                 self._forget_flows()
-            flows = self._flows[source]
-            if len(flows) >= MAX_FLOWS:
-                del flows[next(iter(flows))]
-            gates = (incoming, *(self._policies[port].outgoing for port in ports))
+            if len(known.flows) >= MAX_FLOWS:
+                del known.flows[next(iter(known.flows))]
+            gates = (incoming, *(self._ports[port].policy.outgoing for port in ports))
             is_conditional = not all(gate.always_passes(header) for gate in gates)
-            flows[header] = Route(ports, self._has_one_route(header.system), is_conditional)
+            known.flows[header] = Route(ports, self._has_one_route(header.system), is_conditional)
         return self._pass_outgoing(frame, ports, now)
 
     def _pass(self, frame: Frame, source: Port, route: Route, now: float) -> tuple[Port, ...]:
         """The ports of a conditional route to which the policies let this frame pass."""
-        refusal = self._policies[source].incoming.check(frame, now)
+        refusal = self._ports[source].policy.incoming.check(frame, now)
         if refusal is not None:
             self._report(_owner(source), frame.header, refusal, now)
             return ()
@@ -157,7 +161,8 @@ class Switch:
     def _pass_outgoing(self, frame: Frame, ports: tuple[Port, ...], now: float) -> tuple[Port, ...]:
         passed: list[Port] = []
         for port in ports:
-            refusal = self._policies[port].outgoing.check(frame, now, self._numbers[port])
+            known = self._ports[port]
+            refusal = known.policy.outgoing.check(frame, now, known.number)
             if refusal is None:
                 passed.append(port)
             else:
@@ -168,13 +173,13 @@ class Switch:
         """Whether no port but one may send frames of this system."""
         senders = self._senders.get(system)
         if senders is None:
-            senders = sum(policy.incoming.may_speak_as(system) for policy in self._policies.values())
+            senders = sum(known.policy.incoming.may_speak_as(system) for known in self._ports.values())
             self._senders[system] = senders
         return senders == 1
 
     def _forget_flows(self) -> None:
-        for flows in self._flows.values():
-            flows.clear()
+        for known in self._ports.values():
+            known.flows.clear()
         self._edition = self.router.edition
 
 
