@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import re
 from collections.abc import Iterable
+from dataclasses import replace
 from itertools import chain
 from types import SimpleNamespace
 from typing import Any
@@ -222,7 +223,7 @@ def test_other_version_names_the_older_side(daemon: Daemon) -> None:
 def test_keys_that_arrive_are_shown_and_never_advised(daemon: Daemon) -> None:
     """Of several from one address at least one is not the peer's; the former key has a line of its own."""
     keys = [bytes([number]) * 32 for number in (11, 12, 13)]
-    daemon.history.add_former_key(keys[0], "drone1")
+    daemon.link.config = replace(daemon.link.config, previous_public_key=keys[0])
     for key in keys:
         daemon.dropped(DropReason.UNKNOWN_PEER, THERE, key)
     findings = daemon.findings()

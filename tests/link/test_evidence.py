@@ -22,7 +22,6 @@ from uavlinkd.core.settings import PeerSettings
 from uavlinkd.link.evidence import (
     EVIDENCE_S,
     MAX_DETAILS,
-    MAX_FORMER_KEYS,
     PLACES_S,
     REMEMBERED_S,
     REPORTED,
@@ -152,16 +151,6 @@ def test_growth_is_remembered_and_begins_again() -> None:
     assert growth.within(1.0, 3.0) == {"a": 6}
     growth.update({"a": 1, "c": 1}, 4.0 + REMEMBERED_S)
     assert set(growth._recent) == {"c"}
-
-
-def test_former_keys_are_bounded() -> None:
-    """The oldest is forgotten first; one that is replaced again is the newest."""
-    history = History(0.0)
-    for number in [*range(MAX_FORMER_KEYS), 0, MAX_FORMER_KEYS]:
-        history.add_former_key(bytes([number]), "drone1")
-    assert len(history.former_keys) == MAX_FORMER_KEYS
-    assert bytes([0]) in history.former_keys
-    assert bytes([1]) not in history.former_keys
 
 
 BLOCKED_IN = [("peer", "drone1", "in")]

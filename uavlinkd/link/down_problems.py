@@ -177,15 +177,16 @@ def _hints(peer: PeerFacts) -> Iterator[Found]:
 
 
 def _unknown_keys(peer: PeerFacts, sighting: Sighting) -> Iterator[Found]:
-    before = {*peer.daemon.history.former_keys, peer.link.config.previous_public_key}
+    before = peer.link.config.previous_public_key
     keys = [key for key in sighting.details if isinstance(key, bytes) and key != peer.daemon.config.public_key]
-    if former := [encode_key(key) for key in keys if key in before]:
+    if before is not None and before in keys:
         yield fault(
             "former_key",
-            f"a sender at {at(sighting)} uses the former key {former[-1]}, or an attacker replays an old recording",
+            f"a sender at {at(sighting)} uses the former key {encode_key(before)}, or an attacker replays an old"
+            " recording",
             f"carry the new files to {peer.name} and restart it; if the former key was stolen, this may be the thief",
         )
-    if others := [encode_key(key) for key in keys if key not in before]:
+    if others := [encode_key(key) for key in keys if key != before]:
         which = "the key" if len(others) == 1 else f"{len(others)} keys, so at least one is not {peer.name}:"
         yield fault(
             "wrong_key_here",

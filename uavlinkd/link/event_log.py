@@ -154,10 +154,6 @@ class EventLog:
 
     # Conditions.
 
-    def forget_endpoint(self, name: str) -> None:
-        """The endpoint was closed; a later one of that name starts without history."""
-        self._finding_conditions.close(lambda key: key[1] is Subject.ENDPOINT and key[2] == name)
-
     def check_link(self, link: PeerLink, now: float) -> None:
         """Note the problems of a link that exceed their thresholds, and repair. Call it about once a second."""
         self._check_repair(link, now)

@@ -199,8 +199,6 @@ MAX_SESSIONS: Final = 8
 """Sessions of one peer at another address than the one before that are remembered."""
 OWN_FRAMES_S: Final = 10.0
 """A foreign system counts as mixed with a peer's own if own frames passed within this time."""
-MAX_FORMER_KEYS: Final = 64
-"""Replaced public keys that are remembered, of all peers."""
 
 BLOCKED_S: Final = 10.0
 """How far back refusals count for whether frames pass."""
@@ -321,8 +319,6 @@ class History:
         self.began_at = now
         self.paused: tuple[float, float] | None = None
         """When the last pause of the process ended, and its duration in seconds."""
-        self.former_keys: dict[bytes, str] = {}
-        """Public keys that the configuration had before, with the peer's name. The oldest first."""
         self._parts: dict[tuple[str, str], PartHistory] = {}
         self._sessions: dict[str, deque[SessionBegin]] = {}
 
@@ -345,13 +341,6 @@ class History:
         begins = self._sessions.setdefault(name, deque(maxlen=MAX_SESSIONS))
         if not begins or begins[-1].address != address:
             begins.append(SessionBegin(now, address))
-
-    def add_former_key(self, key: bytes, name: str) -> None:
-        """The configuration no longer has this public key of a peer."""
-        self.former_keys.pop(key, None)
-        if len(self.former_keys) >= MAX_FORMER_KEYS:
-            del self.former_keys[next(iter(self.former_keys))]
-        self.former_keys[key] = name
 
     def sample(self, links: Iterable[PeerLink], endpoints: Iterable[tuple[Endpoint, Policy]], now: float) -> None:
         """Read the counters. Call it once a second. Peers and endpoints that are not named are forgotten."""

@@ -143,7 +143,6 @@ class LocalEndpoints:
             self._switch.remove(port)
         endpoint.close()
         del self.policies[name], self._sources[name], self._urls[name]
-        self._events.forget_endpoint(name)
 
     def close(self) -> None:
         """Close all endpoints."""

@@ -166,7 +166,6 @@ class Peers:
         parts = self._parts
         parts.peer_sockets.stop_following(name)
         link = parts.links[name]
-        parts.history.add_former_key(link.config.settings.public_key, name)
         parts.switch.remove(link)
         link.leave(monotonic())
         del parts.links[name]
