@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import re
 from collections.abc import Iterable
 from dataclasses import replace
@@ -140,7 +139,7 @@ def test_errors_of_this_machine(daemon: Daemon, error: str, cause: str, monkeypa
     monkeypatch.setattr(down_problems, "has_unconfirmed", lambda _: True)
     daemon.now = 5.0
     assert set(daemon.findings()) == {"not_confirmed"}
-    daemon.evidence.add_failure(error, THERE, 5.0)
+    daemon.evidence.add_error(error, THERE, 5.0)
     assert set(daemon.findings()) == {cause}
     assert f"{HOST}:5790" in daemon.findings()[cause].text
     assert error in daemon.findings()[cause].text
@@ -148,7 +147,7 @@ def test_errors_of_this_machine(daemon: Daemon, error: str, cause: str, monkeypa
 
 def test_absent_own_address_explains_that_nothing_can_be_sent(daemon: Daemon) -> None:
     """It has a line of its own, so the peers have none about routes. It is a warning while all peers are up."""
-    daemon.evidence.add_failure("EINVAL", THERE, NOW)
+    daemon.evidence.add_error("EINVAL", THERE, NOW)
     daemon.sockets.absent_addresses = lambda: ["192.0.2.77:5790"]
     daemon.sockets.absent_networks = lambda: {"lte (wwan0: no interface)": "plug the modem in"}
     assert set(daemon.findings()) == {"listen_address_missing", "network_absent"}
@@ -157,12 +156,10 @@ def test_absent_own_address_explains_that_nothing_can_be_sent(daemon: Daemon) ->
     assert {finding.severity for finding in daemon.findings().values()} == {Severity.WARNING}
 
 
-@pytest.mark.parametrize(
-    ("number", "cause"), [(errno.ECONNREFUSED, "no_listener"), (errno.EHOSTUNREACH, "host_unreachable")]
-)
-def test_reports_of_the_network(daemon: Daemon, number: int, cause: str) -> None:
+@pytest.mark.parametrize(("error", "cause"), [("ECONNREFUSED", "no_listener"), ("EHOSTUNREACH", "host_unreachable")])
+def test_reports_of_the_network(daemon: Daemon, error: str, cause: str) -> None:
     """Each error of ICMP has its cause."""
-    daemon.evidence.add_report(number, THERE, NOW)
+    daemon.evidence.add_error(f"icmp_{error}", THERE, NOW)
     assert set(daemon.findings()) == {cause}
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 from types import SimpleNamespace
 from typing import Any
@@ -20,6 +19,7 @@ from uavlinkd.core.outputs import Dropped
 from uavlinkd.core.path import Path
 from uavlinkd.core.settings import PeerSettings
 from uavlinkd.link.evidence import (
+    ELSEWHERE,
     EVIDENCE_S,
     MAX_DETAILS,
     PLACES_S,
@@ -90,8 +90,8 @@ def test_evidence_of_a_relay_counts_for_no_peer_of_that_name(scene: Scene) -> No
     scene.drop(("198.51.100.1", 5790), 10.0 + PLACES_S)
     now = 10.0 + PLACES_S
     assert scene.evidence.seen(DropReason.BAD_HANDSHAKE, link, now) is None
-    assert scene.evidence.seen_of_relay(DropReason.BAD_HANDSHAKE, "drone1", now) is None
-    seen = scene.evidence.seen_of_relay(DropReason.BAD_HANDSHAKE, "vps", now)
+    assert scene.evidence.seen_at(DropReason.BAD_HANDSHAKE, ("relay", "drone1"), now) is None
+    seen = scene.evidence.seen_at(DropReason.BAD_HANDSHAKE, ("relay", "vps"), now)
     assert seen is not None
     assert seen.address == THERE
 
@@ -132,11 +132,11 @@ def test_other_keys_do_not_hide_the_own_one(scene: Scene) -> None:
 
 def test_errors_of_a_candidate_are_not_those_of_another_peer_of_its_host(scene: Scene) -> None:
     """A candidate of one peer may be another port of the host of a peer that is well."""
-    scene.evidence.add_failure("EPERM", (HOST, 40000), 1.0)
-    scene.evidence.add_report(errno.ECONNREFUSED, (HOST, 40000), 1.0)
+    scene.evidence.add_error("EPERM", (HOST, 40000), 1.0)
+    scene.evidence.add_error("icmp_ECONNREFUSED", (HOST, 40000), 1.0)
     for kind in ("EPERM", f"{REPORTED}ECONNREFUSED"):
         assert scene.evidence.seen(kind, scene.link, 1.0) is None
-        assert scene.evidence.seen_elsewhere(kind, 1.0) is not None
+        assert scene.evidence.seen_at(kind, ELSEWHERE, 1.0) is not None
 
 
 def test_growth_is_remembered_and_begins_again() -> None:

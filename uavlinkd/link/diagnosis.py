@@ -13,7 +13,7 @@ from uavlinkd.config.keys import encode_key
 from uavlinkd.core.drops import DropReason
 from uavlinkd.link import traffic_problems as traffic
 from uavlinkd.link.down_problems import down_problems, silence, versions
-from uavlinkd.link.evidence import EVIDENCE_S
+from uavlinkd.link.evidence import ELSEWHERE, EVIDENCE_S
 from uavlinkd.link.facts import EndpointFacts, Found, Moment, PeerFacts, fault, listed, security, warning
 from uavlinkd.link.parts import DaemonParts
 from uavlinkd.link.serial_networks import RECENT_S
@@ -45,8 +45,8 @@ def daemon_problems(moment: Moment) -> Iterator[Found]:
     if gone := daemon.peer_sockets.absent_networks():
         text = f"no peer is reached along {'; '.join(gone)}"
         yield fault_if_down("network_absent", text, "; ".join(dict.fromkeys(gone.values())))
-    sighting = evidence.seen_elsewhere(DropReason.OTHER_VERSION, now)
-    if sighting is not None and moment.down and moment.sole_waiting is None:
+    sighting = evidence.seen_at(DropReason.OTHER_VERSION, ELSEWHERE, now)
+    if sighting is not None and moment.down and not moment.has_sole_waiting:
         there = "the sender" if len(moment.down) > 1 else moment.down[0].name
         yield versions(sighting, daemon.config.name, there)
     raw = evidence.seen_anywhere(DropReason.RAW_MAVLINK, now)
@@ -86,7 +86,7 @@ def member_problems(moment: Moment) -> Iterator[Found]:
     daemon, now = moment.daemon, moment.now
     if daemon.relay is None:
         return
-    unknown = daemon.evidence.seen_elsewhere(DropReason.UNKNOWN_PEER, now)
+    unknown = daemon.evidence.seen_at(DropReason.UNKNOWN_PEER, ELSEWHERE, now)
     if unknown is not None and unknown.address is not None:
         keys = ", ".join(encode_key(key) for key in unknown.details if isinstance(key, bytes))
         yield warning(
@@ -95,7 +95,7 @@ def member_problems(moment: Moment) -> Iterator[Found]:
             "if it is yours, run `uavlinkd pubkey` there, write into its [[member]] what that prints, and run"
             " `uavlinkd reload` here: a key that arrives proves nothing",
         )
-    other = daemon.evidence.seen_elsewhere(DropReason.BAD_MAC1, now)
+    other = daemon.evidence.seen_at(DropReason.BAD_MAC1, ELSEWHERE, now)
     is_down = any(not member.peer.is_up for member in daemon.relay.members.values())
     if other is not None and other.address is not None and is_down:
         yield warning(

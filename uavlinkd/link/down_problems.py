@@ -68,7 +68,7 @@ def _relays(peer: PeerFacts) -> Iterator[_RelayProblem]:
             yield "not_bound", relay
         elif daemon.peer_sockets.unresolved(relay.name):
             yield "name_not_resolved", relay
-        elif daemon.evidence.seen_of_relay(DropReason.BAD_HANDSHAKE, relay.config.name, peer.now) is not None:
+        elif daemon.evidence.seen_at(DropReason.BAD_HANDSHAKE, ("relay", relay.config.name), peer.now) is not None:
             yield "wrong_psk", relay
         elif peer.now - relay.silent_since >= RELAY_SILENT_S:
             yield "relay_not_answering", relay
@@ -215,7 +215,9 @@ def _handshakes(peer: PeerFacts, relays: Sequence[_RelayProblem]) -> Iterator[Fo
     if (sighting := peer.seen(DropReason.BAD_HANDSHAKE)) is not None:
         senders.append(at(sighting))
     for name in (relay.config.name for problem, relay in relays if problem == "wrong_psk"):
-        if (sighting := peer.daemon.evidence.seen_of_relay(DropReason.BAD_HANDSHAKE, name, peer.now)) is not None:
+        if (
+            sighting := peer.daemon.evidence.seen_at(DropReason.BAD_HANDSHAKE, ("relay", name), peer.now)
+        ) is not None:
             senders.append(f"the relay {name} at {at(sighting)}")
     for sender in senders:
         yield fault(

@@ -7,7 +7,6 @@ of its own. All other places share one entry per kind, so that an attacker canno
 
 from __future__ import annotations
 
-import errno
 from collections import deque
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from types import MappingProxyType
@@ -104,30 +103,25 @@ class Evidence:
             place = self._place(address, now) if peer is None else _place_of(peer.name)
             self._add(reason, place, address, detail, now)
 
-    def add_failure(self, error: str, address: SocketAddress | None, now: float) -> None:
-        """The kernel refused to send to an address. ``error`` is its name, such as ``EPERM``. This is certain."""
-        self._add(error, self._target(address, now), address, "", now)
+    def add_error(self, error: str, address: SocketAddress | None, now: float) -> None:
+        """The kernel refused to send to an address. ``error`` is its name, such as ``EPERM``. This is certain.
 
-    def add_report(self, number: int, address: SocketAddress, now: float) -> None:
-        """An ICMP message says that a datagram did not arrive. ``number``: the error that the kernel derives."""
-        self._add(REPORTED + errno.errorcode.get(number, "OSError"), self._target(address, now), address, "", now)
+        With :data:`REPORTED` before it, an ICMP message says that a datagram did not arrive.
+        """
+        self._add(error, self._target(address, now), address, "", now)
 
     def seen(self, kind: str, link: PeerLink, now: float) -> Sighting | None:
         """The newest evidence of this kind about a peer, or from its addresses or hosts."""
         places = [("peer", link.name), *_places_of(link)]
         return self._newest(kind, places, now)
 
-    def seen_of_relay(self, kind: str, name: str, now: float) -> Sighting | None:
-        """The newest evidence of this kind about a relay of the configuration."""
-        return self._newest(kind, [("relay", name)], now)
-
     def seen_at_relay(self, kind: str, relay: RelayLink, now: float) -> Sighting | None:
         """The newest evidence of this kind from an address of a relay."""
         return self._newest(kind, _addresses_of(relay.peers), now)
 
-    def seen_elsewhere(self, kind: str, now: float) -> Sighting | None:
-        """The newest evidence of this kind from a place that is not a configured peer's."""
-        return self._newest(kind, [ELSEWHERE], now)
+    def seen_at(self, kind: str, place: Place, now: float) -> Sighting | None:
+        """The newest evidence of this kind from a place: a ``relay`` by name, or :data:`ELSEWHERE`."""
+        return self._newest(kind, [place], now)
 
     def seen_anywhere(self, kind: str, now: float) -> Sighting | None:
         """The newest evidence of this kind."""

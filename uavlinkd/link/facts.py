@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 from uavlinkd.config import EndpointConfig
 from uavlinkd.core.drops import DropReason
 from uavlinkd.endpoints.ports import Endpoint
-from uavlinkd.link.evidence import PartHistory, Sighting
+from uavlinkd.link.evidence import ELSEWHERE, PartHistory, Sighting
 from uavlinkd.link.parts import DaemonParts
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.relay_link import RelayLink
@@ -42,12 +42,8 @@ class Moment:
         self.now = now
         self.down = [link for link in daemon.links.values() if not link.peer.is_up]
         """The peers that are not up."""
-
-    @property
-    def sole_waiting(self) -> PeerLink | None:
-        """The only peer without addresses that is not up: a sender at an unknown address may be this one."""
-        waiting = [link for link in self.down if not link.config.addresses]
-        return waiting[0] if len(waiting) == 1 else None
+        self.has_sole_waiting = sum(not link.config.addresses for link in self.down) == 1
+        """Whether one peer without addresses is not up: a sender at an unknown address may be this one."""
 
     def owner(self, system: int, link: PeerLink) -> str | None:
         """Another peer than this one, or an endpoint here, that has a MAVLink system id."""
@@ -119,9 +115,9 @@ class PeerFacts(PartFacts):
         """The same; of a peer without addresses, from any sender while it is the only such peer that is not up."""
         if self.link.config.addresses or self.link.relayed:
             return self.seen(reason)
-        if self.moment.sole_waiting is None:
+        if not self.moment.has_sole_waiting:
             return None
-        return _since(self.daemon.evidence.seen_elsewhere(reason, self.now), self.link.silent_since)
+        return _since(self.daemon.evidence.seen_at(reason, ELSEWHERE, self.now), self.link.silent_since)
 
     def seen_at(self, relay: RelayLink, kind: str) -> Sighting | None:
         """Evidence at an address of a relay since that went silent."""

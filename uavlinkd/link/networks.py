@@ -111,23 +111,19 @@ class NetworkLog:
         before = self.written
         if presence == before:
             return
-        is_worth_a_line = before is None or presence.hosts or before.hosts  # not another reason of absence
-        if not is_worth_a_line:
+        if before is not None and not presence.hosts and not before.hosts:  # another reason of absence: no line
             self.written = presence
             return
         omitted = self._limits.take("network", self._name, now)
         if omitted is None:
             return
         self.written = presence
-        log = self._log.bind(**omitted)
-        if before is None and not presence.hosts:
-            log.warning("network_not_here_yet", reason=presence.reason)
-        elif not presence.hosts:
-            log.warning("network_disappeared", reason=presence.reason)
-        elif before is None or not before.hosts:
-            log.info("network_appeared", addresses=list(presence.hosts), interface_index=presence.ifindex)
+        if presence.hosts:
+            event = "network_changed" if before is not None and before.hosts else "network_appeared"
+            self._log.info(event, addresses=list(presence.hosts), interface_index=presence.ifindex, **omitted)
         else:
-            log.info("network_changed", addresses=list(presence.hosts), interface_index=presence.ifindex)
+            event = "network_not_here_yet" if before is None else "network_disappeared"
+            self._log.warning(event, reason=presence.reason, **omitted)
 
 
 def network_status(

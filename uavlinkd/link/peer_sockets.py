@@ -21,7 +21,7 @@ from uavlinkd.endpoints.ports import failure_name
 from uavlinkd.endpoints.reader import PAUSE_S, Reader
 from uavlinkd.endpoints.sockets import BindError, is_absent, is_here, send_from_new_port, udp_socket
 from uavlinkd.link.drop_summary import DropSummary, ShellReason
-from uavlinkd.link.evidence import Evidence
+from uavlinkd.link.evidence import REPORTED, Evidence
 from uavlinkd.link.networks import Network, NetworkBudget, Networks, Receive
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.peer_names import PeerNames
@@ -328,7 +328,7 @@ class PeerSockets:
             return False
         reports = slot.reports.take()
         for address, code in reports:
-            self._evidence.add_report(code, address, monotonic())
+            self._evidence.add_error(REPORTED + errno.errorcode.get(code, "OSError"), address, monotonic())
         slot.reader.renew()
         return bool(reports)
 
@@ -336,7 +336,7 @@ class PeerSockets:
         name = failure_name(error)
         self.failures[name] += 1
         self._drops.add("sends_failed", name, "", 1, monotonic())
-        self._evidence.add_failure(name, address, monotonic())
+        self._evidence.add_error(name, address, monotonic())
 
     def follow(self, link: PeerLink | RelayLink) -> None:
         """Resolve the peer's names, and connect to it at their addresses from every socket that may reach them."""

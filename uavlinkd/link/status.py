@@ -55,7 +55,15 @@ def daemon_status(daemon: DaemonParts, now: float) -> dict[str, object]:
         "stale": dict(daemon.stall.dropped),
         "unrouted": _counts(daemon.switch.router.unrouted),
         "send_failures": dict(daemon.peer_sockets.failures),
-        "relay": None if daemon.relay is None else relay_status(daemon.relay, now),
+        "relay": None
+        if (relay := daemon.relay) is None
+        else {
+            "members": {
+                member.settings.name: _member_status(relay, member, now) for member in relay.members.values()
+            },
+            "connections": relay.bindings.connections,
+            "dropped": _counts(relay.forwarding.dropped),
+        },
         "recording": None
         if (recorder := daemon.recorder) is None
         else {
@@ -217,15 +225,6 @@ def _by_name(
         reasons = named.setdefault("others" if number == ANY_OTHER else name_of_number(number), {})
         reasons[refusal.value] = reasons.get(refusal.value, 0) + count
     return named
-
-
-def relay_status(relay: RelayService, now: float) -> dict[str, object]:
-    """The members, and what was forwarded and dropped. Times are ages in seconds."""
-    return {
-        "members": {member.settings.name: _member_status(relay, member, now) for member in relay.members.values()},
-        "connections": relay.bindings.connections,
-        "dropped": _counts(relay.forwarding.dropped),
-    }
 
 
 def _member_status(relay: RelayService, member: RelayMember, now: float) -> dict[str, object]:
