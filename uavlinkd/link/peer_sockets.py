@@ -167,7 +167,7 @@ class PeerSockets:
         if ip_networks := [network for network in networks if network.serial is None]:
             self.networks = Networks(ip_networks, addresses, self.put, self.open_sockets, self._node, self._log)
             for one in self.networks.sockets.values():
-                self._add_slot(_Slot(one.number, one.family))
+                self._slots.append(_Slot(one.number, one.family))
             self.networks.open(monotonic())
         else:
             for number, address in enumerate(addresses or _EPHEMERAL):
@@ -175,12 +175,12 @@ class PeerSockets:
                     sock = udp_socket(address, may_come_later=True)
                 except BindError as error:
                     raise BindError(f"listen: {error}") from None
-                self._add_slot(_Slot(number, sock.family))
+                self._slots.append(_Slot(number, sock.family))
                 self.put(number, sock)
         lines = [network for network in networks if network.serial is not None]
         self.serial = SerialNetworks(lines, len(self._slots), self._node, self._stall, self._log)
         for line in self.serial.networks:
-            self._add_slot(_Slot(line.number, socket.AF_UNSPEC, line.send))
+            self._slots.append(_Slot(line.number, socket.AF_UNSPEC, line.send))
         self._add_budgets(monotonic())
 
     def _add_budgets(self, now: float) -> None:
@@ -201,19 +201,21 @@ class PeerSockets:
 
     def _choose_senders(self) -> None:
         """A socket without a budget, and without relays, is called directly."""
-        for slot in self._slots:
-            is_plain = slot.number not in self.budgets and not self._uses_relays
-            self.senders[slot.number] = slot.send if is_plain else partial(self._send_charged, slot.number)
-
-    def _add_slot(self, slot: _Slot) -> None:
-        self._slots.append(slot)
-        self.senders.append(slot.send)
+        self.senders = [
+            partial(self._send_charged, slot.number)
+            if self._uses_relays or slot.number in self.budgets
+            else slot.send
+            for slot in self._slots
+        ]
 
     def put(self, number: int, sock: socket.socket | None) -> None:
         """Use this socket under a number from now on, and close the one before. None: there is no socket."""
         slot = self._slots[number]
-        self._close(slot)
-        slot.sock = sock
+        if slot.reader is not None:
+            slot.reader.stop()
+        if slot.sock is not None:
+            slot.sock.close()
+        slot.sock, slot.reader, slot.reports = sock, None, None
         slot.send = _send_nowhere if sock is None else sock.sendto
         self._choose_senders()
         if self._is_started:
@@ -235,13 +237,6 @@ class PeerSockets:
             slot.reader = Reader(slot.sock, receive, on_failure, self._stall, self.pause_s)
             slot.reader.start()
             slot.reports = ErrorReports(slot.sock)
-
-    def _close(self, slot: _Slot) -> None:
-        if slot.reader is not None:
-            slot.reader.stop()
-        if slot.sock is not None:
-            slot.sock.close()
-        slot.sock = slot.reader = slot.reports = None
 
     def do_housekeeping(self) -> None:
         """Have the kernel report errors again, and look at the networks. Call it once a second."""

@@ -58,9 +58,7 @@ def daemon_status(daemon: DaemonParts, now: float) -> dict[str, object]:
         "relay": None
         if (relay := daemon.relay) is None
         else {
-            "members": {
-                member.settings.name: _member_status(relay, member, now) for member in relay.members.values()
-            },
+            "members": {one.settings.name: _member_status(relay, one, now) for one in relay.members.values()},
             "connections": relay.bindings.connections,
             "dropped": _counts(relay.forwarding.dropped),
         },
