@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterable, Mapping
 from typing import Final, NamedTuple
 
@@ -42,8 +42,7 @@ class EventLog:
         self._log = log
         self._limits = limits or LineLimits()
         self._network_of = network_of
-        self._states: dict[str, _State] = {}  # of a peer: the latest that was omitted
-        self._watches: dict[str, LinkWatch] = {}
+        self._watches = defaultdict[str, LinkWatch](LinkWatch)  # by name in the core
         self._findings: dict[_FindingKey, Finding] = {}
         self._present: dict[_FindingKey, float] = {}  # since when
         self._forgotten: Counter[LinkProblem] = Counter()  # problems of peers that were removed
@@ -51,7 +50,6 @@ class EventLog:
             "link", self._limits, self._write_problem, lambda key: (key[0], key[1] is LinkProblem.PATHS_UNPROVEN)
         )
         self._pauses = Conditions[str]("pause", self._limits, self._write_pause, lambda _: ("", False))
-        self._repairs: dict[str, tuple[float, int]] = {}  # by peer: when repair began, and the bytes of repeats then
         self._paused_s = 0.0
         self._finding_conditions = Conditions[_FindingKey](
             "finding",
@@ -72,9 +70,9 @@ class EventLog:
 
     def check(self, now: float) -> None:
         """Write the lines that are due. Call it about once a second."""
-        for name, state in list(self._states.items()):
-            del self._states[name]
-            self._write_event(state, now)
+        for watch in list(self._watches.values()):
+            if watch.omitted_state is not None:
+                self._write_event(watch.omitted_state, now)
         self._problem_conditions.check(now)
         self._pauses.check(now)
         self._finding_conditions.check(now)
@@ -90,10 +88,7 @@ class EventLog:
         self._finding_conditions.close(lambda key: key[1] is Subject.PEER and key[2] == peer)
         for name in [name for name in self._watches if link_name(name) == peer]:
             self._forgotten += self._watches.pop(name).totals
-        for name in [name for name in self._states if link_name(name) == peer]:
-            del self._states[name]
         self._limits.forget(lambda name: link_name(name) == peer)
-        self._repairs.pop(peer, None)
 
     # Events of the core.
 
@@ -110,14 +105,15 @@ class EventLog:
 
     def _write_event(self, event: o.Event, now: float) -> None:
         name = event.peer.name
-        omitted = self._limits.take("peer", name, now)
+        watch, omitted = self._watches[name], self._limits.take("peer", name, now)
+        before, watch.omitted_state = watch.omitted_state, None
         if omitted is None:
-            if name in self._states or not isinstance(event, _State):
+            if before is not event and (before is not None or not isinstance(event, _State)):
                 self._limits.omit("peer", name)
-            if isinstance(event, _State):  # it is written later, so that the log ends with the state of the link
-                self._states[name] = event
+            # A state is written later, so that the log ends with the state of the link.
+            watch.omitted_state = event if isinstance(event, _State) else before
             return
-        if self._states.pop(name, None) is not None:
+        if before is not None and before is not event:
             omitted["omitted_before"] = omitted.get("omitted_before", 0) + 1
         log = self._log.bind(peer=name, **omitted)
         match event:
@@ -158,9 +154,7 @@ class EventLog:
         """Note the problems of a link that exceed their thresholds, and repair. Call it about once a second."""
         self._check_repair(link, now)
         peer = link.peer.name
-        watch = self._watches.get(peer)
-        if watch is None:
-            watch = self._watches[peer] = LinkWatch()
+        watch = self._watches[peer]
         received = link.peer.traffic.envelopes_received
         for problem, growth in watch.measure(link.problems(now), received, now).items():
             key = peer, problem
@@ -170,12 +164,12 @@ class EventLog:
                 self._problem_conditions.note(key, now, growth.since if is_open else growth.minute)
 
     def _check_repair(self, link: PeerLink, now: float) -> None:
-        repair, size = link.output.repair, link.output.copies.repeat_bytes
-        if repair.is_on and link.name not in self._repairs:
-            self._repairs[link.name] = now, size
+        repair, size, watch = link.output.repair, link.output.copies.repeat_bytes, self._watches[link.name]
+        if repair.is_on and watch.repair is None:
+            watch.repair = now, size
             self._log.info("repair_began", peer=link.name, transmissions=repair.transmissions)
-        elif not repair.is_on and link.name in self._repairs:
-            began_at, before = self._repairs.pop(link.name)
+        elif not repair.is_on and watch.repair is not None:
+            (began_at, before), watch.repair = watch.repair, None
             self._log.info(
                 "repair_ended", peer=link.name, duration_s=round(now - began_at, 3), bytes=max(0, size - before)
             )
@@ -297,6 +291,10 @@ class LinkWatch:
     """The totals of one link over the last minute."""
 
     def __init__(self) -> None:
+        self.omitted_state: _State | None = None
+        """The latest that a limit omitted."""
+        self.repair: tuple[float, int] | None = None
+        """When it began, and the bytes of repeats then; None while there is none."""
         self.totals: Counter[LinkProblem] = Counter()
         """All problems since the start."""
         self.shares: dict[LinkProblem, float] = {}
