@@ -106,14 +106,14 @@ class EventLog:
     def _write_event(self, event: o.Event, now: float) -> None:
         name = event.peer.name
         watch, omitted = self._watches[name], self._limits.take("peer", name, now)
-        before, watch.omitted_state = watch.omitted_state, None
+        earlier, watch.omitted_state = watch.omitted_state, None
         if omitted is None:
-            if before is not event and (before is not None or not isinstance(event, _State)):
+            if earlier is not event and (earlier is not None or not isinstance(event, _State)):
                 self._limits.omit("peer", name)
             # A state is written later, so that the log ends with the state of the link.
-            watch.omitted_state = event if isinstance(event, _State) else before
+            watch.omitted_state = event if isinstance(event, _State) else earlier
             return
-        if before is not None and before is not event:
+        if earlier is not None and earlier is not event:
             omitted["omitted_before"] = omitted.get("omitted_before", 0) + 1
         log = self._log.bind(peer=name, **omitted)
         match event:
