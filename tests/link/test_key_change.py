@@ -17,7 +17,7 @@ from uavlinkd.core.crypto import KeyPair, Secret
 from uavlinkd.core.settings import PeerSettings, link_name
 from uavlinkd.link import peers as module
 from uavlinkd.link.carrier import FrameCarrier
-from uavlinkd.link.parts import make_parts
+from uavlinkd.link.parts import DaemonParts
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.peers import pairings
 
@@ -129,7 +129,7 @@ class Scene:
         monkeypatch.setattr(module, "KEY_GRACE_S", 10.0)
         config = load(folder, OUR_LINE, was(THEIRS_BEFORE))
         self.config = replace(config, peers=config.peers[:1])
-        self.parts = make_parts(self.config, structlog.get_logger(), 0.0, lambda _: None)
+        self.parts = DaemonParts(self.config, structlog.get_logger(), 0.0, lambda _: None)
         self.peers = FrameCarrier(self.parts).peers
         self.peers.start()
 

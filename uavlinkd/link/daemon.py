@@ -17,7 +17,7 @@ from uavlinkd.endpoints.sockets import BindError
 from uavlinkd.link.carrier import FrameCarrier
 from uavlinkd.link.diagnosis import find
 from uavlinkd.link.local_endpoints import PilotNotes
-from uavlinkd.link.parts import DaemonParts, make_parts
+from uavlinkd.link.parts import DaemonParts
 from uavlinkd.link.peer_link import radio_figures
 from uavlinkd.link.status import daemon_status, paths_status, state_of
 from uavlinkd.mavlink.own_frames import INTERVAL_S
@@ -50,7 +50,7 @@ class Daemon:
         self.log = structlog.get_logger().bind(daemon=config.name)
         self._loop = asyncio.get_running_loop()
         self._started_at = now = monotonic()
-        self.parts = make_parts(config, self.log, now, self._perform)
+        self.parts = DaemonParts(config, self.log, now, self._perform)
         self.carrier = FrameCarrier(self.parts)
         self._notes = PilotNotes(self.parts.switch.router.addresses)
         self._housekeeping: asyncio.TimerHandle | None = None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 
 from structlog.typing import FilteringBoundLogger
 
@@ -30,81 +29,48 @@ from uavlinkd.system.clock import monotonic
 from uavlinkd.system.stall import StallWatch
 
 
-@dataclass(slots=True, kw_only=True)
 class DaemonParts:
-    """What one daemon consists of."""
+    """What one daemon consists of; it has no peers yet. ``perform`` executes what its relay wants."""
 
-    config: Config
-    """The one in force."""
-    log: FilteringBoundLogger
-    node: Node
-    links: dict[str, PeerLink]
-    """By the peer's name."""
-    link_of: dict[LinkedPeer, PeerLink]
-    """By each peer of the core that carries frames: a link has several while keys change."""
-    switch: Switch
-    peer_sockets: PeerSockets
-    relays: Relays
-    """Those that this daemon uses."""
-    relay: RelayService | None
-    """That of this daemon, if it is one."""
-    local: LocalEndpoints
-    stall: StallWatch
-    recorder: Recorder | None
-    """From the start on, if the daemon records."""
-    drops: DropSummary
-    events: EventLog
-    evidence: Evidence
-    history: History
+    def __init__(
+        self, config: Config, log: FilteringBoundLogger, now: float, perform: Callable[[Iterable[Output]], None]
+    ) -> None:
+        self.config = config
+        """The one in force."""
+        self.log = log
+        self.node = node = Node(config.private_key, os.urandom, now, config.previous_private_key, screen=screen)
+        self.links: dict[str, PeerLink] = {}
+        """By the peer's name."""
+        self.link_of: dict[LinkedPeer, PeerLink] = {}
+        """By each peer of the core that carries frames: a link has several while keys change."""
+        relay_links: dict[str, RelayLink] = {}
+        limits = LineLimits()
+        self.drops = DropSummary(log, limits)
+        self.evidence = Evidence(self.links, config.public_key, relay_links)
+        self.history = History(now)
+        self.stall = StallWatch(now, self._on_pause)
+        self.peer_sockets = sockets = PeerSockets(self.stall, self.drops, self.evidence, log, node)
+        self.events = EventLog(log, limits, sockets.network_name)
+        self.switch = Switch(Router[PeerLink | LocalPort](relays=config.routing.relay), self.stall, self.drops)
+        self.local = LocalEndpoints(config.name, self.switch, self.events, self.stall)
+        self.recorder: Recorder | None = None
+        """From the start on, if the daemon records."""
+        self.relays = Relays(node, sockets, self.links, relay_links, log)
+        """Those that this daemon uses."""
+        self.relay: RelayService | None = None
+        """That of this daemon, if it is one."""
+        if config.relay_server is not None:
+            shell = RelayShell(
+                entropy=os.urandom,
+                clock=monotonic,
+                perform=perform,
+                send=sockets.send,
+                send_from_new_port=sockets.send_from_new_port,
+                on_event=self.events.write,
+            )
+            self.relay = RelayService(node, config.relay_server.limits, shell)
+            sockets.pause_s = 0.0
 
-
-def make_parts(
-    config: Config, log: FilteringBoundLogger, now: float, perform: Callable[[Iterable[Output]], None]
-) -> DaemonParts:
-    """The parts of a daemon with this configuration, without peers. ``perform`` executes what its relay wants."""
-    node = Node(config.private_key, os.urandom, now, config.previous_private_key, screen=screen)
-    links: dict[str, PeerLink] = {}
-    relay_links: dict[str, RelayLink] = {}
-    limits, history = LineLimits(), History(now)
-    drops = DropSummary(log, limits)
-    evidence = Evidence(links, config.public_key, relay_links)
-
-    def on_pause(pause_s: float) -> None:
-        history.paused = monotonic(), pause_s
-        events.write_pause(pause_s, monotonic())
-
-    stall = StallWatch(now, on_pause)
-    sockets = PeerSockets(stall, drops, evidence, log, node)
-    events = EventLog(log, limits, sockets.network_name)
-    router = Router[PeerLink | LocalPort](relays=config.routing.relay)
-    switch = Switch(router, stall, drops)
-    relay: RelayService | None = None
-    if config.relay_server is not None:
-        shell = RelayShell(
-            entropy=os.urandom,
-            clock=monotonic,
-            perform=perform,
-            send=sockets.send,
-            send_from_new_port=sockets.send_from_new_port,
-            on_event=events.write,
-        )
-        relay = RelayService(node, config.relay_server.limits, shell)
-        sockets.pause_s = 0.0
-    return DaemonParts(
-        config=config,
-        log=log,
-        node=node,
-        links=links,
-        link_of={},
-        switch=switch,
-        peer_sockets=sockets,
-        relays=Relays(node, sockets, links, relay_links, log),
-        relay=relay,
-        local=LocalEndpoints(config.name, switch, events, stall),
-        stall=stall,
-        recorder=None,
-        drops=drops,
-        events=events,
-        evidence=evidence,
-        history=history,
-    )
+    def _on_pause(self, pause_s: float) -> None:
+        self.history.paused = monotonic(), pause_s
+        self.events.write_pause(pause_s, monotonic())
