@@ -14,8 +14,7 @@ import pytest
 from tests.daemon.udp import open_socket
 from tests.endpoints.clients import LOOPS, NewLoop, Recorder, frame, heartbeat, run_in, write
 from tests.waiting import until
-from uavlinkd.endpoints.error_queue import SEND_ATTEMPTS, ErrorReports
-from uavlinkd.endpoints.sockets import udp_socket
+from uavlinkd.endpoints.sockets import SEND_ATTEMPTS, ErrorReports, udp_socket
 from uavlinkd.endpoints.udp import UdpServer
 from uavlinkd.system.addresses import Address
 

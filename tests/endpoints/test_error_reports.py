@@ -10,8 +10,7 @@ from tests.daemon.udp import open_socket
 from tests.endpoints.clients import HOSTS, LOOPS, NewLoop, Recorder, frame, run_in, write
 from tests.needs import need
 from tests.waiting import until
-from uavlinkd.endpoints.error_queue import REPORTS_PER_S, ErrorReports
-from uavlinkd.endpoints.sockets import udp_socket
+from uavlinkd.endpoints.sockets import REPORTS_PER_S, ErrorReports, udp_socket
 from uavlinkd.endpoints.udp import UdpClient
 from uavlinkd.lab.sim.loopback_ports import free_port, has_ipv6
 from uavlinkd.system.addresses import Address

@@ -108,7 +108,7 @@ async def test_name_is_looked_up_at_each_attempt(server: TcpServer, monkeypatch:
         asked.append((host, port))
         if len(asked) == 1:
             raise socket.gaierror(socket.EAI_NONAME, "unknown")
-        sockaddr = elsewhere.sockaddr if len(asked) == 2 else server.address
+        sockaddr = (elsewhere.host, elsewhere.port) if len(asked) == 2 else server.address
         return [(socket.AF_INET, socket.SOCK_STREAM, 6, "", sockaddr)]
 
     monkeypatch.setattr(socket, "getaddrinfo", look_up)
@@ -127,7 +127,7 @@ async def test_connection_to_oneself_is_refused(monkeypatch: pytest.MonkeyPatch)
     def prepare_there(sock: socket.socket) -> None:
         prepare(sock)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        sock.bind(address.sockaddr)
+        sock.bind((address.host, address.port))
 
     monkeypatch.setattr(tcp, "_prepare", prepare_there)
     with client_of(address) as tcp_client:

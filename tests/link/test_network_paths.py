@@ -86,7 +86,7 @@ async def scene(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 def paths(address: Address, *numbers: int) -> list[Path]:
     """The paths to an address from these sockets."""
-    sockaddr: Any = (address.host, address.port, 0, 0) if ":" in address.host else address.sockaddr
+    sockaddr: Any = (address.host, address.port, *((0, 0) if ":" in address.host else ()))
     return [Path(number, sockaddr) for number in numbers]
 
 

@@ -45,7 +45,7 @@ async def server(source: Source) -> AsyncIterator[MetricsServer]:
 
 async def exchange(server: MetricsServer, request: bytes, *, end: bool = True) -> bytes:
     """The whole response."""
-    reader, writer = await asyncio.open_connection(*server.address.sockaddr)
+    reader, writer = await asyncio.open_connection(server.address.host, server.address.port)
     try:
         writer.write(request)
         if end:
@@ -143,7 +143,7 @@ async def test_silent_client_times_out(
 @pytest.mark.parametrize("sent", [b"", b"GET /metr", REQUEST], ids=["nothing", "half a request", "a request"])
 async def test_hung_connections_do_not_block_others(server: MetricsServer, sent: bytes) -> None:
     """With all connections in use, the server closes the oldest and answers the new one at once."""
-    hung = [await asyncio.open_connection(*server.address.sockaddr) for _ in range(MAX_CONNECTIONS)]
+    hung = [await asyncio.open_connection(server.address.host, server.address.port) for _ in range(MAX_CONNECTIONS)]
     for _, writer in hung:
         writer.write(sent)
     await until(lambda: len(server._connections) == MAX_CONNECTIONS)

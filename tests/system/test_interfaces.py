@@ -1,4 +1,4 @@
-"""The interfaces of this machine, as the kernel reports them."""
+"""The interfaces and routes of this machine, as the kernel reports them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from tests.needs import need
 from uavlinkd.lab.sim.loopback_ports import has_ipv6
 from uavlinkd.system import interfaces
-from uavlinkd.system.interfaces import find_interface, interface_of
+from uavlinkd.system.interfaces import find_interface, interface_of, leads_to, specific_routes
 
 
 @pytest.fixture(autouse=True)
@@ -60,3 +60,73 @@ def test_kernel_without_ipv6(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) ->
     loopback = find_interface("lo")
     assert loopback is not None
     assert loopback.hosts == ("127.0.0.1",)
+
+
+# Routes.
+
+
+def stored(address: str) -> str:
+    """As the kernel prints an IPv4 address: the number that the machine has in memory."""
+    number = int.from_bytes(bytes(map(int, address.split("."))), sys.byteorder)
+    return f"{number:08X}"
+
+
+def row(interface: str, destination: str, flags: str, mask: str) -> str:
+    """A row of the table of IPv4."""
+    return "\t".join((interface, stored(destination), stored("0.0.0.0"), flags, "0", "0", "0", stored(mask), "0"))
+
+
+@pytest.fixture
+def tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]:
+    """Replacements for the kernel's two tables, which do not exist yet."""
+    ipv4, ipv6 = tmp_path / "route", tmp_path / "ipv6_route"
+    monkeypatch.setattr(interfaces, "_IPV4_ROUTES", ipv4)
+    monkeypatch.setattr(interfaces, "_IPV6_ROUTES", ipv6)
+    return ipv4, ipv6
+
+
+def test_machine_without_tables_has_no_routes(tables: tuple[Path, Path]) -> None:
+    """Another system, or a kernel without a protocol."""
+    assert not any(table.exists() for table in tables)
+    assert specific_routes() == []
+
+
+def test_default_routes_and_refusals_do_not_count(tables: tuple[Path, Path]) -> None:
+    """Nor does the loopback interface, nor a route that is down."""
+    lines = [
+        "Iface Destination Gateway Flags RefCnt Use Metric Mask",
+        row("wwan0", "0.0.0.0", "0003", "0.0.0.0"),
+        row("wlan0", "10.13.0.0", "0001", "255.255.0.0"),
+        row("wlan0", "10.99.0.0", "0200", "255.255.0.0"),
+        row("wlan0", "10.98.0.0", "0000", "255.255.0.0"),
+        row("lo", "127.0.0.0", "0001", "255.0.0.0"),
+    ]
+    tables[0].write_text("\n".join(lines))
+    present = specific_routes()
+    assert [(str(route.network), route.interface) for route in present] == [("10.13.0.0/16", "wlan0")]
+    assert leads_to(present, "10.13.255.1", None)
+    assert leads_to(present, "10.13.255.1", "wlan0")
+    assert not leads_to(present, "10.13.255.1", "wwan0")
+    assert not leads_to(present, "10.99.0.1", None)
+    assert not leads_to(present, "203.0.113.1", None)
+
+
+def test_routes_of_ipv6(tables: tuple[Path, Path]) -> None:
+    """The prefix and its length; an IPv4 address is in none of them."""
+    zeros = "0" * 32
+    lines = [
+        f"fd13{28 * '0'} 40 {zeros} 00 {zeros} 00000100 00000001 00000000 00000001     mesh0",
+        f"{zeros} 00 {zeros} 00 {zeros} 00000400 00000002 00000000 00000003     wwan0",
+        f"fd14{28 * '0'} 40 {zeros} 00 {zeros} 00000100 00000001 00000000 00000201     mesh0",
+    ]
+    tables[1].write_text("\n".join(lines))
+    present = specific_routes()
+    assert [str(route.network) for route in present] == ["fd13::/64"]
+    assert leads_to(present, "fd13::7", "mesh0")
+    assert not leads_to(present, "fd14::7", "mesh0")
+    assert not leads_to(present, "10.0.0.1", None)
+
+
+def test_kernel_tables_are_understood() -> None:
+    """Whatever this machine has, it parses, and no default route is among it."""
+    assert all(route.network.prefixlen > 0 for route in specific_routes())

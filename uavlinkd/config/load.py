@@ -18,7 +18,7 @@ from uavlinkd.config.model import Config, ConfigError, Problem
 from uavlinkd.config.problems import Problems, Sections, Values
 from uavlinkd.config.syntax import at, syntax_problem
 from uavlinkd.core.crypto import Secret
-from uavlinkd.system.threads import Threads
+from uavlinkd.system.tasks import Threads
 
 _MAX_FILE_BYTES = 1 << 20
 _THREAD = Threads(1, "configuration")

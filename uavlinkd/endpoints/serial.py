@@ -15,8 +15,7 @@ from uavlinkd.endpoints.stream_endpoint import Connection, StreamEndpoint
 from uavlinkd.endpoints.url import SerialUrl
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.stall import StallWatch
-from uavlinkd.system.tasks import keep_running
-from uavlinkd.system.threads import Threads
+from uavlinkd.system.tasks import Threads, keep_running
 
 RETRY_S = 0.5
 """Wait between two attempts to open a device that is missing or not permitted."""

@@ -154,7 +154,7 @@ class TcpServer(StreamEndpoint):
                 sock.close()
                 continue
             _prepare(sock)
-            self.open(SocketChannel(sock), str(Address(*sockaddr[:2])), now, epoch)
+            self.open(SocketChannel(sock), str(Address.of(sockaddr)), now, epoch)
 
     def close(self) -> None:
         """Stop listening and close every connection."""

@@ -15,13 +15,12 @@ from typing import Any
 
 import structlog
 
-from uavlinkd.endpoints.error_queue import ErrorReports, send_again
 from uavlinkd.endpoints.ports import Endpoint, LocalPort, PortHandler, failure_name
 from uavlinkd.endpoints.reader import Datagrams, Reader
-from uavlinkd.endpoints.sockets import BindError, udp_socket
+from uavlinkd.endpoints.sockets import BindError, ErrorReports, send_again, udp_socket
 from uavlinkd.mavlink.frames import MAX_GAP_S, MIN_FRAME_BYTES, Frame, SplitCounters, StreamSplitter, split_datagram
 from uavlinkd.mavlink.policy.delivery import Source
-from uavlinkd.system.addresses import Address, numeric_host
+from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.resolver import LONGEST_WAIT_S, Resolved, keep_resolving
 from uavlinkd.system.stall import STALE
@@ -211,7 +210,7 @@ class UdpEndpoint(Endpoint):
         """The new client at ``address``, which sent a genuine frame; None if the endpoint does not accept it."""
 
     def _open(self, address: SocketAddress, received_at: float | None) -> UdpPort:
-        port = UdpPort(self, str(Address(numeric_host(address), address[1])), address, received_at)
+        port = UdpPort(self, str(Address.of(address)), address, received_at)
         self._ports[address] = port
         self.handler.on_port_opened(port)
         return port

@@ -27,7 +27,7 @@ from uavlinkd.ops.recorder import Recorder
 from uavlinkd.ops.sdnotify import Supervisor
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic
-from uavlinkd.system.signals import on_signal
+from uavlinkd.system.tasks import on_signal
 from uavlinkd.system.terminal import printable
 
 if TYPE_CHECKING:

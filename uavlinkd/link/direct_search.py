@@ -24,8 +24,7 @@ from uavlinkd.core.path_state import PathCondition
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.relay_records import Candidates
 from uavlinkd.link.peer_sockets import PeerSockets
-from uavlinkd.system.interfaces import find_interface, interface_names
-from uavlinkd.system.routes import leads_to, specific_routes
+from uavlinkd.system.interfaces import find_interface, interface_names, leads_to, specific_routes
 
 Place = tuple[str, int]
 """Numeric host and port."""

@@ -16,10 +16,17 @@ from structlog.typing import FilteringBoundLogger
 from uavlinkd.config import NetworkConfig, PeerAddress
 from uavlinkd.core.node import Node
 from uavlinkd.core.path import Path, SocketAddress, relay_name
-from uavlinkd.endpoints.error_queue import ErrorReports, send_again
 from uavlinkd.endpoints.ports import failure_name
 from uavlinkd.endpoints.reader import PAUSE_S, Reader
-from uavlinkd.endpoints.sockets import BindError, is_absent, is_here, send_from_new_port, udp_socket
+from uavlinkd.endpoints.sockets import (
+    BindError,
+    ErrorReports,
+    is_absent,
+    is_here,
+    send_again,
+    send_from_new_port,
+    udp_socket,
+)
 from uavlinkd.link.drop_summary import DropSummary, ShellReason
 from uavlinkd.link.evidence import REPORTED, Evidence
 from uavlinkd.link.networks import Network, NetworkBudget, Networks, Receive

@@ -316,7 +316,7 @@ class Relays:
     def _seen(self) -> list[Place]:
         """One for each relay and socket, so that the lies of one relay leave room for the others."""
         views = ((relay, path, place) for relay in self.by_name.values() for path, place in relay.views())
-        return list({(relay, path.socket): place.sockaddr for relay, path, place in views}.values())
+        return list({(relay, path.socket): (place.host, place.port) for relay, path, place in views}.values())
 
     def _search(self, now: float) -> None:
         """Have direct paths searched with what is known now, of the peers that use relays."""

@@ -24,8 +24,7 @@ from uavlinkd.mavlink.dialect import SETUP_SIGNING
 from uavlinkd.mavlink.frames import MAVLINK2
 from uavlinkd.ops.tlog_files import STAMP_BYTES, FolderInUseError, TlogFolder
 from uavlinkd.system.error_meanings import meaning_of
-from uavlinkd.system.tasks import keep_running
-from uavlinkd.system.threads import Threads
+from uavlinkd.system.tasks import Threads, keep_running
 
 MAX_BUFFERED_BYTES = 4 << 20
 """Limit of the buffer of all peers. Frames beyond it are not recorded."""

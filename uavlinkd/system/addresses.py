@@ -47,11 +47,6 @@ class Address:
         return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
 
     @property
-    def sockaddr(self) -> tuple[str, int]:
-        """What ``getaddrinfo`` and asyncio take."""
-        return self.host, self.port
-
-    @property
     def ip(self) -> IPv4Address | IPv6Address | None:
         """The numeric host; None for a name."""
         try:

@@ -1,6 +1,6 @@
-"""The network interfaces of this machine: their numbers, states and addresses (Linux).
+"""The network interfaces of this machine, with their numbers, states and addresses, and its routes (Linux).
 
-It asks by ioctl(2) and reads a table of /proc. It does not use netlink: the service's sandbox permits no netlink
+It asks by ioctl(2) and reads tables of /proc. It does not use netlink: the service's sandbox permits no netlink
 sockets, and a netlink library would cost the daemon memory and start-up time for two questions per second.
 """
 
@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import socket
 import struct
+import sys
 from array import array
-from ipaddress import IPv6Address
+from ipaddress import IPv4Network, IPv6Address, IPv6Network, ip_address
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -37,8 +38,13 @@ _MOST_ADDRESSES: Final = 256
 # linux/if_addr.h: not usable as a source.
 _IFA_F_DADFAILED: Final = 0x08
 _IFA_F_TENTATIVE: Final = 0x40
+# Not /proc/net: the service sees only the folders of processes (ProcSubset=pid).
 _IPV6_TABLE: Final = Path("/proc/self/net/if_inet6")
-"""Not /proc/net: the service sees only the folders of processes (ProcSubset=pid)."""
+_IPV4_ROUTES: Final = Path("/proc/self/net/route")
+_IPV6_ROUTES: Final = Path("/proc/self/net/ipv6_route")
+# linux/route.h
+_RTF_UP: Final = 0x1
+_RTF_REJECT: Final = 0x200
 
 
 class Interface(NamedTuple):
@@ -103,13 +109,47 @@ def _ipv4(sock: socket.socket, name: str) -> list[str]:
 
 def _ipv6(index: int) -> list[str]:
     """Rows of the table: address, index, prefix length, scope, flags (hexadecimal), name."""
-    try:
-        rows = _IPV6_TABLE.read_text().splitlines()
-    except OSError:  # a kernel without IPv6
-        return []
     hosts = []
-    for row in rows:
-        digits, number, _, _, flags, _ = row.split()
+    for digits, number, _, _, flags, _ in _rows(_IPV6_TABLE):
         if int(number, 16) == index and not int(flags, 16) & (_IFA_F_TENTATIVE | _IFA_F_DADFAILED):
             hosts.append(str(IPv6Address(bytes.fromhex(digits))))
     return sorted(hosts)
+
+
+def _rows(table: Path) -> list[list[str]]:
+    try:
+        return [row.split() for row in table.read_text().splitlines()]
+    except OSError:  # a kernel without this protocol
+        return []
+
+
+class SpecificRoute(NamedTuple):
+    """A route to a network, which is not the default route."""
+
+    network: IPv4Network | IPv6Network
+    interface: str
+
+
+def specific_routes() -> list[SpecificRoute]:
+    """All routes but default ones, refusals and those of the loopback interface. None on systems other than Linux."""
+    routes = []
+    for row in _rows(_IPV4_ROUTES)[1:]:
+        # Interface, destination, gateway, flags, 3 more, mask, ... Numbers as the machine stores them.
+        destination, mask = (int(row[column], 16).to_bytes(4, sys.byteorder) for column in (1, 7))
+        ipv4 = IPv4Network((destination, int.from_bytes(mask, "big").bit_count()))
+        routes.append((row[3], SpecificRoute(ipv4, row[0])))
+    for row in _rows(_IPV6_ROUTES):
+        # Destination, its prefix length, 6 more, flags, interface. All in hexadecimal.
+        ipv6 = IPv6Network((bytes.fromhex(row[0]), int(row[1], 16)))
+        routes.append((row[8], SpecificRoute(ipv6, row[9])))
+    return [
+        route
+        for flags, route in routes
+        if int(flags, 16) & (_RTF_UP | _RTF_REJECT) == _RTF_UP and route.network.prefixlen and route.interface != "lo"
+    ]
+
+
+def leads_to(routes: list[SpecificRoute], host: str, interface: str | None) -> bool:
+    """Whether one of the routes, through this interface if one is given, leads to a numeric host."""
+    address = ip_address(host)
+    return any(address in route.network for route in routes if interface in (None, route.interface))

@@ -17,7 +17,7 @@ from structlog.typing import FilteringBoundLogger
 
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.error_meanings import NAME_NOT_RESOLVED, meaning_of
-from uavlinkd.system.threads import Threads
+from uavlinkd.system.tasks import Threads
 
 Resolved = list[tuple[socket.AddressFamily, Any]]
 """Family and socket address of each address, as the kernel takes them."""

@@ -1,9 +1,19 @@
-"""Background tasks whose failure must be reported at once."""
+"""Background tasks whose failure must be reported at once, worker threads for calls that may hang, and signals."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Coroutine
+import errno
+import os
+import signal
+from collections import deque
+from collections.abc import Callable, Coroutine
+from concurrent.futures import Future
+from functools import partial
+from threading import Lock, Thread
+from typing import Any, TypeVar
+
+T = TypeVar("T")
 
 
 def keep_running(work: Coroutine[object, object, None], name: str) -> asyncio.Task[None]:
@@ -21,3 +31,68 @@ def keep_running(work: Coroutine[object, object, None], name: str) -> asyncio.Ta
     task = loop.create_task(work, name=name)
     task.add_done_callback(on_done)
     return task
+
+
+def on_signal(name: str, callback: Callable[[], object]) -> None:
+    """Call ``callback`` in the running loop when a signal arrives. Windows lacks some signals."""
+    loop = asyncio.get_running_loop()
+    number: signal.Signals | None = getattr(signal, name, None)
+    if number is None:
+        return
+    try:
+        loop.add_signal_handler(number, callback)
+    except NotImplementedError:  # Windows
+        signal.signal(number, lambda _, __: loop.call_soon_threadsafe(callback))
+
+
+class Threads:
+    """At most ``limit`` worker threads at a time, called ``name``, for calls that may hang. Further calls wait.
+
+    They are our own because Python joins the threads of executors, which asyncio uses, at exit: a silent name server
+    would delay the stop of the daemon.
+    """
+
+    def __init__(self, limit: int, name: str) -> None:
+        self._name = name
+        self._lock = Lock()
+        """Protects the two below, which change together."""
+        self._free = limit  # threads that may still be started
+        self._waiting: deque[tuple[Future[Any], partial[Any]]] = deque()
+
+    async def run(self, function: Callable[..., T], *arguments: Any) -> T:
+        """Run ``function`` in a worker thread and return its result. Cancelling does not stop the thread.
+
+        Raises:
+            OSError: the system cannot start a thread now.
+            Exception: any exception of ``function``.
+        """
+        future = Future[T]()
+        call = future, partial(function, *arguments)
+        with self._lock:
+            needs_thread = self._free > 0
+            if needs_thread:
+                self._free -= 1
+            else:
+                self._waiting.append(call)
+        if needs_thread:
+            try:
+                Thread(target=self._serve, args=call, name=self._name, daemon=True).start()
+            except RuntimeError:  # the limit of threads, or no memory
+                with self._lock:
+                    self._free += 1
+                raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN)) from None
+        return await asyncio.wrap_future(future)
+
+    def _serve(self, future: Future[Any], call: partial[Any]) -> None:
+        """Do the call, and then those that wait."""
+        while True:
+            if future.set_running_or_notify_cancel():
+                try:
+                    future.set_result(call())
+                except Exception as error:  # raised again in `run`
+                    future.set_exception(error)
+            with self._lock:
+                if not self._waiting:
+                    self._free += 1
+                    return
+                future, call = self._waiting.popleft()

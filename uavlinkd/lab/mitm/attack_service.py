@@ -28,7 +28,7 @@ from uavlinkd.lab.mitm.attacks import ATTACKS, AttackSpec, parse_attack
 from uavlinkd.lab.mitm.channel import AttackChannel
 from uavlinkd.ops.control import ControlServer
 from uavlinkd.ops.log import LogFile
-from uavlinkd.system.signals import on_signal
+from uavlinkd.system.tasks import on_signal
 
 LOG_DETAIL = 1000
 """Interventions of one attack and operation that have a line each."""

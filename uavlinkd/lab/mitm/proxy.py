@@ -124,7 +124,7 @@ class Proxy(ChannelService):
             if peer.address is not None:
                 try:
                     addresses = await asyncio.get_running_loop().getaddrinfo(
-                        *peer.address.sockaddr, type=socket.SOCK_DGRAM
+                        peer.address.host, peer.address.port, type=socket.SOCK_DGRAM
                     )
                 except OSError as error:
                     raise BindError(f"cannot resolve {peer.name} at {peer.address}: {error.strerror}") from None
