@@ -32,19 +32,12 @@ def split_by_class(frames: Sequence[Frame], class_of: ClassOf, now: float) -> li
     """Frames that are here together, by class, critical ones first. Within a class their order is kept."""
     if len(frames) == 1:
         return [(class_of(frames[0], now), frames)]
-    critical: list[Frame] = []
-    stream: list[Frame] = []
-    bulk: list[Frame] = []
+    parts: dict[Class, list[Frame]] = {cls: [] for cls in _TURNS}
     for frame in frames:
         kind = frame.header.kind
         cls = kind.cls if kind is not VALUE_KIND else class_of(frame, now)  # without a call for nearly all frames
-        if cls is Class.STREAM:
-            stream.append(frame)
-        elif cls is Class.CRITICAL:
-            critical.append(frame)
-        else:
-            bulk.append(frame)
-    return [(cls, part) for cls, part in zip(_TURNS, (critical, stream, bulk), strict=True) if part]
+        parts[cls].append(frame)
+    return [(cls, part) for cls, part in parts.items() if part]
 
 
 class PeerEgress:
