@@ -16,7 +16,7 @@ from tests.daemon.process import DaemonProcess
 from tests.mistakes.scene import WITHOUT_RIGHTS, Frames, Scene, checked, said_by_process
 from tests.needs import need
 from uavlinkd.config import keys
-from uavlinkd.config.pasted_keys import EXAMPLE_KEYS
+from uavlinkd.config.key_rules import EXAMPLE_KEYS
 from uavlinkd.lab.sim.loopback_ports import free_port
 
 ANOTHER_USER = 65534

@@ -5,30 +5,25 @@ A rule uses the valid values and ignores the others.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
 from itertools import combinations
-from typing import Any
 
-from uavlinkd.config import network_rules, pasted_keys, relay_rules
+from uavlinkd.config import key_rules, network_rules, relay_rules
 from uavlinkd.config.build import inherited, policy_data
 from uavlinkd.config.problems import Found, Sections, Values, unique
 from uavlinkd.config.schema import LinkSection
-from uavlinkd.endpoints.url import EndpointKind, EndpointUrl, NetworkUrl, SerialUrl
+from uavlinkd.endpoints.url import EndpointKind, EndpointUrl, NetworkUrl
 from uavlinkd.mavlink.policy.settings import PolicyError, read_settings
 from uavlinkd.system.addresses import Address, overlaps
 
 _RETRIES_BEFORE_REJECT = 2
-_OWN_KEY = "is this daemon's own key: write what `uavlinkd pubkey` prints on the {what}"
 
 
 def check(file: Sections) -> Found:
     """Yield every problem between the values of a file."""
     for sections in (file.endpoints, file.peers, file.members):
         yield from unique(sections, "name", "the name of {other} too: write another")
-    yield from _public_keys(file)
+    yield from key_rules.check(file)
     yield from relay_rules.members(file)
-    yield from pasted_keys.check(file)
-    yield from _previous_keys(file)
     yield from _reachability(file)
     yield from relay_rules.relays(file)
     yield from network_rules.networks(file)
@@ -39,47 +34,6 @@ def check(file: Sections) -> Found:
     for peer in file.peers:
         yield from _timers(peer, file.link)
         yield from _policy(peer, is_local=False)
-
-
-def _public_keys(file: Sections) -> Found:
-    """Each peer, member and relay has a key of its own, which is not this daemon's."""
-    private, own = file.secret(file.top, "private_key_file"), file.own_key()
-    for what, sections in (("peer", file.peers), ("member", file.members), ("relay", file.relays)):
-        yield from unique(sections, "public_key", f"the key of {{other}} too: each {what} has its own")
-        for section in sections:
-            key, psk = section.get("public_key"), file.secret(section, "psk_file")
-            if key is not None and key == own and not (private is not None and key == private.reveal()):
-                yield section.at("public_key"), _OWN_KEY.format(what=what)
-            if psk is not None and psk == private:
-                yield (
-                    section.at("psk_file"),
-                    "holds this daemon's private key, which must stay secret: make a PSK with `uavlinkd psk`",
-                )
-
-
-def _previous_keys(file: Sections) -> Found:
-    """Each previous key belongs to one daemon."""
-    own, previous = file.own_key(), file.own_key("previous_private_key_file")
-    if previous is not None and previous == own:
-        yield "previous_private_key_file", "holds the key of private_key_file: leave it out"
-    owners = {section.get("public_key"): section for section in file.others}
-    for section in file.others:
-        key = section.get("previous_public_key")
-        if previous is not None and section.get("public_key") == previous:
-            yield (
-                section.at("public_key"),
-                "is this daemon's own previous key: write what `uavlinkd pubkey` prints on the other daemon",
-            )
-        if key is None:
-            continue
-        place = section.at("previous_public_key")
-        if key in (own, previous):
-            yield place, "is this daemon's own key: write the other daemon's previous key, or leave it out"
-        elif key == section.get("public_key"):
-            yield place, "is its current key: leave it out"
-        elif key in owners:
-            yield place, f"is the key of {owners[key].at()}: write its own, or leave it out"
-    yield from unique(file.others, "previous_public_key", "the previous key of {other} too: write its own")
 
 
 def _reachability(file: Sections) -> Found:
@@ -140,8 +94,7 @@ _FEEDS = {(EndpointKind.UDPOUT, EndpointKind.UDPIN), (EndpointKind.TCP, Endpoint
 
 def _clash(a: EndpointUrl, b: EndpointUrl) -> str | None:
     if not isinstance(a, NetworkUrl) or not isinstance(b, NetworkUrl):
-        same = isinstance(a, SerialUrl) and isinstance(b, SerialUrl) and a.device == b.device
-        return "is the device of {other} too, and only one endpoint can open it: write it once" if same else None
+        return None
     if a.listens and a.kind is b.kind and overlaps(a.address, b.address):
         return "listens where {other} does: write another port"
     if a == b:
@@ -157,25 +110,27 @@ def _timers(section: Values, link: Values | None = None) -> Found:
     given = inherited(link, section) if link else section.valid
     values = {name: field.default for name, field in LinkSection.model_fields.items()} | given
     unknown = section.invalid | (link.invalid - set(section.valid) if link else frozenset())
-    for key, others, message in _disorder(values):
+    least = values["rekey_after_s"] + _RETRIES_BEFORE_REJECT * values["retry_max_s"]
+    for key, others, is_wrong, message in (
+        (
+            "max_age_s",
+            {"coalesce_s"},
+            values["coalesce_s"] >= values["max_age_s"],
+            f"must be more than coalesce_s ({values['coalesce_s']:g}): a frame that waits for others must not become"
+            " too old",
+        ),
+        (
+            "reject_after_s",
+            {"rekey_after_s", "retry_max_s"},
+            values["reject_after_s"] < least,
+            f"must be {least:g} or more, rekey_after_s and {_RETRIES_BEFORE_REJECT} times retry_max_s: the ends need"
+            " time to make new keys before they drop the old ones",
+        ),
+    ):
         involved = {key, *others}
         # A problem that a peer only inherits is reported once, for [link].
-        if not involved & unknown and (link is None or involved & set(section.valid)):
+        if is_wrong and not involved & unknown and (link is None or involved & set(section.valid)):
             yield section.at(key), message
-
-
-def _disorder(values: Mapping[str, Any]) -> Iterator[tuple[str, tuple[str, ...], str]]:
-    if values["coalesce_s"] >= values["max_age_s"]:
-        text = f"must be more than coalesce_s ({values['coalesce_s']:g}): a frame that waits for others must not"
-        yield "max_age_s", ("coalesce_s",), f"{text} become too old"
-    least = values["rekey_after_s"] + _RETRIES_BEFORE_REJECT * values["retry_max_s"]
-    if values["reject_after_s"] < least:
-        yield (
-            "reject_after_s",
-            ("rekey_after_s", "retry_max_s"),
-            f"must be {least:g} or more, rekey_after_s and {_RETRIES_BEFORE_REJECT} times retry_max_s: the ends"
-            " need time to make new keys before they drop the old ones",
-        )
 
 
 def _policy(section: Values, *, is_local: bool) -> Found:

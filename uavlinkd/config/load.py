@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from uavlinkd.config import checks, pasted_keys, schema
+from uavlinkd.config import checks, key_rules, schema
 from uavlinkd.config.advice import advice
 from uavlinkd.config.build import build
 from uavlinkd.config.keys import CREDENTIALS, KeyFileError, find_secret_file, read_secret_file
@@ -50,7 +50,7 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
         problems.add(place, message)
     problems.raise_any()
     config = build(path, file)
-    warnings = (*pasted_keys.advice(config.private_key.reveal(), file.others), *advice(config))
+    warnings = (*key_rules.advice(config.private_key.reveal(), file.others), *advice(config))
     return replace(config, warnings=warnings)
 
 

@@ -130,20 +130,12 @@ def _air_bits_s(section: Values, line: SerialUrl) -> int:
 
 def _devices(file: Sections) -> Found:
     """A device has one user: a network or an endpoint."""
-    users: dict[str, str] = {}
-    for endpoint in file.endpoints:
-        if isinstance(url := endpoint.get("url"), SerialUrl):
-            users.setdefault(url.device, endpoint.at())
-    for section in file.networks:
-        if (line := section.get("serial")) is None:
-            continue
-        if line.device in users:
-            yield (
-                section.at("serial"),
-                f"names {line.device}, the device of {users[line.device]} too, and only one can open it: write"
-                " another",
-            )
-        users.setdefault(line.device, section.at())
+    users: dict[str, Values] = {}
+    for section in (*file.endpoints, *file.networks):
+        key = "url" if section.kind == "endpoint" else "serial"
+        line = section.get(key)
+        if isinstance(line, SerialUrl) and (other := users.setdefault(line.device, section)) is not section:
+            yield section.at(key), f"is the device of {other.at()} too, and only one can open it: write another"
 
 
 def _other_ends(sections: Iterable[Values], serial: set[str], peers: Iterable[Values]) -> Found:

@@ -30,6 +30,11 @@ class Values(NamedTuple):
     valid: dict[str, Any]
     invalid: frozenset[str]
 
+    @property
+    def kind(self) -> str:
+        """``peer`` of ``peer[1]``."""
+        return self.section.partition("[")[0]
+
     def get(self, key: str, default: Any = None) -> Any:
         """The valid value of a key, else the default."""
         return self.valid.get(key, default)

@@ -7,6 +7,8 @@ configuration can have are repeated.
 from __future__ import annotations
 
 import re
+import tomllib
+from contextlib import suppress
 from pathlib import Path
 
 from uavlinkd.config.keys import decode_key
@@ -15,7 +17,8 @@ from uavlinkd.config.problems import example_of
 
 _AT = re.compile(r"(.*) \(at (?:line (\d+), column (\d+)|end of document)\)", re.DOTALL)
 _KEY = re.compile(r"""\s*["']?([A-Za-z0-9_-]{1,32})["']?(?![A-Za-z0-9_.'"+/-])""")
-_STATEMENT = re.compile(r"\s*[A-Za-z0-9_-]+\s*=")
+_MOST_LINES = 20
+"""A longer value without an end is reported where the parser notices it. Each line costs a parse."""
 _HINT = 'text is in straight quotation marks ("…"), true and false are in small letters, a comment begins with #'
 _ONCE = "write a key once in its section, and for another peer or endpoint [[peer]] or [[endpoint]] above its keys"
 
@@ -28,10 +31,10 @@ def syntax_problem(path: Path, text: str, error: Exception) -> Problem:
     if match is None:
         return Problem(str(path), "", "is not TOML that can be read: a number too long, or brackets too deep")
     lines = text.split("\n")
-    line, column = (int(match[2]), int(match[3])) if match[2] else (_start_of_text(lines), 1)
+    line, column = (int(match[2]), int(match[3])) if match[2] else (len(lines), 1)
     # The reason without the names that it quotes, as in "Cannot declare ('a', 'b') twice".
     reason = re.sub(r"\s*(\(.*\)|'.{3,}'|\".*\")", "", match[1])
-    if (start := _start_of_value(lines, line, column)) != line:
+    if (start := _start_of_value(lines, line)) != line:
         line, column, reason = start, 1, f"{reason}: its value has no end"
     key = found[1] if (found := _KEY.match(lines[line - 1])) and example_of(found[1]) else ""
     if "twice" in reason or "verwrite" in reason or "Duplicate" in reason:
@@ -48,26 +51,16 @@ def at(path: Path, line: int, column: int, message: str, key: str = "") -> Probl
     return Problem(f"{path}:{line}:{column}", key, message)
 
 
-def _start_of_value(lines: list[str], line: int, column: int) -> int:
-    """The line of the key whose list has no end: the parser notices that at the next statement. Else ``line``."""
-    text = lines[line - 1].lstrip()
-    first = len(lines[line - 1]) - len(text) + 1
-    is_next = (column == first and (_STATEMENT.match(text) or not text)) or (column <= first + 2 and text[:1] == "[")
-    for number in range(line - 1, 0, -1) if is_next else ():
-        if lines[number - 1].strip():
-            if _STATEMENT.match(lines[number - 1]) and lines[number - 1].count("[") > lines[number - 1].count("]"):
-                return number
-            if lines[number - 1].lstrip().startswith("["):
-                break
-    return line
+def _start_of_value(lines: list[str], line: int) -> int:
+    """The line of the key whose value has no end, which the parser notices later; else ``line``.
 
-
-def _start_of_text(lines: list[str]) -> int:
-    """The line of the first text without an end, which the parser notices at the end of the file; else the last."""
-    for number, line in enumerate(lines, 1):
-        if _STATEMENT.match(line) and any(line.partition("#")[0].count(mark) % 2 for mark in ("'", '"""')):
+    Before the statement with the error, the text is valid.
+    """
+    for number in range(line, max(line - _MOST_LINES, 0), -1):
+        with suppress(ValueError, RecursionError):
+            tomllib.loads("\n".join([*lines[: number - 1], ""]))
             return number
-    return len(lines)
+    return line
 
 
 def _foreign_file(text: str) -> str | None:

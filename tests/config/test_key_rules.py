@@ -11,7 +11,7 @@ import pytest
 
 from tests.config.files import GOOD, KEY, OTHER_PEER, load, member, refused, relay
 from uavlinkd.config import keys
-from uavlinkd.config.pasted_keys import EXAMPLE_KEYS
+from uavlinkd.config.key_rules import EXAMPLE_KEYS
 
 ROOT = Path(__file__).parents[2]
 _SHOWN = re.compile(r"[A-Za-z0-9+/]{43}=")
@@ -92,4 +92,4 @@ def test_private_key_of_another_peer(tmp_path: Path) -> None:
     """Its public half is the key of another peer."""
     private = keys.generate_private_key()
     other = OTHER_PEER.replace(KEY["b"], keys.public_key_text(private))
-    assert 'is the private key of peer "drone2"' in _problem(tmp_path, private, other)
+    assert "is the private key of peer[1] (drone2)" in _problem(tmp_path, private, other)

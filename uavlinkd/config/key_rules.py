@@ -1,0 +1,125 @@
+"""Rules about keys: each is in its place and belongs to one daemon. People paste private keys, and keys of examples.
+
+No message repeats a key. A private key in a configuration is exposed, because that file is shown, copied and sent:
+the remedy is always a new key.
+"""
+
+from __future__ import annotations
+
+import stat
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
+from pathlib import Path
+
+from uavlinkd.config.keys import KEY_TEXT_LENGTH, decode_key, encode_key, looks_private
+from uavlinkd.config.problems import Found, Sections, Values, unique
+from uavlinkd.core.crypto import x25519_public_key
+
+EXAMPLE_KEYS = frozenset(
+    {
+        "+GGI0JkL0+3mJYG9RxFCI7crgfpQ7epbNx8UmBAYcGQ=",
+        "Is+OSCKTa6Id2wymhOZXYuDCPcfLOHGwnYi5Ai117ls=",
+        "Ya1BcyCMNCoxhVU/dI5z9wlfOD9PHricYw/gaSC3swU=",
+        "eZPBKM+9Oztdms1v2yiR+byync+zZsR87etuOX4heHE=",
+    }
+)
+"""The public keys in README.md and configs/. Their private keys do not exist. A test compares this list with them."""
+_MAX_FILES = 512
+_THERE = "write what `uavlinkd pubkey` prints on the {}"
+_EXPOSED = "it is exposed: make a new one there with `uavlinkd keygen`, and write here the public key that it prints"
+
+
+def check(file: Sections) -> Found:
+    """Yield a problem for each key that is in the wrong place, or belongs to two daemons."""
+    previous = file.own_key("previous_private_key_file")
+    if previous is not None and previous == file.own_key():
+        yield "previous_private_key_file", "holds the key of private_key_file: leave it out"
+    for what, sections in (("peer", file.peers), ("member", file.members), ("relay", file.relays)):
+        yield from unique(sections, "public_key", f"the key of {{other}} too: each {what} has its own")
+    yield from unique(file.others, "previous_public_key", "the previous key of {other} too: write its own")
+    yield from _public_keys(file)
+    yield from _previous_keys(file)
+
+
+def _public_keys(file: Sections) -> Found:
+    """No secret key is written as a public one, and no key of this daemon as another's."""
+    private, own = file.secret(file.top, "private_key_file"), file.own_key()
+    previous, files = file.own_key("previous_private_key_file"), _key_files(file.folder)
+    owners = {section.get("public_key"): section.at() for section in file.others}
+    psks = {psk.reveal() for section in file.others if (psk := file.secret(section, "psk_file"))}
+    for section in file.others:
+        if private is not None and file.secret(section, "psk_file") == private:
+            text = "holds this daemon's private key, which must stay secret: make a PSK with `uavlinkd psk`"
+            yield section.at("psk_file"), text
+        if (key := section.get("public_key")) is None:
+            continue
+        half, there = x25519_public_key(key), _THERE.format(section.kind)
+        if private is not None and key == private.reveal() and not looks_private(key):
+            text = f"holds the public key of {section.at()}, not a private key: make this daemon's own with"
+            yield "private_key_file", f"{text} `uavlinkd keygen`"
+        elif key in (own, previous):
+            yield section.at("public_key"), f"is this daemon's own {'' if key == own else 'previous '}key: {there}"
+        elif half == own:
+            remedy = f"move its file away, make a new one with `uavlinkd keygen`, and {there}"
+            yield section.at("public_key"), f"is this daemon's private key, which must stay secret: {remedy}"
+        elif key in psks:
+            text = f"is a PSK, which must stay secret: make a new PSK with `uavlinkd psk`, and {there}"
+            yield section.at("public_key"), text
+        elif half in owners or key in files:
+            what = f"private key of {owners[half]}" if half in owners else f"secret key in {files[key]}"
+            yield section.at("public_key"), f"is the {what}, which must stay secret; {_EXPOSED}"
+
+
+def _previous_keys(file: Sections) -> Found:
+    """A previous key is another one than all current keys."""
+    own = (file.own_key(), file.own_key("previous_private_key_file"))
+    owners = {section.get("public_key"): section.at() for section in file.others}
+    for section in file.others:
+        place, key = section.at("previous_public_key"), section.get("previous_public_key")
+        if key is None:
+            continue
+        if key in own:
+            yield place, "is this daemon's own key: write the other daemon's previous key, or leave it out"
+        elif key == section.get("public_key"):
+            yield place, "is its current key: leave it out"
+        elif key in owners:
+            yield place, f"is the key of {owners[key]}: write its own, or leave it out"
+
+
+def _key_files(folder: Path) -> Mapping[bytes, str]:
+    """The keys in the small files of a folder, with the names of the files. In ``.pub`` people keep public keys."""
+    keys: dict[bytes, str] = {}
+    with suppress(OSError):
+        for number, path in enumerate(folder.iterdir()):
+            if number == _MAX_FILES:
+                break
+            with suppress(OSError, ValueError):
+                status = path.lstat()
+                if stat.S_ISREG(status.st_mode) and KEY_TEXT_LENGTH <= status.st_size <= KEY_TEXT_LENGTH + 4:
+                    key = decode_key(path.read_text(encoding="ascii"))
+                    if path.suffix != ".pub" or looks_private(key):
+                        keys[key] = path.name
+    return keys
+
+
+def advice(private: bytes, owners: Iterable[Values]) -> Iterator[str]:
+    """Yield a warning for each key that is probably in the wrong place. ``owners``: the sections with public keys."""
+    if not looks_private(private):
+        yield (
+            "private_key_file holds a key without the form of a private key, perhaps a public key: make one with"
+            " `uavlinkd keygen`, unless software other than `uavlinkd` and `wg` made it"
+        )
+    for owner in owners:
+        key, what = owner.valid["public_key"], owner.kind
+        name = f'{what} "{owner.valid["name"]}": public_key'
+        if encode_key(key) in EXAMPLE_KEYS:
+            yield (
+                f"{name} is the key of an example, whose private key does not exist: write what `uavlinkd keygen` or"
+                f" `uavlinkd pubkey` printed on the {what}"
+            )
+        elif looks_private(key):
+            yield (
+                f"{name} has the form of a private key. `uavlinkd keygen` makes no such public key, `wg` one of 16:"
+                f" compare it with what `uavlinkd pubkey FILE` prints on the {what}. If it is its private key,"
+                f" {_EXPOSED}"
+            )
