@@ -17,6 +17,8 @@ _ERRORS = [
     ('listen = ["0.0.0.0:5790"\nname = "a"', 1, "listen", 'value has no end: write listen = ["0.0'),
     ('listen = [\n  "0.0.0.0:5790",\n\nname = "a"', 1, "listen", "value has no end"),
     ("[[peer]]\nsystem_ids = [1, 2\n[[peer]]", 2, "system_ids", "value has no end: write system_ids = [2]"),
+    ('listen = [\n  "0.0.0.0:5790",\n  x\n]', 3, "", "Invalid value"),
+    ("[link]\ntag_bits = 96\n// a comment", 3, "", "a comment begins with #"),
     ("confidential = True", 1, "confidential", "write confidential = true"),
     ("keepalive_s = 10s", 1, "keepalive_s", "write keepalive_s = 10"),
     ("[[peer]]\nname = 'a'\n\nname = 'b'", 4, "name", "[[peer]] or [[endpoint]] above"),

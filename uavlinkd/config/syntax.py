@@ -17,6 +17,8 @@ from uavlinkd.config.problems import example_of
 
 _AT = re.compile(r"(.*) \(at (?:line (\d+), column (\d+)|end of document)\)", re.DOTALL)
 _KEY = re.compile(r"""\s*["']?([A-Za-z0-9_-]{1,32})["']?(?![A-Za-z0-9_.'"+/-])""")
+_NEXT = re.compile(r"\s*(?:$|\[|[A-Za-z0-9_-]+\s*=)")
+"""The end of the file, a section, or a key."""
 _MOST_LINES = 20
 """A longer value without an end is reported where the parser notices it. Each line costs a parse."""
 _HINT = 'text is in straight quotation marks ("…"), true and false are in small letters, a comment begins with #'
@@ -52,11 +54,11 @@ def at(path: Path, line: int, column: int, message: str, key: str = "") -> Probl
 
 
 def _start_of_value(lines: list[str], line: int) -> int:
-    """The line of the key whose value has no end, which the parser notices later; else ``line``.
+    """The line of the key whose value has no end, which the parser notices at the next statement; else ``line``.
 
-    Before the statement with the error, the text is valid.
+    The text before that key is valid.
     """
-    for number in range(line, max(line - _MOST_LINES, 0), -1):
+    for number in range(line, max(line - _MOST_LINES, 0), -1) if _NEXT.match(lines[line - 1]) else ():
         with suppress(ValueError, RecursionError):
             tomllib.loads("\n".join([*lines[: number - 1], ""]))
             return number
