@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from uavlinkd.fleet.manifest import FleetSettings, check_settings
-from uavlinkd.fleet.plan import AddressPlan, FleetError, fill
+from uavlinkd.fleet.plan import FleetError, fill, planned_address
 
 
 @pytest.mark.parametrize(
@@ -31,7 +31,7 @@ def test_anything_else_in_braces_is_refused(template: str) -> None:
     with pytest.raises(FleetError, match=r"\{n\} and \{name\}"):
         fill(template, 7, "scout")
     with pytest.raises(FleetError, match="address plan"):
-        AddressPlan.parse(f"{{name}}{template}:5790")
+        planned_address(f"{{name}}{template}:5790", "scout", 7, is_drone=True)
     for key in ("control_socket", "drone_url", "ground_station_url"):
         settings: dict[str, str] = {key: f"/run/{template}"}
         with pytest.raises(FleetError, match=f"--{key.replace('_', '-')}"):

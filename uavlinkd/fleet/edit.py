@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence, Set
 from typing import Any
 
 from uavlinkd.fleet.files import CONFIDENTIAL, key_lines, public_key_lines
@@ -63,9 +63,8 @@ def set_private_keys(text: str, member: Member) -> str:
     return _set_lines(text, 0, lambda table: table, keys, key_lines(member))
 
 
-def section_with_key(text: str, public_keys: Iterable[str]) -> str | None:
+def section_with_key(text: str, public_keys: Set[str | None]) -> str | None:
     """The section that contains one of these keys, as current or previous key; None without one."""
-    unwanted = set(public_keys)
     try:
         table = tomllib.loads(text)
     except ValueError:  # a daemon would refuse the file
@@ -74,7 +73,7 @@ def section_with_key(text: str, public_keys: Iterable[str]) -> str | None:
         peers = table.get(kind, [])
         for number, peer in enumerate(peers if isinstance(peers, list) else []):
             # A daemon ignores spaces around a key.
-            if isinstance(peer, dict) and unwanted & {str(peer.get(key)).strip() for key in _PUBLIC}:
+            if isinstance(peer, dict) and public_keys & {str(peer.get(key)).strip() for key in _PUBLIC}:
                 return f"{kind}[{number}] ({peer.get('name')})"
     return None
 

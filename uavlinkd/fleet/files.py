@@ -3,17 +3,10 @@
 from __future__ import annotations
 
 from uavlinkd.fleet.manifest import ROLES, Fleet, Member, MemberKind, literal
-from uavlinkd.fleet.plan import listen_address
-from uavlinkd.system.addresses import Address
+from uavlinkd.fleet.plan import fill
 
 CONFIDENTIAL = "confidential = true"
 """In ``[link]`` of a fleet with relays: otherwise their owners could read the frames."""
-_DESCRIPTIONS = {
-    MemberKind.DRONE: "a drone",
-    MemberKind.GROUND_STATION: "a ground station",
-    MemberKind.OBSERVER: "an observer",
-    MemberKind.RELAY: "a relay",
-}
 
 
 def config_file(member: Member) -> str:
@@ -38,16 +31,17 @@ def psk_file(other: Member) -> str:
 
 def write_config(fleet: Fleet, member: Member) -> str:
     """The text of a member's configuration."""
-    settings = fleet.settings
+    settings, kind = fleet.settings, member.kind.value.replace("-", " ")
+    url = settings.drone_url if member.is_drone else settings.ground_station_url
     numbered = "" if member.is_relay else f" with MAVLink system id {member.system_id}"
     lines = [
-        f"# {member.name}, {_DESCRIPTIONS[member.kind]}{numbered}.",
+        f"# {member.name}, {'an' if kind == 'observer' else 'a'} {kind}{numbered}.",
         "# Written by `uavlinkd fleet`. Later commands change keys and peers, and keep your other edits.",
         "",
         f"name = {literal(member.name)}",
         *key_lines(member),
         f"listen = {literal(_listen(member))}",
-        f"control_socket = {literal(settings.control_socket_of(member))}",
+        f"control_socket = {literal(fill(settings.control_socket, member.system_id, member.name))}",
         "",
         "[link]",
         f"suites = {literal([settings.suite])}",
@@ -59,7 +53,7 @@ def write_config(fleet: Fleet, member: Member) -> str:
             "",
             "[[endpoint]]",
             f"name = {literal('autopilot' if member.is_drone else 'ground-control')}",
-            f"url = {literal(settings.url_of(member))}",
+            f"url = {literal(fill(url, member.system_id, member.name))}",
             f"system_ids = [{member.system_id}]",
         ]
     if member.kind is MemberKind.OBSERVER:
@@ -69,12 +63,14 @@ def write_config(fleet: Fleet, member: Member) -> str:
 
 
 def _listen(member: Member) -> list[str]:
-    if member.address is None:
+    if (address := member.address) is None:
         return []
-    address = listen_address(member.address)
-    if member.is_relay and address.is_wildcard:  # members may have either family
-        return [f"0.0.0.0:{address.port}", f"[::]:{address.port}"]
-    return [str(address)]
+    if address.ip is not None and address.is_loopback:
+        return [str(address)]
+    both = [f"0.0.0.0:{address.port}", f"[::]:{address.port}"]
+    if member.is_relay:  # members may have either family
+        return both
+    return both[1:] if address.ip is not None and address.ip.version == 6 else both[:1]
 
 
 def key_lines(member: Member) -> list[str]:
@@ -88,10 +84,9 @@ def key_lines(member: Member) -> list[str]:
 def peer_section(fleet: Fleet, member: Member, peer: Member) -> str:
     """The section about another member: ``[[peer]]``, ``[[relay]]`` or ``[[member]]``."""
     kind = member.section_of(peer)
-    addresses: list[Address] = [] if peer.address is None or kind == "member" else [peer.address]
     lines = [f"[[{kind}]]", f"name = {literal(peer.name)}", *public_key_lines(peer)]
-    if addresses:
-        lines.append(f"addresses = {literal([str(address) for address in addresses])}")
+    if peer.address is not None and kind != "member":
+        lines.append(f"addresses = {literal([str(peer.address)])}")
     if fleet.settings.psk:
         lines.append(f"psk_file = {literal(psk_file(peer))}")
     if kind == "peer":

@@ -21,11 +21,11 @@ from uavlinkd.fleet.plan import (
     DEFAULT_PLAN,
     NO_PLAN,
     SYSTEM_IDS,
-    AddressPlan,
     FleetError,
     FleetFileError,
     fill,
     no_fleet,
+    planned_address,
 )
 from uavlinkd.system.addresses import Address, AddressError, parse_address
 from uavlinkd.system.terminal import printable
@@ -74,11 +74,6 @@ class Member:
     previous_public_key: str | None = None
 
     @property
-    def public_keys(self) -> tuple[str, ...]:
-        """The keys by which others accept it now."""
-        return (self.public_key,) if self.previous_public_key is None else (self.public_key, self.previous_public_key)
-
-    @property
     def is_drone(self) -> bool:
         """Whether it is a drone."""
         return self.kind is MemberKind.DRONE
@@ -106,14 +101,6 @@ class FleetSettings:
     control_socket: str = "{name}.sock"
     drone_url: str = "udpin:127.0.0.1:14550"
     ground_station_url: str = "udpout:127.0.0.1:14550"
-
-    def url_of(self, member: Member) -> str:
-        """The URL of a member's endpoint."""
-        return fill(self.drone_url if member.is_drone else self.ground_station_url, member.system_id, member.name)
-
-    def control_socket_of(self, member: Member) -> str:
-        """The control socket of a member's daemon."""
-        return fill(self.control_socket, member.system_id, member.name)
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,10 +147,6 @@ class Fleet:
         by_name = {other.name: other for other in self.members} | {member.name: member}
         return Fleet(self.settings, tuple(by_name.values()))
 
-    def without(self, name: str) -> Fleet:
-        """Remove a member."""
-        return Fleet(self.settings, tuple(member for member in self.members if member.name != name))
-
     def new_member(
         self,
         name: str,
@@ -196,8 +179,7 @@ class Fleet:
         if number is None or number not in SYSTEM_IDS:
             raise FleetError("a system id is a number from 1 to 255, and each member has its own")
         if kind is not MemberKind.OBSERVER and address is None and self.settings.address_plan != NO_PLAN:
-            plan = AddressPlan.parse(self.settings.address_plan)
-            address = plan.address_of(name, number, is_drone=kind is MemberKind.DRONE)
+            address = planned_address(self.settings.address_plan, name, number, is_drone=kind is MemberKind.DRONE)
         return Member(name, kind, number, public_key, address)
 
 
@@ -265,7 +247,7 @@ def check_settings(settings: FleetSettings) -> None:
     if settings.suite not in SUITES_BY_NAME:
         raise FleetError(f'the suite "{settings.suite}" does not exist: use one of {", ".join(SUITES_BY_NAME)}')
     if settings.address_plan != NO_PLAN:
-        AddressPlan.parse(settings.address_plan)
+        planned_address(settings.address_plan, "drone1", 1, is_drone=True)
     for key in _TEMPLATES:
         template = getattr(settings, key)
         try:
@@ -286,10 +268,8 @@ def _member(section: dict[str, Any]) -> Member:
         )
     except AddressError as error:
         raise FleetError(str(error)) from None
-    is_numbered = (
-        member.system_id == 0 and member.address is not None if member.is_relay else (member.system_id in SYSTEM_IDS)
-    )
-    if not (_NAME.fullmatch(member.name) and is_numbered):
+    has_number = member.system_id == 0 if member.is_relay else member.system_id in SYSTEM_IDS
+    if not (_NAME.fullmatch(member.name) and has_number and (member.address or not member.is_relay)):
         raise ValueError("not a member")
     for key in (member.public_key, member.previous_public_key):
         if key is not None:

@@ -115,12 +115,12 @@ def remove(folder: Path, name: str) -> Result:
     """
     with _open_fleet(folder) as before:
         member = before.member(name)
-        changes = FileChanges(folder, before.without(name))
+        changes = FileChanges(folder, replace(before, members=tuple(one for one in before.members if one != member)))
         peers = before.peers_of(member)
         for peer in peers:
             _edit(changes, peer, partial(edit.set_section, kind=peer.section_of(member), name=name))
             changes.deleted.append(folder / peer.name / files.psk_file(member))
-        _check_unused(changes, name, member.public_keys)
+        _check_unused(changes, member)
         apply(changes)
     return _result(changes, *peers)
 
@@ -168,7 +168,7 @@ def rotate(folder: Path, name: str, *, at_once: bool = False) -> Result:
             for peer in peers if before.settings.psk else ():
                 changes.deleted += [folder / peer.name / files.psk_file(member), folder / name / files.psk_file(peer)]
             _add_psks(changes, ((member, peer) for peer in peers))
-            _check_unused(changes, name, old.public_keys)
+            _check_unused(changes, old)
         apply(changes)
     return _result(changes, member, *peers)
 
@@ -254,8 +254,8 @@ def _edit(changes: FileChanges, member: Member, change: Callable[[str], str]) ->
         raise FleetError(f"{path}: {error}") from None
 
 
-def _check_unused(changes: FileChanges, name: str, public_keys: Iterable[str]) -> None:
-    """Check that no member's configuration contains one of these keys, under any peer's name.
+def _check_unused(changes: FileChanges, former: Member) -> None:
+    """Check that no member's configuration contains a key of a former member, under any peer's name.
 
     Raises:
         FleetError: one does; with the file and the section.
@@ -266,9 +266,9 @@ def _check_unused(changes: FileChanges, name: str, public_keys: Iterable[str]) -
             text = changes.texts[path] if path in changes.texts else path.read_text(encoding="utf-8")
         except (OSError, ValueError):  # on its vehicle only, or not text
             continue
-        if (section := edit.section_with_key(text, public_keys)) is not None:
+        if section := edit.section_with_key(text, {former.public_key, former.previous_public_key}):
             raise FleetError(
-                f"{path}: {section} has a key of {name}, which would stay valid: delete it from that file first"
+                f"{path}: {section} has a key of {former.name}, which would stay valid: delete it from that file first"
             )
 
 
