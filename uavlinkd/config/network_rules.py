@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Final
 
 from uavlinkd.config.model import NetworkConfig, PeerAddress
@@ -33,8 +33,6 @@ def networks(file: Sections) -> Found:
         yield from unique(sections, key, f"the {key} of {{other}} too: write another, or remove one network")
     for section in sections:
         yield from _exit(section)
-        if (line := section.get("serial")) is not None:
-            yield from _serial(section, line)
     yield from _devices(file)
     if any({"interface", "address"} & _exits(section) for section in sections):
         yield from _listen(file.top)
@@ -46,15 +44,38 @@ def networks(file: Sections) -> Found:
     yield from _other_ends(sections, serial, peers)
     for peer in peers:
         for written in peer.get("addresses", ()):
-            message = None
-            if written.is_serial or written.network in serial:
-                message = _wrong_serial(written, serial)
-            elif written.network and written.network not in known:
-                message = f"names a network for {written.address} that this file does not have: {_known(known)}"
-            elif configs and not any(used_networks(configs, written)):
-                message = f"names {written}, which no network can reach: {_why(written)}"
-            if message:
+            if message := _wrong(written, known, serial, configs):
                 yield peer.at("addresses"), message
+
+
+def _wrong(written: PeerAddress, known: set[str], serial: set[str], configs: Sequence[NetworkConfig]) -> str | None:
+    """What is wrong with an address of a peer, if the networks cannot have it."""
+    if written.is_serial and written.network not in serial:
+        names = " or ".join(f'"{name}"' for name in sorted(serial))
+        return (
+            f'names "{written.network}" without an address, which only a serial network may have: write'
+            f' {{ address = "10.13.0.2:5790", network = "{written.network}" }}'
+            + (f", or the serial network {names}" if names else "")
+        )
+    if written.network in serial and not written.is_serial:
+        return (
+            f'names {written.address} on "{written.network}", a serial network, which has no addresses: write'
+            f' {{ network = "{written.network}" }}'
+        )
+    if written.network and written.network not in known:
+        names = ", ".join(f'"{name}"' for name in sorted(known))
+        remedy = f"write one of {names}" if names else "add a [[network]] of that name, or write the address alone"
+        return f"names a network for {written.address} that this file does not have: {remedy}"
+    if written.is_serial or not configs or any(used_networks(configs, written)):
+        return None
+    family = f"no address of {_FAMILIES.get(written.address.family)}"
+    if zone := written.address.host.partition("%")[2]:
+        reason = f"it is valid on the interface {zone} only; write that network"
+    elif written.network:
+        reason = f"that network has {family}; write another address, or a network with an interface"
+    else:
+        reason = f"the networks of this file have {family}; write another address, or a network with an interface"
+    return f"names {written}, which no network can reach: {reason}"
 
 
 def network_of(section: Values) -> NetworkConfig:
@@ -82,8 +103,8 @@ def _exits(section: Values) -> set[str]:
 
 
 def _exit(section: Values) -> Found:
-    """A network has one exit."""
-    written = _exits(section)
+    """A network has one exit. A serial one has a rate that its line carries."""
+    written, line = _exits(section), section.get("serial")
     if len(written) != 1:
         yield (
             section.at(next((key for key in ("serial", "address") if key in written), "interface")),
@@ -91,22 +112,15 @@ def _exit(section: Values) -> Found:
             ' interface = "wwan0", address = "10.0.0.5" with an address of this machine, or'
             ' serial = "/dev/ttyUSB0:57600"',
         )
-    if "serial" not in written and "air_bits_s" in section.valid:
-        yield (
-            section.at("air_bits_s"),
-            'is for a radio behind a serial device: write serial = "/dev/ttyUSB0:57600" too, or budget_bits_s'
-            " instead",
-        )
-
-
-def _serial(section: Values, line: SerialUrl) -> Found:
-    """A serial network has a rate that its line carries."""
-    if section.get("metered"):
-        yield section.at("metered"), "is for networks that cost money, and this is a serial line: leave it out"
-    if section.get("budget_bits_s"):
-        text = f"does not go with serial: write air_bits_s, of which this end sends {SENDING_SHARE:.0%}"
-        yield section.at("budget_bits_s"), text
-    if "air_bits_s" in section.invalid:
+    needs_serial = 'is for a radio behind a serial device: write serial = "/dev/ttyUSB0:57600" too, or budget_bits_s'
+    for key, is_wrong, text in (
+        ("metered", line, "is for networks that cost money, and this is a serial line: leave it out"),
+        ("budget_bits_s", line, f"does not go with serial: write air_bits_s ({SENDING_SHARE:.0%} is this end's)"),
+        ("air_bits_s", "serial" not in written, f"{needs_serial} instead"),
+    ):
+        if is_wrong and section.get(key):
+            yield section.at(key), text
+    if line is None or "air_bits_s" in section.invalid:
         return
     if not (air := _air_bits_s(section, line)):
         yield (
@@ -138,42 +152,22 @@ def _devices(file: Sections) -> Found:
             yield section.at(key), f"is the device of {other.at()} too, and only one can open it: write another"
 
 
-def _other_ends(sections: Iterable[Values], serial: set[str], peers: Iterable[Values]) -> Found:
+def _other_ends(sections: Iterable[Values], serial: set[str], peers: Sequence[Values]) -> Found:
     """Each serial network has one peer, which names it without an address."""
     users: dict[str, Values] = {}
-    complete = True
     for peer in peers:
-        complete &= "addresses" not in peer.invalid
         for written in peer.get("addresses", ()):
-            if not written.is_serial or written.network not in serial:
-                continue
-            other = users.setdefault(written.network, peer)
-            if other is not peer:
+            is_end = written.is_serial and written.network in serial
+            if is_end and users.setdefault(written.network, peer) is not peer:
                 yield (
                     peer.at("addresses"),
-                    f'names the serial network "{written.network}", whose other end is {other.at()}: a line has one'
-                    " peer; write it for one of them",
+                    f'names the serial network "{written.network}", whose other end is {users[written.network].at()}:'
+                    " a line has one peer; write it for one of them",
                 )
-    for section in sections if complete else ():
+    for section in sections if not any("addresses" in peer.invalid for peer in peers) else ():
         if (name := section.valid["name"]) in serial - set(users):
             text = f'has no peer at its other end: write addresses = [{{ network = "{name}" }}] in its [[peer]]'
             yield section.at("serial"), text
-
-
-def _wrong_serial(written: PeerAddress, serial: set[str]) -> str | None:
-    if written.is_serial and written.network not in serial:
-        names = " or ".join(f'"{name}"' for name in sorted(serial))
-        return (
-            f'names "{written.network}" without an address, which only a serial network may have: write'
-            f' {{ address = "10.13.0.2:5790", network = "{written.network}" }}'
-            + (f", or the serial network {names}" if names else "")
-        )
-    if written.network in serial and not written.is_serial:
-        return (
-            f'names {written.address} on "{written.network}", a serial network, which has no addresses: write'
-            f' {{ network = "{written.network}" }}'
-        )
-    return None
 
 
 def _listen(top: Values) -> Found:
@@ -199,16 +193,3 @@ def _may_reach(network: NetworkConfig, address: Address) -> bool:
     if address.family != socket.AF_UNSPEC and address.family not in network.families:
         return False
     return not zone or zone.isdigit() or network.interface in (None, zone)
-
-
-def _known(known: Iterable[str]) -> str:
-    names = ", ".join(f'"{name}"' for name in sorted(known))
-    return f"write one of {names}" if names else "add a [[network]] of that name, or write the address alone"
-
-
-def _why(written: PeerAddress) -> str:
-    if zone := written.address.host.partition("%")[2]:
-        return f"it is valid on the interface {zone} only; write that network"
-    which = "that network has" if written.network else "the networks of this file have"
-    family = _FAMILIES[written.address.family]
-    return f"{which} no address of {family}; write another address, or a network with an interface"

@@ -268,7 +268,7 @@ def _check_unused(changes: FileChanges, former: Member) -> None:
             continue
         if section := edit.section_with_key(text, {former.public_key, former.previous_public_key}):
             raise FleetError(
-                f"{path}: {section} has a key of {former.name}, which would stay valid: delete it from that file first"
+                f"{path}: {section} has a key of {former.name}, which would stay valid: delete it there first"
             )
 
 
