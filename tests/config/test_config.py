@@ -377,8 +377,8 @@ _WARNED = [
     (HEAD + PEER, r"no \[\[endpoint\]\]"),
     (HEAD + PEER + "[routing]\nrelay = true\n", r"no \[\[endpoint\]\]"),
     (HEAD + ENDPOINT, r"no \[\[peer\]\]"),
-    (GOOD + "tag_bits = 64\n", "tags of 64 bits with drone1"),
-    (link("tag_bits = 64") + OTHER_PEER, "with every peer:"),
+    (GOOD + "tag_bits = 64\n", '^peer "drone1": tags of 64 bits'),
+    (link("tag_bits = 64") + OTHER_PEER, "^every peer: tags of 64 bits"),
     (GOOD + "max_envelope_bytes = 1453\n", "envelopes over 1,452 bytes"),
     (GOOD + "suites = ['mlkem768']\n", r"mlkem768.*1,3\d\d bytes.*1,280"),
     (GOOD + "suites = ['x25519', 'mlkem1024']\n", r"mlkem1024.*1,7\d\d bytes.*fragments"),
@@ -390,7 +390,7 @@ _WARNED = [
     (GOOD.replace("0.0.0.0", "127.0.0.1"), "neither reaches the other"),
     (_TWO + 'addresses = ["10.13.0.2:5790"]\n', "share the address 10.13.0.2:5790"),
     (f'{GOOD}psk_file = "pair.psk"\n{OTHER_PEER}psk_file = "pair.psk"\n', "have the same PSK"),
-    (_TWO.replace("swarm-member", "all"), r'^peer "drone1", peer "drone2": role = "all": it may send every message'),
+    (_TWO.replace("swarm-member", "all"), r'^every peer: role = "all": it may send every message'),
     (GOOD.replace("[2]", '["all"]'), r'^peer "drone1": system_ids is "all"'),
     (GOOD.replace("[[peer]]", 'system_ids = "all"\n[[peer]]'), r'^endpoint "autopilot": system_ids is "all"'),
     (GOOD + f'allow_in = ["commands", "files"]\n{_PLAN}', r'^peer "drone1": deny_in.*FILE_TRANSFER_PROTOCOL'),
@@ -407,7 +407,7 @@ _WARNED = [
         _TWO.replace("swarm-member", "vehicle") + "[routing]\nrelay = true\n",
         r'relay = true.*"drone1", "drone2".*writes to another vehicle.*accept only the operator.s system_ids$',
     ),
-    (relays(relay()).replace("confidential = true", ""), "cannot alter their frames, but can read them"),
+    (relays(relay()).replace("confidential = true", ""), "its owner cannot alter the frames, but can read them"),
 ]
 
 

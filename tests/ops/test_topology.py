@@ -60,7 +60,7 @@ def test_open_endpoint_is_marked(tmp_path: Path) -> None:
     printed = _printed(load(tmp_path, _FILE))
     assert _line(printed, "autopilot").endswith("this machine")
     assert _line(printed, "tablet").endswith("THE NETWORK")
-    assert 'warning: endpoint "tablet" listens beyond loopback' in printed
+    assert 'warning: endpoint "tablet": it listens beyond loopback' in printed
     assert "No warnings" not in printed
 
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import combinations
 from math import ceil
 
 from uavlinkd.config.model import Config, EndpointConfig, PeerAddress, PeerConfig, Routing
 from uavlinkd.core import constants as c
-from uavlinkd.core.settings import Link
 from uavlinkd.core.wire import initiation_bytes, response_bytes
 from uavlinkd.endpoints.url import EndpointKind, NetworkUrl
 from uavlinkd.mavlink.policy.settings import read_settings
@@ -25,15 +24,21 @@ _SHORT_TAG_BYTES = 8
 def advice(config: Config) -> Iterator[str]:
     """Yield the warnings, those about safety first."""
     endpoints, peers = config.endpoints, config.peers
-    yield from _policies(endpoints, peers)
+    every = [f'peer "{peer.name}"' for peer in peers]
+    about: dict[str, list[str]] = {}
+    for peer in peers:
+        for warning in _of_peer(peer):
+            about.setdefault(warning, []).append(f'peer "{peer.name}"')
+    for endpoint in endpoints:
+        for warning in _of_endpoint(endpoint):
+            about.setdefault(warning, []).append(f'endpoint "{endpoint.name}"')
+    for warning, names in about.items():
+        yield f"{'every peer' if names == every and len(every) > 1 else ', '.join(names)}: {warning}"
+    yield from _shared_systems(endpoints, peers)
     yield from _relayed(peers, config.routing)
-    yield from _exposed(endpoints)
     yield from _exposed_metrics(config.metrics)
-    yield from _shared_secrets(peers)
-    yield from _readable(peers)
-    yield from _links(peers)
-    yield from _slow(peers)
     yield from _reach(() if config.has_ip_networks else config.listen, peers)
+    yield from _shared(peers)
     if config.is_only_relay:
         return
     if not endpoints and not (config.routing.relay and len(peers) > 1):
@@ -42,19 +47,63 @@ def advice(config: Config) -> Iterator[str]:
         yield "there is no [[peer]]: this daemon makes no link"
 
 
-def _policies(endpoints: Sequence[EndpointConfig], peers: Sequence[PeerConfig]) -> Iterator[str]:
-    about: dict[str, list[str]] = {}
-    for peer in peers:
-        for warning in peer.make_policy().warnings:
-            about.setdefault(warning, []).append(f'peer "{peer.name}"')
-    for endpoint in endpoints:
-        for warning in endpoint.make_policy().warnings if endpoint.policy else ():
-            # A local client may be any system, unless the file names its systems.
-            if "system_ids" in endpoint.policy or not warning.startswith("system_ids"):
-                about.setdefault(warning, []).append(f'endpoint "{endpoint.name}"')
-    for warning, names in about.items():
-        yield f"{', '.join(names)}: {warning}"
-    yield from _shared_systems(endpoints, peers)
+def _of_peer(peer: PeerConfig) -> Iterator[str]:
+    link, budget = peer.settings.link, peer.egress.budget_bits_s
+    yield from peer.make_policy().warnings
+    if peer.relays and not link.confidential:
+        yield (
+            "a link through a relay is not confidential: its owner cannot alter the frames, but can read them; write"
+            " confidential = true in [link], at one end or both"
+        )
+    if not link.confidential and link.tag_bytes <= _SHORT_TAG_BYTES:
+        yield (
+            "tags of 64 bits: each forged envelope is accepted with probability 2^-64; use them on slow radios only,"
+            " otherwise write tag_bits = 128"
+        )
+    if link.max_envelope > ETHERNET_PAYLOAD:
+        yield (
+            f"envelopes over {ETHERNET_PAYLOAD:,} bytes: most networks split them, and losing one part loses all;"
+            f" unless the path is known to carry them whole, write max_envelope_bytes = {c.DEFAULT_ENVELOPE_LIMIT}"
+        )
+    for suite in link.suites:
+        start = f"a handshake with {suite.name} starts with a datagram of {initiation_bytes(suite):,} bytes: "
+        if initiation_bytes(suite) > ETHERNET_PAYLOAD:
+            yield start + "it exceeds an MTU of 1,500, so every path must carry fragments; many do not"
+        elif initiation_bytes(suite) > IPV6_LEAST_PAYLOAD:
+            yield start + "Ethernet carries it, a path with IPv6's least MTU of 1,280 (some tunnels) does not"
+    size = max(initiation_bytes(link.suites[0]), response_bytes(link.suites[0])) + IPV4_UDP_BYTES
+    if budget and size * 8 / budget > link.timers.retry_max_s:
+        yield (
+            f"a handshake with {link.suites[0].name} takes {size * 8 / budget:.1f} s at {budget:,} bits/s, but the"
+            f" next attempt starts after {link.timers.retry_max_s:g} s: write retry_max_s ="
+            f" {ceil(size * 16 / budget)}"
+        )
+
+
+def _of_endpoint(endpoint: EndpointConfig) -> Iterator[str]:
+    for warning in endpoint.make_policy().warnings if endpoint.policy else ():
+        # A local client may be any system, unless the file names its systems.
+        if "system_ids" in endpoint.policy or not warning.startswith("system_ids"):
+            yield warning
+    url = endpoint.url
+    if not isinstance(url, NetworkUrl) or not url.is_exposed:
+        return
+    may = (
+        "what its policy passes"
+        if endpoint.policy
+        else "commands (arm, disarm, take-off, flight termination), missions and parameters to every peer, as if this"
+        " vehicle had sent them"
+    )
+    if url.listens:
+        yield (
+            f"it listens beyond loopback ({url}): any sender that reaches that port can send {may}, and read what the"
+            f" peers send; unless that is intended, write {url.kind}:127.0.0.1:{url.address.port}"
+        )
+    else:
+        yield (
+            f"it sends beyond this machine ({url}): MAVLink there is neither authentic nor secret; an attacker on"
+            f" that path can send {may}"
+        )
 
 
 def _shared_systems(endpoints: Sequence[EndpointConfig], peers: Sequence[PeerConfig]) -> Iterator[str]:
@@ -72,10 +121,11 @@ def _shared_systems(endpoints: Sequence[EndpointConfig], peers: Sequence[PeerCon
         if len(names) > 1:
             shared.setdefault(tuple(names), []).append(system)
     for several, systems in shared.items():
-        names_text = f"{', '.join(several[:-1])} and {several[-1]}"
+        which = f"system{'s' if len(systems) > 1 else ''} {', '.join(map(str, systems))}"
         yield (
-            f"{names_text} may send as the same {_systems(systems)}: receivers cannot distinguish their frames, and"
-            " one can impersonate the other; unless one carries the other's frames, allow each system for one of them"
+            f"{', '.join(several[:-1])} and {several[-1]} may send as the same {which}: receivers cannot distinguish"
+            " their frames, and one can impersonate the other; unless one carries the other's frames, allow each"
+            " system for one of them"
         )
 
 
@@ -90,34 +140,6 @@ def _relayed(peers: Sequence[PeerConfig], routing: Routing) -> Iterator[str]:
         )
 
 
-def _systems(systems: Sequence[int]) -> str:
-    return f"system {systems[0]}" if len(systems) == 1 else f"systems {', '.join(map(str, systems))}"
-
-
-def _exposed(endpoints: Sequence[EndpointConfig]) -> Iterator[str]:
-    for endpoint in endpoints:
-        url = endpoint.url
-        if not isinstance(url, NetworkUrl) or not url.is_exposed:
-            continue
-        may = (
-            "what its policy passes"
-            if endpoint.policy
-            else "commands (arm, disarm, take-off, flight termination), missions and parameters to every peer, as if"
-            " this vehicle had sent them"
-        )
-        if url.listens:
-            yield (
-                f'endpoint "{endpoint.name}" listens beyond loopback ({url}): any sender that reaches that port can'
-                f" send {may}, and read what the peers send; unless that is intended, write"
-                f" {url.kind}:127.0.0.1:{url.address.port}"
-            )
-        else:
-            yield (
-                f'endpoint "{endpoint.name}" sends beyond this machine ({url}): MAVLink there is neither authentic'
-                f" nor secret; an attacker on that path can send {may}"
-            )
-
-
 def _exposed_metrics(metrics: Address | None) -> Iterator[str]:
     if metrics is not None and not metrics.is_loopback:
         yield (
@@ -125,64 +147,6 @@ def _exposed_metrics(metrics: Address | None) -> Iterator[str]:
             " this daemon, their times and traffic, unencrypted; open the firewall for Prometheus only, or write"
             f' listen = "127.0.0.1:{metrics.port}"'
         )
-
-
-def _shared_secrets(peers: Sequence[PeerConfig]) -> Iterator[str]:
-    for a, b in combinations(peers, 2):
-        if a.settings.psk is not None and a.settings.psk == b.settings.psk:
-            yield (
-                f'peers "{a.name}" and "{b.name}" have the same PSK: an attacker that captures one of them has it'
-                " for both; make one for each pair with `uavlinkd psk`"
-            )
-
-
-def _readable(peers: Sequence[PeerConfig]) -> Iterator[str]:
-    """Warn of links through a relay whose frames are not encrypted."""
-    names = [f'"{peer.name}"' for peer in peers if peer.relays and not peer.settings.link.confidential]
-    if names:
-        yield (
-            f"links through a relay are not confidential ({', '.join(names)}): the owner of the relay cannot alter"
-            " their frames, but can read them; write confidential = true in [link], at one end or both"
-        )
-
-
-def _links(peers: Sequence[PeerConfig]) -> Iterator[str]:
-    if names := _peers_with(peers, lambda link: not link.confidential and link.tag_bytes <= _SHORT_TAG_BYTES):
-        yield (
-            f"tags of 64 bits with {names}: each forged envelope is accepted with probability 2^-64; use them on slow"
-            " radios only, otherwise write tag_bits = 128"
-        )
-    if names := _peers_with(peers, lambda link: link.max_envelope > ETHERNET_PAYLOAD):
-        yield (
-            f"envelopes over {ETHERNET_PAYLOAD:,} bytes with {names}: most networks split them, and losing one part"
-            " loses all; unless the path is known to carry them whole, write max_envelope_bytes ="
-            f" {c.DEFAULT_ENVELOPE_LIMIT}"
-        )
-    for suite in dict.fromkeys(suite for peer in peers for suite in peer.settings.link.suites):
-        size = initiation_bytes(suite)
-        if size <= IPV6_LEAST_PAYLOAD:
-            continue
-        names = _peers_with(peers, lambda link, suite=suite: suite in link.suites)  # type: ignore[misc]
-        start = f"a handshake with {suite.name} starts with a datagram of {size:,} bytes ({names}): "
-        if size > ETHERNET_PAYLOAD:
-            yield start + "it exceeds an MTU of 1,500, so every path must carry fragments; many do not"
-        else:
-            yield start + "Ethernet carries it, a path with IPv6's least MTU of 1,280 (some tunnels) does not"
-
-
-def _slow(peers: Sequence[PeerConfig]) -> Iterator[str]:
-    """Warn of a handshake that a budget cannot carry before the next attempt."""
-    for peer in peers:
-        link, budget = peer.settings.link, peer.egress.budget_bits_s
-        if not budget:
-            continue
-        size = max(initiation_bytes(link.suites[0]), response_bytes(link.suites[0])) + IPV4_UDP_BYTES
-        if size * 8 / budget > link.timers.retry_max_s:
-            yield (
-                f"a handshake with {link.suites[0].name} takes {size * 8 / budget:.1f} s at {budget:,} bits/s"
-                f' with "{peer.name}", but the next attempt starts after {link.timers.retry_max_s:g} s: write'
-                f" retry_max_s = {ceil(size * 16 / budget)}"
-            )
 
 
 def _reach(listen: Sequence[Address], peers: Sequence[PeerConfig]) -> Iterator[str]:
@@ -199,23 +163,24 @@ def _reach(listen: Sequence[Address], peers: Sequence[PeerConfig]) -> Iterator[s
             )
         elif all(own.is_loopback for own in listen) and not any(address.is_loopback for address in numeric):
             yield f'peer "{peer.name}" is on the network, but listen names only loopback: neither reaches the other'
+
+
+def _shared(peers: Sequence[PeerConfig]) -> Iterator[str]:
+    """Warn of addresses and PSKs of two peers."""
     for a, b in combinations(peers, 2):
         both = [one.address for one in a.addresses for other in b.addresses if _clash(one, other)]
         if both:
             yield f'peers "{a.name}" and "{b.name}" share the address {min(both)}: only one peer can use it'
+        if a.settings.psk is not None and a.settings.psk == b.settings.psk:
+            yield (
+                f'peers "{a.name}" and "{b.name}" have the same PSK: an attacker that captures one of them has it'
+                " for both; make one for each pair with `uavlinkd psk`"
+            )
 
 
 def _clash(a: PeerAddress, b: PeerAddress) -> bool:
     """Whether both are one address on one network."""
     return a.address == b.address and (a.network == b.network or not (a.network and b.network))
-
-
-def _peers_with(peers: Sequence[PeerConfig], condition: Callable[[Link], bool]) -> str:
-    """The names of the peers whose link meets the condition; empty if no link does."""
-    names = [peer.name for peer in peers if condition(peer.settings.link)]
-    if len(names) > 1 and len(names) == len(peers):
-        return "every peer"
-    return ", ".join(names)
 
 
 def exposure(endpoint: EndpointConfig) -> str:
