@@ -136,19 +136,16 @@ def _parser() -> argparse.ArgumentParser:
         return command
 
     run = add("run", _run, "run the daemon")
-    run.add_argument("--config", metavar="FILE", type=Path, required=True)
     run.set_defaults(is_relay=False)
     relay = add("relay", _run, "run a relay: it passes datagrams between its members, and cannot forge them")
-    relay.add_argument("--config", metavar="FILE", type=Path, required=True)
     relay.set_defaults(is_relay=True)
     add_daemon_commands(commands)
-
     check = add("check", _check, "check a configuration and show its effect")
-    check.add_argument("--config", metavar="FILE", type=Path, required=True)
+    for command in (run, relay, check):
+        command.add_argument("--config", metavar="FILE", type=Path, required=True)
     check.add_argument(
         "--keys", metavar="DIR", type=Path, help="for a service: the folder of its keys, as in LoadCredential="
     )
-
     check.add_argument(
         "--elsewhere", action="store_true", help="the file is for another machine: do not look at this one"
     )

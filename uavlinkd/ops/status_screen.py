@@ -245,8 +245,7 @@ def phrase(code: str, *lists: Iterable[Reason]) -> str:
             return reason.phrase
     if code in ENDPOINT_FAILURES:
         return ENDPOINT_FAILURES[code]
-    number = {name: number for number, name in errno.errorcode.items()}.get(code)
-    return code.replace("_", " ") if number is None else os.strerror(number).lower()
+    return os.strerror(getattr(errno, code)).lower() if hasattr(errno, code) else code.replace("_", " ")
 
 
 def _by_count(counts: dict[str, int], *lists: Iterable[Reason]) -> list[_Count]:

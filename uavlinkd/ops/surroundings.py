@@ -15,6 +15,7 @@ import subprocess
 import threading
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -62,14 +63,10 @@ class Surroundings(NamedTuple):
 
 def look_around(config: Config) -> Surroundings:
     """What this machine has for a configuration."""
-    answers = look_up_names(config)
+    answers = _look_up_names(config)
     networks = look_at_networks(config, answers)
-    return networks._replace(lacks=[*lacks(config, answers), *networks.lacks])
-
-
-def lacks(config: Config, answers: Answers) -> list[str]:
-    """What this machine lacks beside networks. ``answers``: those of :func:`look_up_names`."""
-    return [*_serial(config), *_addresses(config), *_names(config, answers), *_control_socket(config)]
+    others = _serial(config), _addresses(config), _names(config, answers), _control_socket(config)
+    return networks._replace(lacks=[*chain(*others), *networks.lacks])
 
 
 def _addresses(config: Config) -> Iterator[str]:
@@ -97,7 +94,7 @@ def _addresses(config: Config) -> Iterator[str]:
             )
 
 
-def look_up_names(config: Config) -> Answers:
+def _look_up_names(config: Config) -> Answers:
     """Resolve all names at the same time, as the system does for every software."""
     answers: Answers = {address.host: [] for _, address in _named(config) if address.ip is None}
 
@@ -139,27 +136,21 @@ def _serial(config: Config) -> Iterator[str]:
     users = [(f'endpoint "{one.name}"', one.url) for one in config.endpoints if isinstance(one.url, SerialUrl)]
     users += [(f'network "{one.name}"', one.serial) for one in config.networks if one.serial is not None]
     for user, url in users:
-        if why := _serial_problem(Path(url.device)):
-            yield f"{user}: {url.device} {why}"
-
-
-def _serial_problem(path: Path) -> str | None:
-    try:
-        is_device = stat.S_ISCHR(path.stat().st_mode)
-    except PermissionError:
-        return "cannot be looked at: its folder does not allow it"
-    except OSError:
-        present = [str(other) for pattern in _SERIAL_DEVICES for other in sorted(Path("/dev").glob(pattern))]
-        listed = f"this machine has {', '.join(present)}" if present else "this machine has no serial device"
-        return f"is not there now: plug it in, or write another device; {listed}"
-    if not is_device:
-        return "is not a serial device: write one, such as /dev/ttyACM0"
-    if not os.access(path, os.R_OK | os.W_OK):
-        return (
-            "may not be opened by this user: add the daemon's user to the device's group, often dialout"
-            " (`sudo usermod -aG dialout $USER`, then log in again)"
-        )
-    return None
+        start, path = f"{user}: {url.device}", Path(url.device)
+        try:
+            if not stat.S_ISCHR(path.stat().st_mode):
+                yield f"{start} is not a serial device: write one, such as /dev/ttyACM0"
+            elif not os.access(path, os.R_OK | os.W_OK):
+                yield (
+                    f"{start} may not be opened by this user: add the daemon's user to the device's group, often"
+                    " dialout (`sudo usermod -aG dialout $USER`, then log in again)"
+                )
+        except PermissionError:
+            yield f"{start} cannot be looked at: its folder does not allow it"
+        except OSError:
+            present = [str(other) for pattern in _SERIAL_DEVICES for other in sorted(Path("/dev").glob(pattern))]
+            listed = f"this machine has {', '.join(present) or 'no serial device'}"
+            yield f"{start} is not there now: plug it in, or write another device; {listed}"
 
 
 def _control_socket(config: Config) -> Iterator[str]:

@@ -120,14 +120,13 @@ class TlogFolder:
         Raises:
             OSError: no file of ours is left to delete.
         """
-        while self._free_bytes() < self._settings.min_free_bytes + size:
+        while True:
+            state = os.fstatvfs(self._folder)
+            if (state.f_bavail - 1) * state.f_frsize >= self._settings.min_free_bytes + size:
+                return  # a write may begin another block
             if not self._closed:
                 raise OSError(errno.ENOSPC, "only min_free_bytes are free, which are reserved for others")
             self._delete(next(iter(self._closed)))
-
-    def _free_bytes(self) -> int:
-        state = os.fstatvfs(self._folder)
-        return (state.f_bavail - 1) * state.f_frsize  # a write may begin another block
 
     def _delete(self, number: int) -> None:
         with suppress(FileNotFoundError):
