@@ -46,7 +46,7 @@ def initiate(peer: Peer, now: float) -> list[Output]:
         return peer.drop(drop.reason, 1)
     pending, datagrams = initiator.initiate(index, paths, peer.sessions.generation, now)
     peer.indices.owners[index] = peer, pending
-    peer.timers.set(Timer.INITIATION_EXPIRY, initiator.next_expiry())
+    peer.set_expiry()
     return [sent for datagram, path in datagrams for sent in transmit(peer, datagram, path, is_copy=path != paths[0])]
 
 
@@ -103,7 +103,7 @@ def answer(peer: Peer, received: Received, initiation: bytes, path: Path, now: f
     waiting = Unconfirmed(session, macs[0], len(initiation), response, [path], is_expected, macs[1], expires_at)
     peer.sessions.wait(waiting)
     peer.indices.owners[index] = peer, session
-    peer.timers.set(Timer.SESSION_EXPIRY, peer.sessions.next_expiry())
+    peer.set_expiry()
     return _transmit_answer(peer, datagram, waiting, path)
 
 
@@ -132,7 +132,6 @@ def adopt(peer: Peer, session: Session, path: Path, now: float) -> list[Output]:
     out = freshness.end(peer, peer.sessions.confirm(session, now))
     peer.initiator.cancel()
     peer.initiator.attempts = 0
-    peer.timers.stop(Timer.INITIATION_EXPIRY)
     peer.traffic.handshakes += 1
     if peer.sessions.current is session:
         peer.established_at = now
@@ -141,10 +140,13 @@ def adopt(peer: Peer, session: Session, path: Path, now: float) -> list[Output]:
         agreed = session.parameters
         facts = agreed.generation, session.suite.name, agreed.confidential, session.tag_bytes, session.is_initiator
         out.append(SessionEstablished(peer, path, *facts, is_rekey))
-        out += probing.begin_session(peer, session, path, now)
+        peer.paths.prefer(path, now)
+        for state in peer.paths.states:
+            state.note_session()
+        out += probing.update(peer, now)
     else:
         probing.follow_paths(peer, now)
-    peer.timers.set(Timer.SESSION_EXPIRY, peer.sessions.next_expiry())
+    peer.set_expiry()
     peer.set_initiate()
     return out
 

@@ -240,6 +240,10 @@ class Peer:
         self.handshake_after_s = max(durations.handshake_after_s, c.HANDSHAKE_ROUND_TRIPS * round_trip_s)
         self.lost_after_s = max(durations.lost_after_s, c.LOST_ROUND_TRIPS * round_trip_s)
 
+    def set_expiry(self) -> None:
+        """Set when a session, or an initiation, expires."""
+        self.timers.set(Timer.EXPIRY, min(self.sessions.next_expiry(), self.initiator.next_expiry()))
+
     def set_initiate(self) -> None:
         """Set when to initiate."""
         self.timers.set(Timer.INITIATE, max(self.initiator.retry_at, self.keys_wanted_at()))

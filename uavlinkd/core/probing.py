@@ -37,15 +37,6 @@ def follow_paths(peer: Peer, now: float) -> None:
             session.arrivals = Arrivals(now)
 
 
-def begin_session(peer: Peer, session: Session, path: Path, now: float) -> list[Output]:
-    """A session that was made along ``path`` carries the traffic now."""
-    paths = peer.paths
-    paths.prefer(path, now)
-    for state in paths.states:
-        state.note_session()
-    return update(peer, now)
-
-
 def ask_everywhere(peer: Peer, session: Session, now: float, waiting: Unconfirmed | None = None) -> list[Output]:
     """A session begins: ask along every path, also those that carried its handshake (``waiting``)."""
     paths = peer.paths

@@ -16,13 +16,10 @@ def handle_timeout(peer: Peer, now: float) -> list[Output]:
     out: list[Output] = []
     for timer in peer.timers.expired(now):
         match timer:
-            case Timer.SESSION_EXPIRY:
-                out += _expire_sessions(peer, now)
+            case Timer.EXPIRY:
+                out += _expire(peer, now)
             case Timer.FRESHNESS:
                 out += freshness.handle_timeout(peer, now)
-            case Timer.INITIATION_EXPIRY:
-                peer.initiator.expire(now)
-                peer.timers.set(timer, peer.initiator.next_expiry())
             case Timer.PATHS:
                 out += probing.handle_timeout(peer, now)
             case Timer.SILENCE:
@@ -36,9 +33,10 @@ def handle_timeout(peer: Peer, now: float) -> list[Output]:
     return out
 
 
-def _expire_sessions(peer: Peer, now: float) -> list[Output]:
+def _expire(peer: Peer, now: float) -> list[Output]:
+    peer.initiator.expire(now)
     out = freshness.end(peer, peer.sessions.expire(now))
-    peer.timers.set(Timer.SESSION_EXPIRY, peer.sessions.next_expiry())
+    peer.set_expiry()
     if peer.is_up and peer.sessions.current is None:
         out += peer.note_lost(now)
     peer.set_initiate()

@@ -16,21 +16,19 @@ MIN_ENTRIES = 64
 class Timer(IntEnum):
     """What a peer waits for. Timers that expire together are handled in this order."""
 
-    SESSION_EXPIRY = 0
-    """The keys of a session are too old, or a session was not confirmed."""
+    EXPIRY = 0
+    """The keys of a session are too old, a session was not confirmed, or an initiation not answered in time."""
     FRESHNESS = 1
     """Frames were held for too long, or an echo request about them is repeated."""
-    INITIATION_EXPIRY = 2
-    """The response to an own initiation would come too late."""
-    PATHS = 3
+    PATHS = 2
     """A path is to be judged, or a question along it is due."""
-    SILENCE = 4
+    SILENCE = 3
     """Something was sent and nothing received since: ask, initiate, give the peer up."""
-    INITIATE = 5
+    INITIATE = 4
     """New keys are wanted, or an initiation is repeated."""
-    PROBE = 6
+    PROBE = 5
     """The round trip of a link in use is measured."""
-    KEEPALIVE = 7
+    KEEPALIVE = 6
     """An idle link is kept open and measured."""
 
 

@@ -29,11 +29,6 @@ _LONG_HEADER = struct.Struct(">BHI")
 SHORT_HEADER_BYTES = _SHORT_HEADER.size
 LONG_HEADER_BYTES = _LONG_HEADER.size
 
-NOISE_1_BYTES = c.KEY_BYTES + (c.KEY_BYTES + c.AEAD_TAG_BYTES) + c.AEAD_TAG_BYTES
-"""The first Noise message without payload: e, sealed s, the payload's tag. A group adds its share and a tag."""
-NOISE_2_BYTES = c.KEY_BYTES + c.AEAD_TAG_BYTES
-"""The second: e, the payload's tag. A group adds its ciphertext and a tag."""
-
 
 # Parameters and handshake payloads.
 
@@ -111,16 +106,18 @@ def prologue(suite: Suite) -> bytes:
 
 def initiation_bytes(suite: Suite) -> int:
     """Length of an initiation of this suite."""
-    share = suite.share_bytes + c.AEAD_TAG_BYTES if suite.has_group else 0
-    payload = _INITIATION_HEADER.size - 1 + Parameters.SIZE
-    return _INITIATION_HEADER.size + NOISE_1_BYTES + share + payload + MACS_BYTES
+    return _handshake_bytes(_INITIATION_HEADER, 2 * c.KEY_BYTES + c.AEAD_TAG_BYTES, suite.share_bytes)  # e, sealed s
 
 
 def response_bytes(suite: Suite) -> int:
     """Length of a response of this suite: never more than its initiation's."""
-    ciphertext = suite.ciphertext_bytes + c.AEAD_TAG_BYTES if suite.has_group else 0
-    payload = _RESPONSE_HEADER.size - 1 + Parameters.SIZE
-    return _RESPONSE_HEADER.size + NOISE_2_BYTES + ciphertext + payload + MACS_BYTES
+    return _handshake_bytes(_RESPONSE_HEADER, c.KEY_BYTES, suite.ciphertext_bytes)
+
+
+def _handshake_bytes(header: struct.Struct, keys: int, group: int) -> int:
+    payload = header.size - 1 + Parameters.SIZE
+    sealed = payload + c.AEAD_TAG_BYTES + (group + c.AEAD_TAG_BYTES if group else 0)
+    return header.size + keys + sealed + MACS_BYTES
 
 
 def initiation_header(suite: Suite, sender_index: int) -> bytes:
