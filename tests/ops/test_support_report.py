@@ -29,29 +29,31 @@ def test_same_value_has_the_same_pseudonym() -> None:
     assert text == '"key-1" key-2 key-1 peer-address-1:5790 peer-address-2:5790 address-1 [address-2]:1'
 
 
-def test_beginning_of_a_key_is_replaced() -> None:
-    """`check` shows the first characters: they become the pseudonym of the whole key."""
-    assert Redactor().redact(f"{OTHER_KEY} {KEY} {KEY[:8]}... {'Ab1' * 3}...") == "key-1 key-2 key-2... Ab1Ab1Ab1..."
-    assert Redactor().redact(f"drone1  {KEY[:8]}...  10") == "drone1  key-1...  10"
+HEX = keys.decode_key(KEY).hex()
+PAIRS = [HEX[at : at + 2] for at in range(0, 64, 2)]
 
 
 @pytest.mark.parametrize(
-    "text",
+    ("text", "redacted"),
     [
-        f'public_key = "{KEY[:30]}"',
-        f"PrivateKey = {KEY[:-1]}",
-        f"PresharedKey={KEY}",
-        f'{{"psk": "{KEY[:20]}"}}',
-        f"it came with {KEY[:-1]}",
-        keys.decode_key(KEY).hex(),
-        f'private_key = "{KEY}{KEY}"',
+        (f"{OTHER_KEY} {KEY} {KEY[:8]}... {'Ab1' * 3}...", "key-1 key-2 key-2... Ab1Ab1Ab1..."),
+        (f"drone1  {KEY[:8]}...  10", "drone1  key-1...  10"),
+        (f'public_key = "{KEY[:30]}"', 'public_key = "key-1"'),
+        (f"PrivateKey = {KEY[:-1]}", "PrivateKey = key-1"),
+        (f"PresharedKey={KEY}", "PresharedKey=key-1"),
+        (f'{{"psk": "{KEY[:20]}"}}', '{"psk": "key-1"}'),
+        (f"it came with {KEY[:-1]}", "it came with key-1"),
+        (f'private_key = "{KEY}{KEY}"', 'private_key = "key-2"'),
+        (f"{HEX} 0x{HEX} 0X{HEX.upper()}", "key-1 key-2 key-3"),
+        (f"dump: {' '.join(PAIRS)}.", "dump: key-1."),
+        (f"id {':'.join(PAIRS)}", "id key-1"),
+        (r"{\"psk\": \"hunter2 secret\", \"name\": 1}", r"{\"psk\": \"key-1\", \"name\": 1}"),
+        (r'psk = "hunter2\"secret" # x', 'psk = "key-1" # x'),
     ],
 )
-def test_keys_in_any_form_are_replaced(text: str) -> None:
-    """Whole, damaged, without padding, as hexadecimal digits, in TOML, JSON or WireGuard's format."""
-    redacted = Redactor().redact(text)
-    assert "key-" in redacted
-    assert not any(part in redacted for part in (KEY[:12], KEY[10:22], keys.decode_key(KEY).hex()[:12]))
+def test_keys_in_any_form_are_replaced(text: str, redacted: str) -> None:
+    """Whole, damaged, their beginning, without padding, in dumps, in TOML, JSON, JSON in JSON, WireGuard's format."""
+    assert Redactor().redact(text) == redacted
 
 
 @pytest.mark.parametrize(
@@ -137,25 +139,6 @@ def test_without_a_terminal_it_needs_consent(
     assert "add --yes" in capsys.readouterr().err
     assert main([*arguments, "--yes"]) == OK
     assert path.exists()
-
-
-HEX = keys.decode_key(KEY).hex()
-PAIRS = [HEX[at : at + 2] for at in range(0, 64, 2)]
-
-
-@pytest.mark.parametrize(
-    ("text", "redacted"),
-    [
-        (f"0x{HEX} 0X{HEX.upper()}", "key-1 key-2"),
-        (f"dump: {' '.join(PAIRS)}.", "dump: key-1."),
-        (f"id {':'.join(PAIRS)}", "id key-1"),
-        (r"{\"psk\": \"hunter2 secret\", \"name\": 1}", r"{\"psk\": \"key-1\", \"name\": 1}"),
-        (r'psk = "hunter2\"secret" # x', 'psk = "key-1" # x'),
-    ],
-)
-def test_keys_in_dumps_and_in_quoted_json(text: str, redacted: str) -> None:
-    """With a prefix, as pairs of digits, and behind escaped quotation marks."""
-    assert Redactor().redact(text) == redacted
 
 
 def test_a_section_is_redacted_before_it_is_cut(monkeypatch: pytest.MonkeyPatch) -> None:
