@@ -16,7 +16,8 @@ import pytest
 from tests.endpoints.clients import frame, large_frame, recorder, write
 from tests.waiting import until
 from uavlinkd.endpoints import tcp
-from uavlinkd.endpoints.tcp import CLIENT_SILENT_S, CLIENTS_PER_ENDPOINT, TcpServer
+from uavlinkd.endpoints.ports import CLIENT_SILENT_S, CLIENTS_PER_ENDPOINT
+from uavlinkd.endpoints.tcp import TcpServer
 from uavlinkd.system.addresses import Address
 
 SIOCOUTQNSD = 0x894B

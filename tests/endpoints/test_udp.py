@@ -10,16 +10,10 @@ import pytest
 
 from tests.daemon.udp import open_socket
 from tests.endpoints.clients import Recorder, frame, heartbeat, recorder, write
-from uavlinkd.endpoints.ports import LocalPort
+from uavlinkd.endpoints.ports import CLIENT_SILENT_S, CLIENTS_PER_ENDPOINT, LocalPort
 from uavlinkd.endpoints.reader import Datagrams, Reader
 from uavlinkd.endpoints.sockets import udp_socket
-from uavlinkd.endpoints.udp import (
-    CLIENT_IDLE_S,
-    CLIENT_SILENT_S,
-    CLIENTS_PER_ENDPOINT,
-    LOCAL_DATAGRAM_BYTES,
-    UdpServer,
-)
+from uavlinkd.endpoints.udp import CLIENT_IDLE_S, LOCAL_DATAGRAM_BYTES, UdpServer
 from uavlinkd.mavlink.frames import MAX_GAP_S
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic

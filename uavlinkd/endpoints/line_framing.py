@@ -35,18 +35,15 @@ from uavlinkd.mavlink.frames import MAVLINK1, MAVLINK2
 
 DELIMITER: Final = b"\0"
 CRC_BYTES: Final = 2
-MAX_DATAGRAM: Final = 2048
-"""The longest datagram on a line: more than the longest handshake message."""
+MAX_DATAGRAM: Final = 2048  # the longest datagram on a line: more than the longest handshake message
 MAX_ENCODED: Final = MAX_DATAGRAM + CRC_BYTES + (MAX_DATAGRAM + CRC_BYTES + 253) // 254
 """The longest datagram in COBS, without delimiters. A receiver holds at most this and one chunk."""
 
 REPORTS_CUT_OUT: Final = 2
 """So many reports are cut out of one broken datagram: a modem sends one a second, an attacker could fill the line."""
 
-REPORT_STARTS: Final = bytes((MAVLINK1, MAVLINK2))
-"""A report starts with one of these bytes."""
-_CRC_EXTRA: Final = {109: 185, 166: 21}
-"""By message: RADIO_STATUS, and RADIO of old firmware."""
+REPORT_STARTS: Final = bytes((MAVLINK1, MAVLINK2))  # a report starts with one of these bytes
+_CRC_EXTRA: Final = {109: 185, 166: 21}  # by message: RADIO_STATUS, and RADIO of old firmware
 _HEADERS: Final = {MAVLINK1: (17, 5, {1: 9}), MAVLINK2: (21, 7, {1: 9, 2: 0, 3: 0, 8: 0, 9: 0})}
 """By first byte: length of a report, place of the message, and the bytes that have one value, by their places."""
 _FIGURES: Final = Struct("<HH5B")
@@ -86,7 +83,6 @@ def report_bytes(data: bytes, at: int) -> int | None:
 
 
 def parse_report(frame: bytes) -> RadioReport:
-    """The figures of a whole report."""
     at = len(frame) - _FIGURES.size - CRC_BYTES
     rxerrors, fixed, rssi, remrssi, txbuf, noise, remnoise = _FIGURES.unpack_from(frame, at)
     return RadioReport(rssi, remrssi, txbuf, noise, remnoise, rxerrors, fixed)
@@ -122,31 +118,20 @@ class LineDecoder:
     datagrams are skipped. If a datagram is broken because the modem put a report into it, the report is cut out.
     """
 
-    __slots__ = (
-        *("_cuts", "_is_skipping", "_rest"),
-        *("datagrams", "discarded", "discarded_bytes", "report", "reports", "reports_inside"),
-    )
-
     def __init__(self) -> None:
         self._rest = b""
         self._cuts = 0  # reports that were cut out of the piece that begins now
         self._is_skipping = False  # up to the next delimiter: what precedes it is too long
-        self.datagrams = 0
-        """How many arrived whole."""
+        self.datagrams = 0  # how many arrived whole
         self.discarded = Counter[Noise](dict.fromkeys(Noise, 0))
         """Pieces between two delimiters that are not a datagram."""
-        self.discarded_bytes = Counter[Noise](dict.fromkeys(Noise, 0))
-        """Their bytes."""
-        self.reports = 0
-        """Reports of the modem."""
-        self.reports_inside = 0
-        """Those of them that were inside a datagram."""
-        self.report: RadioReport | None = None
-        """The last one."""
+        self.discarded_bytes = Counter[Noise](dict.fromkeys(Noise, 0))  # their bytes
+        self.reports = 0  # reports of the modem
+        self.reports_inside = 0  # those of them that were inside a datagram
+        self.report: RadioReport | None = None  # the last one
 
     @property
     def line_noise(self) -> int:
-        """All discarded pieces."""
         return self.discarded.total()
 
     @property

@@ -29,8 +29,7 @@ class OutgoingFrames:
     def __init__(self, dropped: Counter[str], delivered: DeliveredStream) -> None:
         self._dropped = dropped
         self._admit = delivered.admit
-        self.queue = FairQueue(self._on_drop)
-        """The frames that are not committed."""
+        self.queue = FairQueue(self._on_drop)  # the frames that are not committed
         self._committed = b""
         self._ends: deque[int] = deque()  # sizes of the committed frames; for the first, of its unwritten rest
 

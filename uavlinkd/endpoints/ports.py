@@ -17,23 +17,22 @@ from uavlinkd.mavlink.frames import Frame, SplitCounters
 from uavlinkd.mavlink.policy.delivery import DeliveredStreams, Source
 from uavlinkd.system.stall import StallWatch
 
+CLIENTS_PER_ENDPOINT = 32  # most clients of one `udpin` or `tcpin` endpoint
+CLIENT_SILENT_S = 5.0
+"""While all places are taken, the client that has been silent longest loses its place to a new client, if it has been
+silent for this long. ``udpin`` sends such a client no broadcast frames of other clients."""
+
 
 class LocalPort:
     """One client of an endpoint. Compared by identity."""
 
-    __slots__ = ("delivered", "endpoint", "name", "received_at")
-
     def __init__(self, endpoint: Endpoint, name: str, received_at: float | None) -> None:
         self.endpoint = endpoint
-        self.name = name
-        """Its address, for people: ``127.0.0.1:14550``, ``/dev/ttyACM0``."""
+        self.name = name  # its address, for people: `127.0.0.1:14550`, `/dev/ttyACM0`
         self.received_at = received_at
         """When its last frame was received, in monotonic seconds; None before the first frame."""
         self.delivered = endpoint.delivered.of(name)
         """The byte stream that it reads. It decides which bytes a frame becomes, in the order of delivery."""
-
-    def __repr__(self) -> str:
-        return f"LocalPort({self.endpoint.name}, {self.name})"
 
     def send(self, frames: Sequence[Frame], source: Source, now: float, waited_s: float) -> None:
         """Send frames that arrived together, all from one source, to the client, or drop and count them.
@@ -46,8 +45,7 @@ class LocalPort:
 class PortHandler(Protocol):
     """Receives the reports of an endpoint. ``now`` is monotonic seconds."""
 
-    stall: StallWatch
-    """Endpoints report their reads to it."""
+    stall: StallWatch  # endpoints report their reads to it
 
     def on_port_opened(self, port: LocalPort) -> None:
         """A client connected."""
@@ -74,8 +72,7 @@ class Endpoint(ABC):
     def __init__(self, name: str, handler: PortHandler) -> None:
         self.name = name
         self.handler = handler
-        self.counters = SplitCounters()
-        """Frames and garbage in the received bytes."""
+        self.counters = SplitCounters()  # frames and garbage in the received bytes
         self.failures: Counter[str] = Counter()
         """Errors by name: the kernel's (``ECONNREFUSED``), and the endpoint's own reasons."""
         self.bytes_received = self.bytes_sent = self.frames_sent = 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
+import sys
 from array import array
 from collections.abc import Callable
 from math import inf
@@ -12,13 +13,9 @@ from typing import Any
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.stall import STALE, STALL_S, Backlog, StallWatch
 
-try:
+if sys.platform != "win32":
     import fcntl
     import termios
-except ImportError:  # Windows
-    _CAN_ASK = False
-else:
-    _CAN_ASK = True
 
 DATAGRAMS_PER_WAKE_UP = 128
 """Most datagrams that one read takes from a socket. Then the other sockets have their turn."""
@@ -35,8 +32,7 @@ DATAGRAM_OVERHEAD_BYTES = 256
 """A datagram takes at least this much of a receive buffer in addition to its length: the kernel's own record of it
 (struct sk_buff). Linux 6.18 on x86-64 takes 830."""
 
-Datagrams = list[tuple[bytes, tuple[Any, ...]]]
-"""Datagrams, each with the socket address of its sender."""
+Datagrams = list[tuple[bytes, tuple[Any, ...]]]  # datagrams, each with the socket address of its sender
 
 
 DatagramHandler = Callable[[Datagrams, float, int, float], None]
@@ -80,8 +76,7 @@ class Reader:
         self._loop = asyncio.get_running_loop()
         self._is_watched = False  # by the loop
         self._timer: asyncio.TimerHandle | None = None  # reads the socket next, and not the loop
-        self.gather_s = 0.0
-        """Datagrams are read so long after the first of them arrived; 0: at once."""
+        self.gather_s = 0.0  # datagrams are read so long after the first of them arrived; 0: at once
         self._done_at = -inf  # when the last batch had been delivered
         self._is_burst = False  # the last read was soon after the one before it
         self._found_several = False  # the last read found more than one datagram
@@ -189,7 +184,7 @@ class Reader:
         except OSError as error:
             return not self._is_drained(error)
         datagrams.append((bytes(_buffer[:size]), source))
-        if not _CAN_ASK:
+        if sys.platform == "win32":
             return True
         fcntl.ioctl(self._sock, termios.FIONREAD, self._waiting)
         return self._waiting[0] > 0

@@ -17,16 +17,13 @@ from uavlinkd.system.clock import monotonic
 from uavlinkd.system.stall import StallWatch
 from uavlinkd.system.tasks import Threads, keep_running
 
-RETRY_S = 0.5
-"""Wait between two attempts to open a device that is missing or not permitted."""
+RETRY_S = 0.5  # wait between two attempts to open a device that is missing or not permitted
 IN_FLIGHT_S = 0.02
 """The kernel gets no more bytes than the line carries in this time, or one frame: they cannot be overtaken there."""
 REFILL = 0.75
 """The kernel gets more when it holds no more than this part of that, so that several frames share a wake-up."""
-IN_FLIGHT_BYTES = 4096
-"""The limit for a device without a line rate, as its driver counts."""
-POLL_S = 0.005
-"""Time until the next look at a device without a line rate."""
+IN_FLIGHT_BYTES = 4096  # the limit for a device without a line rate, as its driver counts
+POLL_S = 0.005  # time until the next look at a device without a line rate
 LATE_S = 0.001
 """Added to timers, because event loops round to milliseconds and a timer must not fire too early."""
 TERMINAL_BYTES = 4096 + 640 * 1024
@@ -129,11 +126,9 @@ class SerialChannel:
         self.fileno = device.fileno
 
     def read(self, size: int) -> bytes:
-        """The received bytes; no bytes, or an error, once the device is unplugged."""
         return os.read(self._fd, size)
 
     def write(self, data: bytes) -> int:
-        """Pass bytes to the kernel."""
         count = os.write(self._fd, data)
         if self._bytes_per_s is not None:
             self._sent_by = max(self._sent_by, monotonic()) + count / self._bytes_per_s
@@ -154,14 +149,12 @@ class SerialChannel:
         return max(in_kernel, int((self._sent_by - now) * self._bytes_per_s)) if self._sent_by > now else in_kernel
 
     def drain_s(self, to_bytes: int, now: float) -> float:
-        """Computed from the line's rate."""
         if self._bytes_per_s is None:
             return POLL_S
         to_bytes = min(to_bytes, int(REFILL * self.limit_bytes))
         return max(0.0, self.held(now) - to_bytes) / self._bytes_per_s + LATE_S
 
     def close(self, *, abort: bool) -> None:
-        """Close the device at once in any case."""
         discard(self.device)
 
 
@@ -178,12 +171,10 @@ class SerialEndpoint(StreamEndpoint):
         self._opener = Opener(f"serial-{name}", url)
 
     def start(self) -> None:
-        """Open the device as soon as it is present."""
         opening = self._opener.keep_open(self.handler.stall, self._use, self.could_not_open)
         self._task = keep_running(opening, f"the endpoint {self.name}")
 
     def close(self) -> None:
-        """Stop, and close the device."""
         self._opener.is_closed = True
         super().close()
 

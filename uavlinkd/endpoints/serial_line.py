@@ -31,8 +31,7 @@ from uavlinkd.system.clock import monotonic
 from uavlinkd.system.stall import STALE, Backlog, StallWatch
 from uavlinkd.system.tasks import keep_running
 
-MODEM_S: Final = 0.25
-"""The modem gets no more than the air carries in this time, or one datagram."""
+MODEM_S: Final = 0.25  # the modem gets no more than the air carries in this time, or one datagram
 QUEUE_S: Final = 0.25
 """So much may wait here for the modem, and :data:`QUEUE_BYTES` more."""
 QUEUE_BYTES: Final = 320
@@ -41,10 +40,8 @@ READ_BYTES: Final = 4096
 STUCK_S: Final = 5.0
 """The modem withholds CTS for longer: the wire is broken or not connected. Then the daemon opens the device again,
 and ignores CTS until the device is lost for another reason."""
-WIRE_LATE_S: Final = 0.05
-"""A USB adapter reports later than this wire's rate shows that bytes were sent."""
-CLOSE_S: Final = 0.5
-"""At the end of the daemon, the last datagram has this time to leave the kernel."""
+WIRE_LATE_S: Final = 0.05  # a USB adapter reports later than this wire's rate shows that bytes were sent
+CLOSE_S: Final = 0.5  # at the end of the daemon, the last datagram has this time to leave the kernel
 LINE_FULL: Final = "LINE_FULL"
 """In place of an error's name: a datagram was dropped because too much waits for the radio."""
 CTS_STUCK: Final = "CTS_STUCK"
@@ -56,8 +53,7 @@ class CtsHold:
     """Looks at a line in which the modem can stop this end by the CTS wire."""
 
     def __init__(self) -> None:
-        self.total_s = 0.0
-        """The time for which the modem held this end, until the last look."""
+        self.total_s = 0.0  # the time for which the modem held this end, until the last look
         self._since: float | None = None
         self._noted_at = 0.0
 
@@ -76,7 +72,6 @@ class CtsHold:
         return 0.0 if self._since is None else now - self._since
 
     def end(self) -> None:
-        """The device is closed."""
         self._since = None
 
 
@@ -100,18 +95,14 @@ class SerialLine:
         self.decoder = LineDecoder()
         self.failures: Counter[str] = Counter()
         """Failures to open it, lost connections and dropped datagrams, by the name of the error."""
-        self.reason = "it was not opened yet"
-        """Why it is not open."""
-        self.error = ""
-        """The name of the error behind that."""
-        self.uses_cts = False
-        """Whether the modem can stop this end by the CTS wire."""
+        self.reason = "it was not opened yet"  # why it is not open
+        self.error = ""  # the name of the error behind that
+        self.uses_cts = False  # whether the modem can stop this end by the CTS wire
         self.cts = CtsHold()
         self.bytes_received = 0
         self.bytes_written = 0
         self._name = name
-        self.bytes_s = bytes_s
-        """The rate at which it is written: this end's part of the air."""
+        self.bytes_s = bytes_s  # the rate at which it is written: this end's part of the air
         self._on_datagrams = on_datagrams
         self._on_change = on_change
         self._stall = stall
@@ -129,11 +120,9 @@ class SerialLine:
 
     @property
     def is_open(self) -> bool:
-        """Whether the device is there."""
         return self._device is not None
 
     def start(self) -> None:
-        """Open the device as soon as it is present."""
         opening = self._opener.keep_open(self._stall, self._use, self._could_not_open)
         self._task = keep_running(opening, f"the serial network {self._name}")
 
@@ -266,7 +255,6 @@ class SerialLine:
             self._on_datagrams(datagrams, now, epoch)
 
     def _lose(self, reason: str) -> None:
-        """The device is gone."""
         self.error = reason
         self.failures[reason] += 1
         self._ignores_cts = reason == CTS_STUCK

@@ -21,8 +21,7 @@ BUFFER_BYTES = 1 << 20
 """Requested for the receive buffer and the send buffer: room for hundreds of envelopes of the default size. The
 kernel may grant less (net.core.rmem_max)."""
 
-_INTERFACE_NAME_BYTES = 16
-"""IFNAMSIZ: linux/if.h."""
+_INTERFACE_NAME_BYTES = 16  # IFNAMSIZ: linux/if.h
 _FREEBIND = {
     socket.AF_INET: (socket.IPPROTO_IP, 15),  # IP_FREEBIND, which Python does not name: linux/in.h
     socket.AF_INET6: (socket.IPPROTO_IPV6, 78),  # IPV6_FREEBIND: linux/in6.h
@@ -32,8 +31,7 @@ _FREEBIND = {
 class BindError(CommandError):
     """An address that cannot be listened on. The message is for the operator."""
 
-    is_taken = False
-    """Whether another socket is bound there."""
+    is_taken = False  # whether another socket is bound there
 
 
 @contextmanager
@@ -200,8 +198,6 @@ class ErrorReports:
     ICMP messages, or a client that is closed for hours, costs no work per datagram.
     """
 
-    __slots__ = ("_left", "_sock")
-
     def __init__(self, sock: socket.socket) -> None:
         self._sock = sock
         self._left = 0
@@ -267,19 +263,15 @@ def send_again(
 
 # Whether an interface or an address can be used now.
 
-LINK_LOCAL: Final = "fe80:"
-"""The start of a link-local IPv6 address."""
+LINK_LOCAL: Final = "fe80:"  # the start of a link-local IPv6 address
 
 
 class Presence(NamedTuple):
     """What the machine has of a network at one moment."""
 
-    ifindex: int = 0
-    """The number of the interface. For an address it is 0, unless the address is link-local."""
-    hosts: tuple[str, ...] = ()
-    """Its addresses; empty if it is absent."""
-    reason: str = ""
-    """Why it is absent."""
+    ifindex: int = 0  # The number of the interface. For an address it is 0, unless the address is link-local.
+    hosts: tuple[str, ...] = ()  # its addresses; empty if it is absent
+    reason: str = ""  # why it is absent
 
 
 def look(interface: str | None, address: str | None) -> Presence:

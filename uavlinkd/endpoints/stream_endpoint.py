@@ -36,15 +36,13 @@ _MEANINGS = {
     "EPERM": "this service may not open the device: see DeviceAllow in its unit",
     "connect_timeout": "there is no answer from there now",
     "not_resolved": meaning_of(NAME_NOT_RESOLVED),
-}
-"""Why an endpoint is not open, where the common table does not say it. The daemon tries again indefinitely."""
+}  # where the common table does not say it
 
 
 class ByteChannel(Protocol):
     """The kernel's side of one connection. No method blocks."""
 
-    def fileno(self) -> int:
-        """The file descriptor, for the event loop."""
+    def fileno(self) -> int: ...
 
     def read(self, size: int) -> bytes:
         """The received bytes, up to ``size``; no bytes at the end of the stream.
@@ -74,7 +72,7 @@ class ByteChannel(Protocol):
         """After how many seconds the kernel should hold no more than ``to_bytes``."""
 
     def close(self, *, abort: bool) -> None:
-        """Close it; ``abort`` discards the kernel's unsent bytes."""
+        """Close it; ``abort`` discards the kernel's unsent bytes, and resets a TCP connection."""
 
 
 class Connection(LocalPort):
@@ -89,8 +87,7 @@ class Connection(LocalPort):
         self.channel = channel
         self.opened_at = opened_at
         self.outgoing = OutgoingFrames(endpoint.failures, self.delivered)
-        self.lost = asyncio.Event()
-        """Set when the port has been reported as closed."""
+        self.lost = asyncio.Event()  # set when the port has been reported as closed
         self._splitter = StreamSplitter(endpoint.counters, endpoint.max_gap_s, endpoint.max_hold_s)
         self._loop = asyncio.get_running_loop()
         self._fd = channel.fileno()
@@ -98,8 +95,7 @@ class Connection(LocalPort):
         self._backlog = Backlog(self._stall, self._fd, channel.capacity, opened_in)
         self._epoch = opened_in  # of the last read
         self._is_open = True
-        self.ended_well = False
-        """Whether the client ended it, and may still read the kernel's bytes."""
+        self.ended_well = False  # whether the client ended it, and may still read the kernel's bytes
         self._has_read = False
         self._awaits_writable = False
         self._room_timer: asyncio.TimerHandle | None = None
@@ -112,7 +108,6 @@ class Connection(LocalPort):
         return self.opened_at if self.received_at is None else self.received_at
 
     def on_readable(self, now: float) -> None:
-        """Read the received bytes and deliver their frames."""
         epoch = self._backlog.begin(now)
         is_empty = False
         chunks: list[bytes] = []
@@ -310,10 +305,8 @@ class StreamEndpoint(Endpoint):
     connections that ended: ``disconnected`` (by the client), ``stalled``, or the kernel's error.
     """
 
-    max_gap_s = MAX_GAP_S
-    """A frame with a longer gap inside counts as broken."""
-    max_hold_s = inf
-    """How long a frame may take as a whole. Serial lines have no limit."""
+    max_gap_s = MAX_GAP_S  # a frame with a longer gap inside counts as broken
+    max_hold_s = inf  # How long a frame may take as a whole. Serial lines have no limit.
     refused_starts: tuple[bytes, ...] = ()
     """A connection that begins with one of these comes from a browser and is closed."""
 
@@ -324,16 +317,13 @@ class StreamEndpoint(Endpoint):
 
     @property
     def ports(self) -> Sequence[Connection]:
-        """The present clients."""
         return list(self._connections)
 
     def do_housekeeping(self, now: float) -> None:
-        """Close connections that have stalled."""
         for connection in self.ports:
             connection.check(now)
 
     def close(self) -> None:
-        """Stop and close every connection."""
         super().close()
         connections, self._connections = self._connections, []
         for connection in connections:
@@ -366,5 +356,4 @@ class StreamEndpoint(Endpoint):
             connection.lost.set()
 
     def dispose(self, connection: Connection) -> None:
-        """Close the channel of a lost connection."""
         connection.channel.close(abort=not connection.ended_well)

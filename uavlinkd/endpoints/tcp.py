@@ -15,7 +15,7 @@ from contextlib import suppress
 from secrets import SystemRandom
 from typing import Any
 
-from uavlinkd.endpoints.ports import PortHandler, failure_name
+from uavlinkd.endpoints.ports import CLIENT_SILENT_S, CLIENTS_PER_ENDPOINT, PortHandler, failure_name
 from uavlinkd.endpoints.sockets import bind, new_socket
 from uavlinkd.endpoints.stream_endpoint import STALLED_S, StreamEndpoint
 from uavlinkd.system.addresses import Address
@@ -24,11 +24,6 @@ from uavlinkd.system.resolver import resolve
 from uavlinkd.system.stall import Backlog
 from uavlinkd.system.tasks import keep_running
 
-CLIENTS_PER_ENDPOINT = 32
-"""Most clients of one ``tcpin`` endpoint."""
-CLIENT_SILENT_S = 5.0
-"""When all places are taken, the client that has been silent longest loses its place to a new client, if it has been
-silent for this long."""
 FIRST_WAIT_S = 0.25
 LONGEST_WAIT_S = 5.0
 """Wait between two attempts to connect. It doubles each time, and is up to a quarter longer at random."""
@@ -37,14 +32,12 @@ CONNECT_TIMEOUT_S = 5.0
 MAX_GAP_S = 2.0
 """Longest gap in a frame, and longest duration of a frame. TCP loses no bytes, but repeats some of them late. After
 this time a frame is too old, or a serial line behind the server has lost a part of it."""
-MAX_ADDRESSES = 8
-"""Addresses of a name that one attempt tries."""
+MAX_ADDRESSES = 8  # addresses of a name that one attempt tries
 ACCEPT_PAUSE_S = 1.0
 """Wait before the next accept when the system has no file descriptor or memory for a client."""
 
 _SEND_BUFFER_BYTES = 16384
-_NOT_SENT_BYTES = 1024
-"""The kernel accepts a write while it holds fewer unsent bytes than this."""
+_NOT_SENT_BYTES = 1024  # the kernel accepts a write while it holds fewer unsent bytes than this
 _WRITE_BYTES = 1400
 """Most bytes of one write: a segment. The kernel accepts a write whole or not at all."""
 _OWN_SEGMENT = socket.MSG_EOR if sys.platform == "linux" else 0
@@ -82,7 +75,6 @@ class SocketChannel:
         return self._sock.send(data, _OWN_SEGMENT)
 
     def capacity(self) -> int:
-        """The present size of the receive buffer."""
         return self._sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
 
     limit_bytes = _WRITE_BYTES
@@ -96,7 +88,6 @@ class SocketChannel:
         return 0.0
 
     def close(self, *, abort: bool) -> None:
-        """Close it; ``abort`` resets the connection."""
         if abort:
             _try_option(self._sock, socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         self._sock.close()
@@ -120,7 +111,6 @@ class TcpServer(StreamEndpoint):
 
     @property
     def address(self) -> tuple[str, int]:
-        """The address on which it listens."""
         host, port = self._listener.getsockname()[:2]
         return host, port
 
@@ -129,7 +119,6 @@ class TcpServer(StreamEndpoint):
         return self._listener.dup()
 
     def start(self) -> None:
-        """Accept connections from now on."""
         asyncio.get_running_loop().add_reader(self._listener.fileno(), lambda: self.on_acceptable(monotonic()))
 
     def on_acceptable(self, now: float) -> None:
@@ -157,7 +146,6 @@ class TcpServer(StreamEndpoint):
             self.open(SocketChannel(sock), str(Address.of(sockaddr)), now, epoch)
 
     def close(self) -> None:
-        """Stop listening and close every connection."""
         if self._resume is not None:
             self._resume.cancel()
         if self._listener.fileno() >= 0:
@@ -196,7 +184,6 @@ class TcpClient(StreamEndpoint):
         self._address = address
 
     def start(self) -> None:
-        """Begin to connect."""
         self._task = keep_running(self._keep_connected(), f"the endpoint {self.name}")
 
     async def _keep_connected(self) -> None:

@@ -11,11 +11,18 @@ import socket
 from abc import abstractmethod
 from collections.abc import Sequence
 from math import inf
-from typing import Any
 
 import structlog
 
-from uavlinkd.endpoints.ports import Endpoint, LocalPort, PortHandler, failure_name
+from uavlinkd.core.path import SocketAddress
+from uavlinkd.endpoints.ports import (
+    CLIENT_SILENT_S,
+    CLIENTS_PER_ENDPOINT,
+    Endpoint,
+    LocalPort,
+    PortHandler,
+    failure_name,
+)
 from uavlinkd.endpoints.reader import Datagrams, Reader
 from uavlinkd.endpoints.sockets import BindError, ErrorReports, send_again, udp_socket
 from uavlinkd.mavlink.frames import MAX_GAP_S, MIN_FRAME_BYTES, Frame, SplitCounters, StreamSplitter, split_datagram
@@ -26,13 +33,8 @@ from uavlinkd.system.resolver import LONGEST_WAIT_S, Resolved, keep_resolving
 from uavlinkd.system.stall import STALE
 from uavlinkd.system.tasks import keep_running
 
-CLIENTS_PER_ENDPOINT = 32
-"""Most clients of one ``udpin`` endpoint."""
 CLIENT_IDLE_S = 60.0
 """``udpin`` forgets a client that is silent for this long. Even a listener sends a heartbeat each second."""
-CLIENT_SILENT_S = 5.0
-"""A client that is silent for this long gets no broadcast frames of other clients. When all places are taken, it
-loses its place to a new client."""
 REMOTE_SILENT_S = 5.0
 """The name of a ``udpout`` endpoint is looked up again when its address is silent for this long."""
 LOCAL_DATAGRAM_BYTES = 296
@@ -41,14 +43,10 @@ LOCAL_DATAGRAM_BYTES = 296
 
 _ANY = {socket.AF_INET: Address("0.0.0.0", 0), socket.AF_INET6: Address("::", 0)}
 
-SocketAddress = tuple[Any, ...]
-"""As the kernel takes and returns it: host and port; for IPv6 also the flow label and the interface."""
-
 
 class UdpPort(LocalPort):
     """A client of a UDP endpoint."""
 
-    __slots__ = ("address",)
     endpoint: UdpEndpoint
 
     def __init__(self, endpoint: UdpEndpoint, name: str, address: SocketAddress, received_at: float | None) -> None:
@@ -86,37 +84,32 @@ class UdpEndpoint(Endpoint):
 
     def __init__(self, name: str, sock: socket.socket, handler: PortHandler) -> None:
         super().__init__(name, handler)
-        self._sock = sock
-        self._reports = ErrorReports(sock)
+        self._use(sock)
         self._epoch = handler.stall.epoch  # of the last read
-        self._gather_s = 0.0
-        self._reader: Reader | None = None
         self._ports: dict[SocketAddress, UdpPort] = {}
         self._silent: set[LocalPort] = set()
         self._splitters: dict[SocketAddress, StreamSplitter] = {}  # of clients that cut frames apart
 
     @property
     def ports(self) -> Sequence[UdpPort]:
-        """The present clients."""
         return list(self._ports.values())
 
     @property
     def address(self) -> tuple[str, int]:
-        """The socket's own address."""
         host, port = self._sock.getsockname()[:2]
         return host, port
 
+    def _use(self, sock: socket.socket) -> None:
+        self._sock = sock
+        self._reports = ErrorReports(sock)
+        self._reader = Reader(sock, self.take, self._on_read_error, self.handler.stall)
+
     def start(self) -> None:
-        """Read whenever datagrams are there."""
-        self._reader = Reader(self._sock, self.take, self._on_read_error, self.handler.stall)
-        self._reader.gather_s = self._gather_s
         self._reader.start()
 
     def gather(self, seconds: float) -> None:
         """Read once for all datagrams that arrive within ``seconds``, and not for each of them."""
-        self._gather_s = seconds
-        if self._reader is not None:
-            self._reader.gather_s = seconds
+        self._reader.gather_s = seconds
 
     def take(self, datagrams: Datagrams, now: float, epoch: int, waited_s: float = 0.0) -> None:
         """Deliver the frames of each client, in their order."""
@@ -195,14 +188,12 @@ class UdpEndpoint(Endpoint):
                 self.handler.on_frames(self._ports[address], frames, now, epoch)
 
     def close(self) -> None:
-        """Stop, and close the socket."""
         super().close()
         self._ports.clear()
         self._close_socket()
 
     def _close_socket(self) -> None:
-        if self._reader is not None:
-            self._reader.stop()
+        self._reader.stop()
         self._sock.close()
 
     @abstractmethod
@@ -232,8 +223,7 @@ class UdpEndpoint(Endpoint):
             self.failures[errno.errorcode.get(number, "OSError")] += 1
             if number == errno.ECONNREFUSED and (port := self._ports.get(address)) is not None:
                 self._on_refused(port)
-        if self._reader is not None:
-            self._reader.renew()
+        self._reader.renew()
         return bool(reports)
 
     def _on_refused(self, port: UdpPort) -> None:
@@ -314,10 +304,11 @@ class UdpClient(UdpEndpoint):
             except BindError:
                 self.failures["family_unavailable"] += 1
                 return False
+            gather_s = self._reader.gather_s
             self._close_socket()
-            self._sock = sock
-            self._reports = ErrorReports(sock)
-            super().start()
+            self._use(sock)
+            self._reader.gather_s = gather_s
+            self._reader.start()
         for port in self.ports:
             self._forget(port)
         self._open(address, None)

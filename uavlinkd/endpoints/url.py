@@ -71,10 +71,8 @@ class SerialUrl:
         return f"{self.kind}:{self.device}:{self.baud}"
 
     kind: ClassVar = EndpointKind.SERIAL
-    listens: ClassVar = False
-    """A wire has one other end."""
-    is_exposed: ClassVar = False
-    """Access to a wire needs presence."""
+    listens: ClassVar = False  # a wire has one other end
+    is_exposed: ClassVar = False  # access to a wire needs presence
 
 
 EndpointUrl = NetworkUrl | SerialUrl

@@ -106,7 +106,6 @@ class Bindings:
 
     @property
     def connections(self) -> int:
-        """How many there are."""
         return sum(map(len, self._pairs.values()))
 
     def handles(self, member: bytes, path: Path, key: bytes) -> tuple[int, ...]:
@@ -157,7 +156,6 @@ class Bindings:
         return changes
 
     def end_path(self, member: bytes, path: Path, now: float) -> Changes:
-        """A path of a member is gone."""
         of_member = self._members[member]
         return self._end([of_member.wishes[key][path] for key in of_member.paths.get(path, ())], now)
 

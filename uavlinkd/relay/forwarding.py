@@ -17,8 +17,7 @@ from uavlinkd.relay.member_settings import RelayLimits
 
 BURST_S = 0.05
 """A member may send what its limits allow in this time at once. The relay has no queue."""
-BURST_BYTES = 1500
-"""And at least one datagram of this length."""
+BURST_BYTES = 1500  # and at least one datagram of this length
 _START = bytes((RELAYED,))
 _HEADER_BYTES = 3
 
@@ -43,14 +42,11 @@ class Meter:
 
     def __init__(self, limits: RelayLimits) -> None:
         self._bytes_until = self._count_until = 0.0
-        self.datagrams = self.bytes = 0
-        """Forwarded."""
-        self.over_limit = 0
-        """Datagrams that were dropped."""
+        self.datagrams = self.bytes = 0  # forwarded
+        self.over_limit = 0  # datagrams that were dropped
         self.set_limits(limits)
 
     def set_limits(self, limits: RelayLimits) -> None:
-        """Apply other limits from now on."""
         self._datagram_s, self._byte_s = 1 / limits.datagrams_s, 8 / limits.bits_s
         self._burst_s = max(BURST_S, self._datagram_s, BURST_BYTES * self._byte_s)
 
@@ -78,11 +74,9 @@ _Key = tuple[int, SocketAddress, bytes]
 
 
 class _Route(NamedTuple):
-    header: bytes
-    """Of the data that is sent."""
+    header: bytes  # of the data that is sent
     path: Path
-    meter: Meter
-    """Of the sender."""
+    meter: Meter  # of the sender
 
 
 class Forwarding:
@@ -92,8 +86,7 @@ class Forwarding:
         self._send = send
         self._clock = clock
         self._routes: dict[_Key, _Route] = {}
-        self.total = Meter(limits)
-        """The limits of all members together."""
+        self.total = Meter(limits)  # the limits of all members together
         self.dropped = Counter[Reason]()
 
     def __len__(self) -> int:

@@ -39,19 +39,15 @@ class RelayMember:
         self.settings = settings
         self.peers = tuple(peers)
         """In the core: several while this daemon's key changes, and the member is a peer too."""
-        self.is_own = is_own
-        """Whether the relay added its peer to the core: it does not carry frames."""
+        self.is_own = is_own  # whether the relay added its peer to the core: it does not carry frames
         self.meter = Meter(settings.limits)
         self.binds = TokenBucket(BINDS_PER_S, BINDS_BURST, now)
-        self.binds_ignored = 0
-        """Binds above :data:`BINDS_PER_S`."""
+        self.binds_ignored = 0  # binds above `BINDS_PER_S`
         self.filter_tests = TokenBucket(c.FILTER_TESTS_PER_S, c.FILTER_TESTS, now)
         self.filter_tests_ignored = 0
         """Filter tests above this limit, or along a path that is not validated or does not work."""
-        self.since = now
-        """When it was up or not for the first time, as it is now."""
-        self.reported_over_limit = 0
-        """Of the meter's count."""
+        self.since = now  # when it was up or not for the first time, as it is now
+        self.reported_over_limit = 0  # of the meter's count
 
     @property
     def peer(self) -> Peer:
@@ -76,16 +72,12 @@ class RelayShell:
     """What a relay uses of its daemon."""
 
     entropy: Entropy
-    clock: Callable[[], float]
-    """Monotonic."""
-    perform: Callable[[list[Output]], None]
-    """Executes outputs of the core."""
-    send: Callable[[bytes, Path], None]
-    """Passes a datagram to the kernel."""
+    clock: Callable[[], float]  # monotonic
+    perform: Callable[[list[Output]], None]  # executes outputs of the core
+    send: Callable[[bytes, Path], None]  # passes a datagram to the kernel
     send_from_new_port: Callable[[bytes, Path], bool]
     """Does so from a port that sent nothing before, and returns whether the kernel accepted it."""
-    on_event: Callable[[o.Event, float], None]
-    """Receives the events of the members that are not peers."""
+    on_event: Callable[[o.Event, float], None]  # receives the events of the members that are not peers
 
 
 class RelayService:
@@ -94,8 +86,7 @@ class RelayService:
     def __init__(self, node: Node, limits: RelayLimits, shell: RelayShell) -> None:
         self._node = node
         self._shell = shell
-        self.members: dict[bytes, RelayMember] = {}
-        """By public key."""
+        self.members: dict[bytes, RelayMember] = {}  # by public key
         self._member_of: dict[LinkedPeer, RelayMember] = {}
         self.bindings = Bindings(shell.entropy)
         self.forwarding = Forwarding(shell.send, shell.clock, limits)
@@ -152,7 +143,6 @@ class RelayService:
     # From the core. Neither method sends.
 
     def on_event(self, event: o.Event, now: float) -> None:
-        """An event of a member."""
         member = self._member_of.get(event.peer)
         if member is None:
             return

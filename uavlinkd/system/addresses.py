@@ -10,10 +10,8 @@ from typing import Any
 
 DEFAULT_PORT = 5790
 """The usual port of a daemon. It is a convention: a configuration always names the port."""
-IPV4_UDP_BYTES = 20 + 8
-"""Header bytes of a datagram over IPv4 (RFC 791, RFC 768)."""
-IPV6_UDP_BYTES = 40 + 8
-"""Header bytes of a datagram over IPv6 (RFC 8200, RFC 768)."""
+IPV4_UDP_BYTES = 20 + 8  # header bytes of a datagram over IPv4 (RFC 791, RFC 768)
+IPV6_UDP_BYTES = 40 + 8  # header bytes of a datagram over IPv6 (RFC 8200, RFC 768)
 
 _MAX_PORT = 65535
 _PORT = re.compile(r"[0-9]{1,5}")

@@ -14,12 +14,8 @@ from ipaddress import IPv4Network, IPv6Address, IPv6Network, ip_address
 from pathlib import Path
 from typing import Final, NamedTuple
 
-try:
+if sys.platform == "linux":
     import fcntl
-except ImportError:  # Windows
-    _CAN_ASK = False
-else:
-    _CAN_ASK = True
 
 # linux/sockios.h
 _SIOCGIFCONF: Final = 0x8912
@@ -32,8 +28,7 @@ _IFF_NOARP: Final = 0x80
 _NAME: Final = struct.Struct("16s")
 _REQUEST: Final = struct.Struct("16s24s" if struct.calcsize("P") == 8 else "16s16s")
 """struct ifreq: the name of an interface, and a union."""
-_CONF: Final = struct.Struct("@iP")
-"""struct ifconf: length and address of a buffer."""
+_CONF: Final = struct.Struct("@iP")  # struct ifconf: length and address of a buffer
 _MOST_ADDRESSES: Final = 256
 # linux/if_addr.h: not usable as a source.
 _IFA_F_DADFAILED: Final = 0x08
@@ -50,11 +45,9 @@ _RTF_REJECT: Final = 0x200
 class Interface(NamedTuple):
     """An interface at one moment."""
 
-    ifindex: int
-    """Its number. An interface that was removed returns with another one."""
+    ifindex: int  # Its number. An interface that was removed returns with another one.
     flags: int
-    hosts: tuple[str, ...]
-    """Its usable addresses, IPv4 first. A link-local IPv6 address has no zone here."""
+    hosts: tuple[str, ...]  # Its usable addresses, IPv4 first. A link-local IPv6 address has no zone here.
 
     @property
     def is_up(self) -> bool:
@@ -69,7 +62,7 @@ class Interface(NamedTuple):
 
 def find_interface(name: str) -> Interface | None:
     """The interface of this name, if the machine has it now. None on systems other than Linux."""
-    if not _CAN_ASK:
+    if sys.platform != "linux":
         return None
     try:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:

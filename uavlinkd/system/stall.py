@@ -37,8 +37,7 @@ class StallWatch:
         self._on_pause = on_pause
         self.turned_at = now
         """The time of the last turn. A read within STALL_S of it may set it, instead of a call of :meth:`turn`."""
-        self.backlogs: WeakSet[Backlog] = WeakSet()
-        """Checked after each pause, as long as they exist."""
+        self.backlogs: WeakSet[Backlog] = WeakSet()  # checked after each pause, as long as they exist
 
     def turn(self, now: float) -> int:
         """Report a turn of the loop and return its epoch. ``now`` is the present monotonic time in seconds."""
@@ -84,8 +83,7 @@ class Backlog:
         self.fd = fd
         self._watch = watch
         self._capacity = capacity
-        self.left = 0
-        """How much of the queue may still be from before a pause."""
+        self.left = 0  # how much of the queue may still be from before a pause
         is_older = opened_in is not None and opened_in != watch.turn(monotonic())
         if is_older or any(backlog.is_stale for backlog in watch.backlogs):
             self.mark()

@@ -54,8 +54,7 @@ class Threads:
 
     def __init__(self, limit: int, name: str) -> None:
         self._name = name
-        self._lock = Lock()
-        """Protects the two below, which change together."""
+        self._lock = Lock()  # protects the two below, which change together
         self._free = limit  # threads that may still be started
         self._waiting: deque[tuple[Future[Any], partial[Any]]] = deque()
 
