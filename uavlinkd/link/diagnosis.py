@@ -139,7 +139,7 @@ def find(daemon: DaemonParts, now: float) -> list[Finding]:
 
     add(Subject.DAEMON, "", [*daemon_problems(moment), *member_problems(moment), *line_problems(moment)])
     for link in daemon.links.values():
-        peer = PeerFacts(moment, link.name, daemon.history.part("peer", link.name), link.config.policy, link)
+        peer = PeerFacts(moment, link)
         add(Subject.PEER, link.name, traffic.peer_problems(peer))
         if link.peer.is_up:
             add(Subject.PEER, link.name, traffic.up_problems(peer))
@@ -148,7 +148,5 @@ def find(daemon: DaemonParts, now: float) -> list[Finding]:
     configs = {config.name: config for config in daemon.config.endpoints}
     for endpoint in daemon.local.endpoints:
         if (config := configs.get(endpoint.name)) is not None:
-            history = daemon.history.part("endpoint", endpoint.name)
-            facts = EndpointFacts(moment, endpoint.name, history, config.policy, endpoint, config)
-            add(Subject.ENDPOINT, endpoint.name, traffic.endpoint_problems(facts))
+            add(Subject.ENDPOINT, endpoint.name, traffic.endpoint_problems(EndpointFacts(moment, endpoint, config)))
     return sorted(findings, key=lambda one: (one.severity, one.subject, one.name, one.cause))

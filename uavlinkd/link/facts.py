@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Final, NamedTuple
 
 from uavlinkd.config import EndpointConfig
 from uavlinkd.core.drops import DropReason
 from uavlinkd.endpoints.ports import Endpoint
-from uavlinkd.link.evidence import ELSEWHERE, PartHistory, Sighting
+from uavlinkd.link.evidence import ELSEWHERE, Sighting
 from uavlinkd.link.parts import DaemonParts
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.relay_link import RelayLink
@@ -70,42 +69,27 @@ class Moment:
                 yield system, link, link.name
 
 
-@dataclass(frozen=True)
 class PartFacts:
     """A peer or an endpoint."""
 
-    moment: Moment
-    name: str
-    history: PartHistory
-    rules: Mapping[str, object]
-    """Its policy, as the file has it."""
-
-    @property
-    def daemon(self) -> DaemonParts:
-        """That of the moment."""
-        return self.moment.daemon
-
-    @property
-    def now(self) -> float:
-        """Monotonic seconds."""
-        return self.moment.now
-
-    @property
-    def rule(self) -> str:
-        """Its policy in two words."""
-        return f"role {self.rules['role']}" if "role" in self.rules else "its policy"
+    def __init__(self, moment: Moment, kind: str, name: str, rules: Mapping[str, object]) -> None:
+        self.moment, self.daemon, self.now = moment, moment.daemon, moment.now
+        self.name = name
+        self.history = moment.daemon.history.part(kind, name)
+        self.rules = rules
+        """Its policy, as the file has it,"""
+        self.rule = f"role {rules['role']}" if "role" in rules else "its policy"
+        """and in two words."""
 
 
-@dataclass(frozen=True)
 class PeerFacts(PartFacts):
     """A peer."""
 
-    link: PeerLink
-
-    @property
-    def addresses(self) -> str:
+    def __init__(self, moment: Moment, link: PeerLink) -> None:
+        super().__init__(moment, "peer", link.name, link.config.policy)
+        self.link = link
+        self.addresses = listed(map(str, link.config.addresses))
         """Those of the file."""
-        return listed(map(str, self.link.config.addresses))
 
     def seen(self, kind: str) -> Sighting | None:
         """Evidence since the link went down."""
@@ -124,12 +108,13 @@ class PeerFacts(PartFacts):
         return _since(self.daemon.evidence.seen_at_relay(kind, relay, self.now), relay.silent_since)
 
 
-@dataclass(frozen=True)
 class EndpointFacts(PartFacts):
     """A local endpoint."""
 
-    endpoint: Endpoint
-    config: EndpointConfig
+    def __init__(self, moment: Moment, endpoint: Endpoint, config: EndpointConfig) -> None:
+        super().__init__(moment, "endpoint", endpoint.name, config.policy)
+        self.endpoint = endpoint
+        self.config = config
 
 
 def _since(sighting: Sighting | None, since: float) -> Sighting | None:
