@@ -178,7 +178,7 @@ class LocalEndpoints:
     # Time.
 
     def do_housekeeping(self, radio: LinkFigures | None, now: float) -> None:
-        """Forget clients that have gone, log silent endpoints, and send RADIO_STATUS. Call it once a second."""
+        """Forget clients that have gone, and send RADIO_STATUS. Call it once a second."""
         for endpoint in self.endpoints:
             endpoint.do_housekeeping(now)
             source, _ = self._sources[endpoint.name]
