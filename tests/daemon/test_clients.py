@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
-from pathlib import Path
 
 import pytest
 
@@ -32,7 +31,7 @@ async def flying(
 ) -> AsyncIterator[tuple[Flight, DaemonProcess, DaemonProcess]]:
     """An autopilot, its daemon, and the ground station's: all linked."""
     drone, ground = drone_and_ground(stage, system=SYSTEM)
-    # MAVProxy and mavutil speak as 255 here, MAVSDK as 245.
+    # MAVProxy speaks as 255 here, MAVSDK as 245.
     drone.config["peer"][0]["system_ids"] = [245, 255]
     drone.add_endpoint("autopilot", drone_url)
     ground.add_endpoint("station", ground_url)
@@ -66,54 +65,37 @@ async def check(
 
 
 @pytest.mark.long
-async def test_mavutil_flies_through_a_serial_port(stage: Stage) -> None:
-    """mavutil on a serial port, the autopilot called on UDP: connect, parameters, mission, arm, up, down."""
-    scenarios.need("pymavlink.mavutil")
-    port = free_port()
+async def test_mavproxy_flies_through_a_serial_port(stage: Stage) -> None:
+    """MAVProxy on a serial port, the autopilot called on UDP: connect, parameters, mission, arm, up, down."""
     fast = ModemSettings(air_bits_s=1e6, line_baud=115_200, turn_around_s=0.0, queue_bytes=1 << 16)
     ports = ModemPorts(PortSettings(stage.folder / "left", stage.folder / "right", fast))
     await ports.start()
+    ground_url, url = f"serial:{ports.settings.left}:115200", str(ports.settings.right)
     try:
-        async with flying(
-            stage,
-            drone_url=f"udpout:127.0.0.1:{port}",
-            flight_url=f"udpin:127.0.0.1:{port}",
-            ground_url=f"serial:{ports.settings.left}:115200",
-        ) as (flight, drone, ground):
-            await check(flight, drone, ground, lambda: scenarios.fly_with_mavutil(str(ports.settings.right)))
+        await fly_with_mavproxy(stage, ("udpout", "udpin"), ground_url, url)
     finally:
         await ports.stop()
 
 
 @pytest.mark.long
-async def test_mavproxy_flies_through_tcp(stage: Stage, tmp_path: Path) -> None:
-    """MAVProxy as a TCP client, the autopilot called on UDP: connect, parameters, mission, arm, up, down."""
+@pytest.mark.parametrize(("ground", "station"), [("tcpin", "tcp"), ("udpout", "udpin")])
+async def test_mavproxy_flies_through_a_socket(stage: Stage, ground: str, station: str) -> None:
+    """MAVProxy as a TCP client, or listening on UDP."""
+    address = f"127.0.0.1:{free_port()}"
+    await fly_with_mavproxy(stage, ("udpin", "udpout"), f"{ground}:{address}", f"{station}:{address}")
+
+
+async def fly_with_mavproxy(stage: Stage, air: tuple[str, str], ground_url: str, url: str) -> None:
+    """Fly; ``air``: how the vehicle's daemon and the autopilot open their connection."""
     scenarios.need("MAVProxy")
-    vehicle, station = free_port(), free_port()
-    async with flying(
-        stage,
-        drone_url=f"udpout:127.0.0.1:{vehicle}",
-        flight_url=f"udpin:127.0.0.1:{vehicle}",
-        ground_url=f"tcpin:127.0.0.1:{station}",
-    ) as (flight, drone, ground):
-        url = f"tcp:127.0.0.1:{station}"
-        await check(flight, drone, ground, lambda: scenarios.fly_with_mavproxy(url, tmp_path, flight))
+    drone_url, flight_url = (f"{kind}:127.0.0.1:{port}" for port in [free_port()] for kind in air)
+    async with flying(stage, drone_url, flight_url, ground_url) as (flight, drone, ground):
+        await check(flight, drone, ground, lambda: scenarios.fly_with_mavproxy(url, stage.folder, flight))
 
 
-@pytest.mark.parametrize(
-    ("client", "kinds", "fly"),
-    [
-        ("pymavlink.mavutil", ("udpin", "udpout", "udpout", "udpin"), scenarios.fly_with_mavutil),
-        ("mavsdk.asyncio", ("udpin", "udpout", "udpin", "udpout"), scenarios.fly_with_mavsdk),
-    ],
-)
-async def test_client_flies_through_udp(
-    stage: Stage, client: str, kinds: tuple[str, str, str, str], fly: Callable[[str], Awaitable[Seen]]
-) -> None:
-    """A client that listens or calls on UDP: connect, parameters, mission, arm, up, down."""
-    scenarios.need(client)
+async def test_mavsdk_flies_through_udp(stage: Stage) -> None:
+    """MAVSDK calls on UDP: connect, parameters, mission, arm, up, down."""
+    scenarios.need("mavsdk.asyncio")
     air, ground_at = f"127.0.0.1:{free_port()}", f"127.0.0.1:{free_port()}"
-    drone_kind, flight_kind, ground_kind, station_kind = kinds
-    urls = f"{drone_kind}:{air}", f"{flight_kind}:{air}", f"{ground_kind}:{ground_at}"
-    async with flying(stage, *urls) as (flight, drone, ground):
-        await check(flight, drone, ground, lambda: fly(f"{station_kind}:{ground_at}"))
+    async with flying(stage, f"udpin:{air}", f"udpout:{air}", f"udpin:{ground_at}") as (flight, drone, ground):
+        await check(flight, drone, ground, lambda: scenarios.fly_with_mavsdk(f"udpout:{ground_at}"))

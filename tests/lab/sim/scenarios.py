@@ -82,16 +82,8 @@ def check_flown(flight: Flight) -> None:
 
 async def fly_with_mavsdk(url: str) -> Seen:
     """MAVSDK's own library flies the vehicle."""
-    return await _run_client("mavsdk", url)
-
-
-async def fly_with_mavutil(url: str) -> Seen:
-    return await _run_client("mavutil", url)
-
-
-async def _run_client(client: str, url: str) -> Seen:
     process = await asyncio.create_subprocess_exec(
-        *end_with_parent(PYTHON, str(CLIENTS), client, url),
+        *end_with_parent(PYTHON, str(CLIENTS), url),
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.STDOUT,
     )
