@@ -270,7 +270,9 @@ def _route(host: str, *options: str) -> dict[str, Any] | None:
         return None
     words = [_IP, "-j", "route", "get", *options, host.partition("%")[0]]
     try:
-        answer = subprocess.run(words, capture_output=True, text=True, timeout=_IP_S, check=False)  # noqa: S603  a fixed command
+        answer = subprocess.run(  # noqa: S603  a fixed command
+            words, capture_output=True, text=True, timeout=_IP_S, check=False
+        )
         (route,) = json.loads(answer.stdout)
     except (OSError, ValueError, subprocess.TimeoutExpired):
         return None
