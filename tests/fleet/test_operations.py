@@ -13,8 +13,7 @@ import pytest
 from tests.fleet.vehicles import loaded
 from uavlinkd.config import keys
 from uavlinkd.fleet import operations, transaction
-from uavlinkd.fleet.manifest import Fleet, FleetSettings, MemberKind, read_manifest
-from uavlinkd.fleet.plan import FleetError
+from uavlinkd.fleet.manifest import Fleet, FleetError, FleetSettings, MemberKind, read_manifest
 from uavlinkd.system.addresses import parse_address
 
 

@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from uavlinkd.fleet.manifest import FleetSettings, check_settings
-from uavlinkd.fleet.plan import FleetError, fill, planned_address
+from uavlinkd.fleet.manifest import FleetError, FleetSettings, check_settings, fill, planned_address
 
 
 @pytest.mark.parametrize(

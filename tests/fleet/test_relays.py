@@ -10,8 +10,7 @@ import pytest
 from tests.fleet.vehicles import NAMES, RELAY, Vehicles, flying, loaded
 from tests.waiting import until
 from uavlinkd.fleet import operations
-from uavlinkd.fleet.manifest import FleetSettings, MemberKind, read_manifest
-from uavlinkd.fleet.plan import NO_PLAN, FleetError
+from uavlinkd.fleet.manifest import NO_PLAN, FleetError, FleetSettings, MemberKind, read_manifest
 from uavlinkd.fleet.transaction import check_members
 from uavlinkd.system.addresses import Address
 

@@ -16,8 +16,7 @@ from tests.waiting import until
 from uavlinkd.config import Config
 from uavlinkd.config.load import load_config
 from uavlinkd.fleet import operations
-from uavlinkd.fleet.manifest import FleetSettings, read_manifest
-from uavlinkd.fleet.plan import NO_PLAN
+from uavlinkd.fleet.manifest import NO_PLAN, FleetSettings, read_manifest
 from uavlinkd.lab.child_processes import end_with_parent
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.ops.control import ControlError, ask

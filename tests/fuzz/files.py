@@ -15,8 +15,7 @@ from uavlinkd.config.keys import KeyFileError, decode_key, encode_key, read_secr
 from uavlinkd.config.load import load_config
 from uavlinkd.core import wire
 from uavlinkd.core.suites import SUITES
-from uavlinkd.fleet.manifest import FILE_NAME, read_manifest, write_manifest
-from uavlinkd.fleet.plan import FleetError
+from uavlinkd.fleet.manifest import FILE_NAME, FleetError, read_manifest, write_manifest
 from uavlinkd.lab.mitm import anatomy
 from uavlinkd.lab.mitm.proxy_settings import ProxySettings, SettingsError, load_proxy_settings
 from uavlinkd.lab.sim.tlog import TlogError, parse_tlog

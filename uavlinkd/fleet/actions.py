@@ -7,9 +7,8 @@ import os
 import sys
 
 from uavlinkd.fleet import operations
-from uavlinkd.fleet.manifest import FleetSettings, MemberKind
+from uavlinkd.fleet.manifest import DEFAULT_PLAN, NO_PLAN, FleetError, FleetSettings, MemberKind
 from uavlinkd.fleet.operations import Result
-from uavlinkd.fleet.plan import DEFAULT_PLAN, NO_PLAN, FleetError
 from uavlinkd.system.addresses import Address, AddressError, parse_address
 from uavlinkd.system.terminal import OK, printable
 

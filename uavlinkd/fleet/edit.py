@@ -13,8 +13,7 @@ from collections.abc import Callable, Sequence, Set
 from typing import Any
 
 from uavlinkd.fleet.files import CONFIDENTIAL, key_lines, public_key_lines
-from uavlinkd.fleet.manifest import Member
-from uavlinkd.fleet.plan import FleetError
+from uavlinkd.fleet.manifest import FleetError, Member
 
 _HEADER = re.compile(r"[ \t]*\[")
 _KEY = re.compile(r"[ \t]*(?:\"([^\"]*)\"|'([^']*)'|([A-Za-z0-9_-]+))[ \t]*=")

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from uavlinkd.fleet.manifest import ROLES, Fleet, Member, MemberKind, literal
-from uavlinkd.fleet.plan import fill
+from uavlinkd.fleet.manifest import ROLES, Fleet, Member, MemberKind, fill, literal
 
 CONFIDENTIAL = "confidential = true"
 """In ``[link]`` of a fleet with relays: otherwise their owners could read the frames."""

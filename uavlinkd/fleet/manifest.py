@@ -1,6 +1,7 @@
 """The fleet's manifest: its members and their public keys. It contains no secret and may be in a public repository.
 
-Every command writes ``fleet.toml`` last, so that it describes what the folders contain.
+Every command writes ``fleet.toml`` last, so that it describes what the folders contain. What cannot be is refused
+with a FleetError, which says why.
 """
 
 from __future__ import annotations
@@ -11,28 +12,89 @@ import tomllib
 from collections.abc import Iterable
 from dataclasses import dataclass, field, fields
 from enum import StrEnum
+from ipaddress import ip_network
 from pathlib import Path
 from typing import Any
 
 from uavlinkd.config.keys import decode_key
 from uavlinkd.config.relay_rules import MOST as MOST_RELAYS
 from uavlinkd.core.suites import SUITES_BY_NAME
-from uavlinkd.fleet.plan import (
-    DEFAULT_PLAN,
-    NO_PLAN,
-    SYSTEM_IDS,
-    FleetError,
-    FleetFileError,
-    fill,
-    no_fleet,
-    planned_address,
-)
-from uavlinkd.system.addresses import Address, AddressError, parse_address
-from uavlinkd.system.terminal import printable
+from uavlinkd.system.addresses import DEFAULT_PORT, Address, AddressError, parse_address
+from uavlinkd.system.terminal import FAILED, UsageError, printable
 
 FILE_NAME = "fleet.toml"
 _TEMPLATES = ("control_socket", "drone_url", "ground_station_url")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
+DEFAULT_PLAN = "10.13.0.0/24"
+NO_PLAN = "none"
+"""Members have no addresses: they reach each other along relays."""
+SYSTEM_IDS = range(1, 256)
+"""The system ids of MAVLink."""
+_BRACES = re.compile(r"\{n\}|\{name\}|[{}]")
+
+
+class FleetError(UsageError):
+    """The command line, the manifest or a configuration is wrong. The command changed nothing.
+
+    Each message is for a person and contains no secret.
+    """
+
+
+class FleetFileError(FleetError):
+    """A file or folder cannot be read or written."""
+
+    status = FAILED
+
+
+def no_fleet(folder: Path) -> FleetError:
+    """The error for a folder without a manifest."""
+    return FleetError(
+        f"{folder} contains no fleet: name its folder with --out DIR,"
+        f" or create one with `uavlinkd fleet init --out {folder}`"
+    )
+
+
+def fill(template: str, number: int, name: str) -> str:
+    """Replace ``{n}`` and ``{name}``. ``str.format`` would give access to attributes."""
+    values = {"{n}": str(number), "{name}": name}
+
+    def value(match: re.Match[str]) -> str:
+        if match[0] not in values:
+            raise FleetError("the only braces in a template are {n} and {name}")
+        return values[match[0]]
+
+    return _BRACES.sub(value, template)
+
+
+def planned_address(plan: str, name: str, system_id: int, *, is_drone: bool) -> Address:
+    """The address of a member by a plan, which is a network or a template.
+
+    In a network, drone ``n`` has the ``n``-th address. The ground station with system id 255 has the last host
+    address, at most the 254th; the one with 254 has the address before it. In a template, ``{n}`` is the same number
+    and ``{name}`` the member's name: ``10.13.0.{n}:5790``, ``{name}.local:5790``.
+    """
+    if "{" in plan or "}" in plan:
+        try:
+            address = parse_address(fill(plan, system_id if is_drone else system_id - 1, name), allow_names=True)
+        except (AddressError, FleetError) as error:
+            raise FleetError(f'the address plan "{plan}" has no address for {name}: {error}') from None
+        if "{n}" not in plan and "{name}" not in plan:
+            raise FleetError(
+                f'the address plan "{plan}" contains neither {{n}} nor {{name}}: all addresses would be the same'
+            )
+        return address
+    try:
+        network = ip_network(plan)
+    except ValueError:
+        raise FleetError(
+            f'the address plan "{plan}" is neither a network such as {DEFAULT_PLAN} (its last bits zero)'
+            " nor a template such as 10.13.0.{n}:5790"
+        ) from None
+    size = min(network.num_addresses, 256)
+    offset = system_id if is_drone else size - 1 - (256 - system_id)
+    if not 0 < offset < size - 1:
+        raise FleetError(f"the network {network} has no address for {name}: use a larger one")
+    return Address(str(network[offset]), DEFAULT_PORT)
 
 
 class MemberKind(StrEnum):
@@ -111,11 +173,7 @@ class Fleet:
     members: tuple[Member, ...] = ()
 
     def member(self, name: str) -> Member:
-        """The member with this name.
-
-        Raises:
-            FleetError: it does not exist.
-        """
+        """The member with this name."""
         for member in self.members:
             if member.name == name:
                 return member
@@ -132,11 +190,7 @@ class Fleet:
         return [member for member in self.members if member.is_relay]
 
     def with_member(self, member: Member) -> Fleet:
-        """Add a member, or replace the member with its name.
-
-        Raises:
-            FleetError: another member has its system id or address.
-        """
+        """Add a member, or replace the member with its name."""
         for other in self.members:
             if other.name == member.name:
                 continue
@@ -156,11 +210,7 @@ class Fleet:
         address: Address | None = None,
         system_id: int | None = None,
     ) -> Member:
-        """Make a member. By default drones have the next system id from 1 up, others from 255 down.
-
-        Raises:
-            FleetError: the name is not valid or is taken, there is no free system id or address, or a relay has none.
-        """
+        """Make a member. By default drones have the next system id from 1 up, others from 255 down."""
         if not _NAME.fullmatch(name):
             raise FleetError(
                 f'"{printable(name)}" is not a name: write up to 63 letters, digits, dots, hyphens and underscores'
@@ -206,12 +256,7 @@ def literal(value: object) -> str:
 
 
 def read_manifest(folder: Path) -> Fleet:
-    """Read the manifest in a folder.
-
-    Raises:
-        FleetError: there is no manifest, or it is damaged.
-        FleetFileError: it cannot be read.
-    """
+    """Read the manifest in a folder."""
     path = folder / FILE_NAME
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -236,11 +281,7 @@ def read_manifest(folder: Path) -> Fleet:
 
 
 def check_settings(settings: FleetSettings) -> None:
-    """Check the values of all settings.
-
-    Raises:
-        FleetError: one is not valid.
-    """
+    """Check the values of all settings."""
     for setting in fields(FleetSettings):
         if not isinstance(getattr(settings, setting.name), bool if setting.name == "psk" else str):
             raise FleetError(f"{setting.name} has a value of the wrong type")

@@ -2,6 +2,7 @@
 
 A fleet's folder contains the manifest and a folder for each member. Only that folder contains the member's private
 key. The commands do not need the key again: if a folder was moved to its vehicle, they write the changed files only.
+An operation that raises FleetError changed nothing.
 """
 
 from __future__ import annotations
@@ -17,8 +18,16 @@ from pathlib import Path
 from uavlinkd.config import keys
 from uavlinkd.core.crypto import x25519_public_key
 from uavlinkd.fleet import edit, files
-from uavlinkd.fleet.manifest import Fleet, FleetSettings, Member, MemberKind, check_settings, read_manifest
-from uavlinkd.fleet.plan import FleetError, FleetFileError
+from uavlinkd.fleet.manifest import (
+    Fleet,
+    FleetError,
+    FleetFileError,
+    FleetSettings,
+    Member,
+    MemberKind,
+    check_settings,
+    read_manifest,
+)
 from uavlinkd.fleet.transaction import FileChanges, apply, is_loadable, lock
 from uavlinkd.system.addresses import Address
 
@@ -46,9 +55,6 @@ def init(
     """Create a fleet in a new folder. If a step fails, the folder is not created.
 
     ``relays``: the public address of each.
-
-    Raises:
-        FleetError: what is wrong.
     """
     check_settings(settings)
     if min(drones, ground_stations, observers) < 0 or not drones + ground_stations + observers:
@@ -88,11 +94,7 @@ def init(
 def add(
     folder: Path, name: str, kind: MemberKind, *, address: Address | None = None, system_id: int | None = None
 ) -> Result:
-    """Add a member, and add it as a peer to the others' configurations.
-
-    Raises:
-        FleetError: what is wrong. Nothing was changed.
-    """
+    """Add a member, and add it as a peer to the others' configurations."""
     with _open_fleet(folder) as before:
         private = keys.generate_private_key()
         member = before.new_member(name, kind, keys.public_key_text(private), address=address, system_id=system_id)
@@ -108,11 +110,7 @@ def add(
 
 
 def remove(folder: Path, name: str) -> Result:
-    """Remove a member: the others refuse it once they have their files. Its own folder is kept.
-
-    Raises:
-        FleetError: what is wrong. Nothing was changed.
-    """
+    """Remove a member: the others refuse it once they have their files. Its own folder is kept."""
     with _open_fleet(folder) as before:
         member = before.member(name)
         changes = FileChanges(folder, replace(before, members=tuple(one for one in before.members if one != member)))
@@ -131,9 +129,6 @@ def rotate(folder: Path, name: str, *, at_once: bool = False) -> Result:
     The old key stays valid: the member's daemon and the others' files have both keys until a session confirms the
     new one or the grace period ends. Therefore the files may arrive in any order; with relays, the member's own files
     last. ``at_once`` is for a compromised key: it revokes the old key immediately and replaces the member's PSKs.
-
-    Raises:
-        FleetError: what is wrong. Nothing was changed.
     """
     with _open_fleet(folder) as before:
         old = before.member(name)
@@ -179,11 +174,7 @@ def finish_command(folder: Path, name: str) -> str:
 
 
 def finish_rotation(folder: Path, name: str) -> Result:
-    """Remove a member's old key from all files.
-
-    Raises:
-        FleetError: what is wrong. Nothing was changed.
-    """
+    """Remove a member's old key from all files."""
     with _open_fleet(folder) as before:
         old = before.member(name)
         if old.previous_public_key is None:
@@ -255,11 +246,7 @@ def _edit(changes: FileChanges, member: Member, change: Callable[[str], str]) ->
 
 
 def _check_unused(changes: FileChanges, former: Member) -> None:
-    """Check that no member's configuration contains a key of a former member, under any peer's name.
-
-    Raises:
-        FleetError: one does; with the file and the section.
-    """
+    """Check that no member's configuration contains a key of a former member, under any peer's name."""
     for member in changes.fleet.members:
         path = changes.folder / member.name / files.config_file(member)
         try:

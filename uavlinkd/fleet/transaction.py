@@ -14,8 +14,7 @@ from pathlib import Path
 from uavlinkd.config import ConfigError, keys
 from uavlinkd.config.load import load_config
 from uavlinkd.fleet.files import config_file
-from uavlinkd.fleet.manifest import FILE_NAME, Fleet, Member, write_manifest
-from uavlinkd.fleet.plan import FleetError, FleetFileError, no_fleet
+from uavlinkd.fleet.manifest import FILE_NAME, Fleet, FleetError, FleetFileError, Member, no_fleet, write_manifest
 from uavlinkd.system.terminal import printable
 
 
