@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import socket
-import threading
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,56 +10,41 @@ import pytest
 
 from tests.ops.test_status_screen import peer, status_of
 from uavlinkd.cli import main
-from uavlinkd.ops import commands
+from uavlinkd.ops import commands, control
+from uavlinkd.ops.control import ask
 from uavlinkd.system.terminal import FAILED, OK, WRONG
 
 
 class Daemons:
-    """Control sockets in a folder, each with a fixed answer."""
+    """Control sockets in a folder, each with a fixed answer; without one, no daemon listens."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.requests: list[tuple[str, str]] = []
-        self._sockets: list[socket.socket] = []
+        self.answers: dict[Path, dict[str, Any]] = {}
+        self.requests: list[tuple[Path, str]] = []
 
-    def add(self, name: str, answer: dict[str, Any], instance: str = "") -> Path:
-        """Serve an answer at the socket of the service, or of an instance."""
+    def add(self, answer: dict[str, Any] | None, instance: str = "") -> Path:
+        """The socket of the service, or of an instance."""
         path = self.folder / instance / "control.sock"
         path.parent.mkdir(exist_ok=True, parents=True)
-        server = socket.socket(socket.AF_UNIX)
-        server.bind(str(path))
-        server.listen()
-        self._sockets.append(server)
-        threading.Thread(target=self._serve, args=(server, name, answer), daemon=True).start()
+        path.touch()
+        if answer is not None:
+            self.answers[path] = answer
         return path
 
-    def _serve(self, server: socket.socket, name: str, answer: dict[str, Any]) -> None:
-        while True:
-            try:
-                connection, _ = server.accept()
-            except OSError:
-                return
-            with connection:
-                self.requests.append((name, connection.recv(100).decode().strip()))
-                connection.sendall(json.dumps(answer).encode() + b"\n")
-
-    def close(self) -> None:
-        """Stop to serve; the sockets' files stay."""
-        while self._sockets:
-            server = self._sockets.pop()
-            server.shutdown(socket.SHUT_RDWR)
-            server.close()
+    def ask(self, path: Path, request: str, **options: Any) -> dict[str, Any]:
+        """In place of a request through the socket."""
+        self.requests.append((path, request))
+        return self.answers[path] if path in self.answers else ask(path, request, **options)
 
 
 @pytest.fixture
-def daemons(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Daemons]:
-    """A folder in place of /run/uavlinkd; short enough for the path of a socket."""
-    monkeypatch.chdir(tmp_path)
-    folder = Path("run")
-    monkeypatch.setattr(commands, "RUNTIME_FOLDER", folder)
-    daemons = Daemons(folder)
-    yield daemons
-    daemons.close()
+def daemons(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Daemons:
+    """A folder in place of /run/uavlinkd."""
+    daemons = Daemons(tmp_path / "run")
+    monkeypatch.setattr(commands, "RUNTIME_FOLDER", daemons.folder)
+    monkeypatch.setattr(control, "ask", daemons.ask)
+    return daemons
 
 
 def status(name: str, state: str = "up") -> dict[str, Any]:
@@ -72,35 +54,28 @@ def status(name: str, state: str = "up") -> dict[str, Any]:
 
 def test_several_daemons_are_shown_one_after_another(daemons: Daemons, capsys: pytest.CaptureFixture[str]) -> None:
     """The service first, then its instances by name; the exit status is the worst one."""
-    daemons.add("ground", status("ground"))
+    daemons.add(status("ground"))
     assert main(["status"]) == OK
     assert "ground  1 of 1 peers up" in capsys.readouterr().out
-    daemons.add("drone2", status("drone2", "waiting"), "drone2")
-    daemons.add("drone1", status("drone1"), "drone1")
+    daemons.add(status("drone2", "waiting"), "drone2")
+    daemons.add(status("drone1"), "drone1")
     assert main(["status"]) == FAILED
     out = capsys.readouterr().out
     assert out.index("ground  1 of 1") < out.index("drone1  1 of 1") < out.index("drone2  0 of 1")
     assert main(["status", "--json"]) == FAILED
-    assert [json.loads(line)["name"] for line in capsys.readouterr().out.splitlines()] == [
-        "ground",
-        "drone1",
-        "drone2",
-    ]
+    names = ["ground", "drone1", "drone2"]
+    assert [json.loads(line)["name"] for line in capsys.readouterr().out.splitlines()] == names
     assert main(["peer", "list"]) == OK
-    assert [line for line in capsys.readouterr().out.splitlines() if line.endswith(":")] == [
-        "ground:",
-        "drone1:",
-        "drone2:",
-    ]
+    lines = capsys.readouterr().out.splitlines()
+    assert [line for line in lines if line.endswith(":")] == [f"{name}:" for name in names]
 
 
 def test_a_daemon_that_does_not_answer_does_not_hide_others(
     daemons: Daemons, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A socket that a killed daemon left is reported beside the others."""
-    path = daemons.add("killed", {})
-    daemons.close()
-    daemons.add("drone1", status("drone1"), "drone1")
+    path = daemons.add(None)
+    daemons.add(status("drone1"), "drone1")
     assert main(["status"]) == FAILED
     out, err = capsys.readouterr()
     assert "drone1  1 of 1 peers up" in out
@@ -109,11 +84,11 @@ def test_a_daemon_that_does_not_answer_does_not_hide_others(
 
 def test_reload_of_several_daemons_needs_a_name(daemons: Daemons, capsys: pytest.CaptureFixture[str]) -> None:
     """No daemon reads its file again by accident: the message lists the sockets."""
-    paths = [daemons.add(name, {"problems": [], "name": name}, name) for name in ("drone1", "drone2")]
+    paths = [daemons.add({"problems": [], "name": name}, name) for name in ("drone1", "drone2")]
     assert main(["reload"]) == WRONG
     err = capsys.readouterr().err
     assert all(f"--socket {path}" in err for path in paths)
     assert daemons.requests == []
     assert main(["reload", "--socket", str(paths[1])]) == OK
     assert capsys.readouterr().out == "drone2 reloaded\n"
-    assert daemons.requests == [("drone2", "reload")]
+    assert daemons.requests == [(paths[1], "reload")]
