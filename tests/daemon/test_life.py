@@ -6,16 +6,19 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+import socket
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from tests.daemon.frames import frame
 from tests.daemon.harness import Stage
 from tests.daemon.process import DaemonProcess
 from tests.needs import need
-from tests.waiting import PATIENCE_S
+from tests.waiting import PATIENCE_S, until
+from uavlinkd.lab.sim.tlog import read_tlog
 
 
 def run(daemon: DaemonProcess, *command: str) -> subprocess.CompletedProcess[str]:
@@ -107,3 +110,82 @@ async def test_no_core_dump_holds_the_keys(stage: Stage) -> None:
     need(limits.exists(), "Linux's /proc")
     (line,) = [line for line in limits.read_text().splitlines() if line.startswith("Max core file size")]
     assert line.split()[4:6] == ["0", "0"]
+
+
+# A daemon and its service manager, played by a socket. ``tests/compose`` has a real systemd.
+
+
+class Manager(asyncio.DatagramProtocol):
+    """What a service manager receives, in order."""
+
+    def __init__(self) -> None:
+        self.received: list[str] = []
+
+    def datagram_received(self, data: bytes, addr: object) -> None:
+        self.received.append(data.decode())
+
+    async def until_received(self, message: str, times: int = 1) -> None:
+        """Wait until the daemon has sent a message so often."""
+        await until(lambda: self.received.count(message) >= times)
+
+
+async def supervised(daemon: DaemonProcess) -> tuple[Manager, asyncio.BaseTransport]:
+    """Start a daemon under a manager of its own, with a watchdog."""
+    sock = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    sock.bind(str(daemon.folder / "notify"))
+    transport, manager = await asyncio.get_running_loop().create_datagram_endpoint(Manager, sock=sock)
+    await daemon.start({"NOTIFY_SOCKET": str(daemon.folder / "notify"), "WATCHDOG_USEC": "2000000"})
+    return manager, transport
+
+
+async def test_manager_is_notified_from_the_start_to_the_end(stage: Stage) -> None:
+    """Ready when the daemon answers, peers up, a reload, a refused file, a peer that goes, the end."""
+    a, b = stage.pair()
+    manager, transport = await supervised(a)
+    await manager.until_received("READY=1")
+    await a.status()
+    assert manager.received[0] == "READY=1"
+    await b.start()
+    await manager.until_received("STATUS=1 of 1 peers up")
+    await manager.until_received("WATCHDOG=1", 2)
+    await a.send_signal(signal.SIGHUP)
+    await manager.until_received("READY=1", 2)
+    assert len([one for one in manager.received if one.startswith("RELOADING=1\nMONOTONIC_USEC=")]) == 1
+    good = a.config_file.read_text()
+    a.config_file.write_text(f"colour = 1\n{good}")
+    await a.send_signal(signal.SIGHUP)
+    await manager.until_received("STATUS=1 of 1 peers up; the new configuration was refused")
+    a.config_file.write_text(good)
+    await a.send_signal(signal.SIGHUP)
+    await manager.until_received("STATUS=1 of 1 peers up", 2)
+    await b.stop()
+    await manager.until_received("STATUS=0 of 1 peers up")
+    await a.stop()
+    assert manager.received[-1] == "STOPPING=1"
+    transport.close()
+
+
+# The recording of a real daemon.
+
+FROM_PEER = 0
+
+
+def recorded(daemon: DaemonProcess) -> list[tuple[int, bytes]]:
+    """Which way, and what, of its only file."""
+    (path,) = (daemon.folder / "flights").iterdir()
+    return [(record.time_us & 3, record.frame) for record in read_tlog(path).records]
+
+
+async def test_what_a_policy_refuses_is_recorded_as_it_came(stage: Stage) -> None:
+    """It crossed the link: of a captured peer one wants to know what it tried."""
+    a, b = stage.pair()
+    b.config["recording"] = {"folder": "flights", "min_free_bytes": 100_000}
+    into_a = a.add_endpoint("autopilot")
+    b.config["peer"][0] |= {"system_ids": [7], "role": "vehicle"}
+    await stage.start(a, b)
+    client = await stage.client()
+    client.send(frame(1), into_a)
+    await b.until(lambda status: bool(status["peers"]["drone0"]["refused"]["in"]))
+    await b.until(lambda status: status["recording"]["frames"] == 1)
+    await b.stop()
+    assert recorded(b) == [(FROM_PEER, frame(1))]
