@@ -40,7 +40,7 @@ from uavlinkd.core.suites import SUITES_BY_NAME
 from uavlinkd.endpoints.url import SerialUrl
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.mavlink.policy.gate import Refusal
-from uavlinkd.relay.member_settings import RelayLimits
+from uavlinkd.relay.forwarding import RelayLimits
 from uavlinkd.system.addresses import Address
 
 

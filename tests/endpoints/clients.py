@@ -14,7 +14,8 @@ from tests.policies import TRUSTED
 from tests.samples import file_part, frames_of, number_value, raws
 from uavlinkd.endpoints.ports import LocalPort
 from uavlinkd.endpoints.stream_endpoint import StreamEndpoint
-from uavlinkd.endpoints.udp import UdpServer
+from uavlinkd.endpoints.tcp import TcpServer
+from uavlinkd.endpoints.udp import UdpEndpoint, UdpServer
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.delivery import Source
@@ -103,6 +104,12 @@ class Recorder:
         self.epochs.append(epoch)
         self.waited.append(waited_s)
         self.on_batch()
+
+
+def address_of(endpoint: TcpServer | UdpEndpoint) -> tuple[str, int]:
+    """The address of its socket."""
+    host, port = (endpoint.listener if isinstance(endpoint, TcpServer) else endpoint._sock).getsockname()[:2]
+    return host, port
 
 
 def recorder(endpoint: StreamEndpoint | UdpServer) -> Recorder:

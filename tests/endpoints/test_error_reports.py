@@ -7,7 +7,7 @@ import errno
 import socket
 
 from tests.daemon.udp import open_socket
-from tests.endpoints.clients import HOSTS, LOOPS, NewLoop, Recorder, frame, run_in, write
+from tests.endpoints.clients import HOSTS, LOOPS, NewLoop, Recorder, address_of, frame, run_in, write
 from tests.needs import need
 from tests.waiting import until
 from uavlinkd.endpoints.sockets import REPORTS_PER_S, ErrorReports, udp_socket
@@ -61,7 +61,7 @@ def test_client_that_does_not_listen_is_counted(new_loop: NewLoop) -> None:
             client.setblocking(False)
             write(target, [frame(7)], monotonic())
             assert client.recv(1000) == frame(7)
-            client.sendto(frame(8), endpoint.address)
+            client.sendto(frame(8), address_of(endpoint))
             await until(lambda: endpoint.counters.frames == 1)
         endpoint.close()
 

@@ -278,7 +278,7 @@ def test_a_full_socket_counts_as_no_more_than_its_receive_buffer(pair: Pair, siz
         pair.send(bytes(size))
     pause_process(pair)
     read = sum(len(datagram) + DATAGRAM_OVERHEAD_BYTES for datagram in pair.wake_up())
-    while pair.reader.backlog.is_stale:
+    while pair.reader.backlog.left:
         read += sum(len(datagram) + DATAGRAM_OVERHEAD_BYTES for datagram in pair.wake_up())
     with pytest.raises(BlockingIOError):
         pair.receiver.recv(1)

@@ -13,7 +13,7 @@ from time import monotonic
 
 import pytest
 
-from tests.endpoints.clients import frame, large_frame, recorder, write
+from tests.endpoints.clients import address_of, frame, large_frame, recorder, write
 from tests.waiting import until
 from uavlinkd.endpoints import tcp
 from uavlinkd.endpoints.ports import CLIENT_SILENT_S, CLIENTS_PER_ENDPOINT
@@ -31,7 +31,7 @@ Connect = Callable[[], socket.socket]
 def connect(server: TcpServer) -> Iterator[Connect]:
     """Connects a client to the server."""
     with ExitStack() as stack:
-        yield lambda: stack.enter_context(socket.create_connection(server.address, timeout=60))
+        yield lambda: stack.enter_context(socket.create_connection(address_of(server), timeout=60))
 
 
 async def test_each_client_is_a_port(server: TcpServer, connect: Connect) -> None:

@@ -11,7 +11,7 @@ from time import monotonic
 import pytest
 from structlog.testing import capture_logs
 
-from tests.endpoints.clients import Recorder, frame, recorder, unused_address, write
+from tests.endpoints.clients import Recorder, address_of, frame, recorder, unused_address, write
 from tests.waiting import Stopwatch, until
 from uavlinkd.endpoints import tcp
 from uavlinkd.endpoints.tcp import TcpClient, TcpServer, tcp_listener
@@ -53,7 +53,7 @@ async def test_client_waits_for_a_server_that_is_not_there_yet() -> None:
 async def test_client_follows_a_server_that_restarts(server: TcpServer) -> None:
     """The port is reported as closed, and a new one as opened, within a second if the server had sent frames."""
     server.start()
-    address = Address(*server.address)
+    address = Address(*address_of(server))
     with client_of(address) as tcp_client:
         await until(lambda: len(server.ports) == 1)
         write(server.ports[0], [frame(1)], monotonic())
@@ -108,7 +108,7 @@ async def test_name_is_looked_up_at_each_attempt(server: TcpServer, monkeypatch:
         asked.append((host, port))
         if len(asked) == 1:
             raise socket.gaierror(socket.EAI_NONAME, "unknown")
-        sockaddr = (elsewhere.host, elsewhere.port) if len(asked) == 2 else server.address
+        sockaddr = (elsewhere.host, elsewhere.port) if len(asked) == 2 else address_of(server)
         return [(socket.AF_INET, socket.SOCK_STREAM, 6, "", sockaddr)]
 
     monkeypatch.setattr(socket, "getaddrinfo", look_up)

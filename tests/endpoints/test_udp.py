@@ -9,7 +9,7 @@ from contextlib import ExitStack
 import pytest
 
 from tests.daemon.udp import open_socket
-from tests.endpoints.clients import Recorder, frame, heartbeat, recorder, write
+from tests.endpoints.clients import Recorder, address_of, frame, heartbeat, recorder, write
 from uavlinkd.endpoints.ports import CLIENT_SILENT_S, CLIENTS_PER_ENDPOINT, LocalPort
 from uavlinkd.endpoints.reader import Datagrams, Reader
 from uavlinkd.endpoints.sockets import udp_socket
@@ -35,7 +35,7 @@ def client(server: UdpServer) -> Iterator[Callable[[], socket.socket]]:
 
         def make() -> socket.socket:
             sock = stack.enter_context(open_socket("127.0.0.1"))
-            sock.connect(server.address)
+            sock.connect(address_of(server))
             return sock
 
         yield make

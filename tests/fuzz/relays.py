@@ -37,7 +37,7 @@ from uavlinkd.core.relay_records import (
 from uavlinkd.core.settings import PeerSettings
 from uavlinkd.core.suites import SUITES_BY_NAME
 from uavlinkd.relay.bindings import QUARANTINED_PER_MEMBER, ConnectionEnd
-from uavlinkd.relay.member_settings import MemberSettings, RelayLimits
+from uavlinkd.relay.forwarding import MemberSettings, RelayLimits
 from uavlinkd.relay.service import RelayService, RelayShell
 
 MOST_PEERS: Final = 3

@@ -20,6 +20,7 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from tests.daemon.udp import Client, open_client
+from tests.endpoints.clients import address_of
 from tests.waiting import until
 from uavlinkd.config import Config, EndpointConfig, PeerAddress, PeerConfig
 from uavlinkd.config.model import Log, Routing
@@ -119,7 +120,7 @@ class Scene:
         endpoint = endpoint_of(self.left)
         for number in range(first, first + FRAMES):
             raw = attitude(number)
-            self.client.send(raw, endpoint.address)
+            self.client.send(raw, address_of(endpoint))
             await self.ground.until_received(raw)
             await asyncio.sleep(APART_S)
 
@@ -158,6 +159,6 @@ async def test_calls_per_frame(scene: Scene) -> None:
         sys.setprofile(None)
     (link_address,) = scene.left.parts.peer_sockets.addresses
     from_client = counter.usual_path(link_address.port)
-    from_peer = counter.usual_path(endpoint_of(scene.right).address[1])
+    from_peer = counter.usual_path(address_of(endpoint_of(scene.right))[1])
     assert len(from_client) <= FROM_CLIENT_LIMIT, "\n".join(from_client)
     assert len(from_peer) <= FROM_PEER_LIMIT, "\n".join(from_peer)

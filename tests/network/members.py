@@ -30,7 +30,7 @@ from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.relay_link import RELAYED_START, RelayHandles, RelayLink
 from uavlinkd.link.relays import TOKEN_START, Relays
 from uavlinkd.relay.bindings import QUARANTINED_PER_MEMBER
-from uavlinkd.relay.member_settings import MemberSettings, RelayLimits
+from uavlinkd.relay.forwarding import MemberSettings, RelayLimits
 from uavlinkd.relay.service import RelayService, RelayShell
 from uavlinkd.system import addresses
 

@@ -21,8 +21,7 @@ from uavlinkd.relay.bindings import (
     ConnectionEnd,
     MemberConnection,
 )
-from uavlinkd.relay.forwarding import Forwarding, Meter
-from uavlinkd.relay.member_settings import RelayLimits
+from uavlinkd.relay.forwarding import Forwarding, Meter, RelayLimits
 
 A, B, C, D = (bytes([number]) * c.KEY_BYTES for number in range(1, 5))
 STRANGER = bytes([9]) * c.KEY_BYTES

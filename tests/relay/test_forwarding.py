@@ -10,8 +10,7 @@ from uavlinkd.core.drops import DropReason
 from uavlinkd.core.path import Path
 from uavlinkd.core.relay_records import INNER_STARTS, wrap
 from uavlinkd.relay.bindings import ConnectionEnd, MemberConnection
-from uavlinkd.relay.forwarding import BURST_S, Forwarding, Meter, RelayReason
-from uavlinkd.relay.member_settings import RelayLimits
+from uavlinkd.relay.forwarding import BURST_S, Forwarding, Meter, RelayLimits, RelayReason
 
 AT_A, AT_B = Path(0, ("192.0.2.1", 1000)), Path(1, ("2001:db8::2", 2000, 0, 0))
 A, B = ConnectionEnd(b"a" * 32, AT_A, 0x1111), ConnectionEnd(b"b" * 32, AT_B, 0x2222)

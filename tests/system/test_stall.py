@@ -42,7 +42,7 @@ def test_short_turn_is_not_a_pause(watch: StallWatch, queue: Queue) -> None:
     queue.sender.send(b"new")
     assert watch.turn(STALL_S) == 0
     assert queue.backlog.begin(2 * STALL_S) == 0
-    assert not queue.backlog.is_stale
+    assert not queue.backlog.left
 
 
 def test_each_pause_is_reported_once_and_begins_an_epoch() -> None:
@@ -86,11 +86,11 @@ def test_new_queue_is_stale_while_another_is(watch: StallWatch, queue: Queue) ->
     queue.sender.send(b"old")
     watch.turn(PAUSED_UNTIL)
     heir = Queue(watch)
-    assert heir.backlog.is_stale
+    assert heir.backlog.left
     for stale in (queue, heir):
         stale.backlog.end(0, is_empty=True)
     late = Queue(watch)
-    assert not late.backlog.is_stale
+    assert not late.backlog.left
     heir.close()
     late.close()
 
@@ -99,9 +99,9 @@ def test_device_opened_before_a_pause_is_stale(monkeypatch: pytest.MonkeyPatch, 
     """It may have sent bytes meanwhile."""
     monkeypatch.setattr("uavlinkd.system.stall.monotonic", lambda: PAUSED_UNTIL)
     before = Queue(watch, opened_in=0)
-    assert before.backlog.is_stale
+    assert before.backlog.left
     before.backlog.end(0, is_empty=True)
     after = Queue(watch, opened_in=1)
-    assert not after.backlog.is_stale
+    assert not after.backlog.left
     before.close()
     after.close()

@@ -37,7 +37,7 @@ from uavlinkd.core import wire
 from uavlinkd.core.path import RELAY_HOST
 from uavlinkd.core.settings import Link, PeerSettings, Redundancy, Timers, previous_of
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
-from uavlinkd.relay.member_settings import MemberSettings, RelayLimits
+from uavlinkd.relay.forwarding import MemberSettings, RelayLimits
 from uavlinkd.system.addresses import IPV6_UDP_BYTES
 
 VERIFYING_SHARE: Final = 0.05

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol, TypeVar
 
 from uavlinkd.config.model import Config, ConfigError, EndpointConfig, PeerConfig, Problem, RelayConfig
-from uavlinkd.relay.member_settings import MemberSettings
+from uavlinkd.relay.forwarding import MemberSettings
 
 _FIXED = {
     "name": "name",

@@ -15,7 +15,7 @@ from uavlinkd.core.settings import PeerSettings
 from uavlinkd.endpoints.url import EndpointUrl, SerialUrl
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.mavlink.policy.compilation import Policy
-from uavlinkd.relay.member_settings import MemberSettings, RelayLimits
+from uavlinkd.relay.forwarding import MemberSettings, RelayLimits
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.terminal import UsageError
 

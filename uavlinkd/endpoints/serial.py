@@ -24,8 +24,7 @@ REFILL = 0.75
 """The kernel gets more when it holds no more than this part of that, so that several frames share a wake-up."""
 IN_FLIGHT_BYTES = 4096  # the limit for a device without a line rate, as its driver counts
 POLL_S = 0.005  # time until the next look at a device without a line rate
-LATE_S = 0.001
-"""Added to timers, because event loops round to milliseconds and a timer must not fire too early."""
+LATE_S = 0.001  # Added to timers, because event loops round to milliseconds and a timer must not fire too early.
 TERMINAL_BYTES = 4096 + 640 * 1024
 """Most received bytes that the kernel holds for a terminal (Linux: N_TTY_BUF_SIZE, TTYB_DEFAULT_MEM_LIMIT)."""
 _BITS_PER_BYTE = 10  # with start and stop bit
@@ -40,22 +39,6 @@ def has_line_rate(device: str) -> bool:
     """
     path = os.path.realpath(device)
     return not path.startswith(_PSEUDO_TERMINALS) and not os.path.basename(path).startswith(_WITHOUT_RATE)
-
-
-def open_device(url: SerialUrl) -> BaseSerial:
-    """Open a device for this process alone. It may block: call it in a thread.
-
-    Raises:
-        OSError: any failure, an unsupported baud rate included.
-    """
-    device = serial_for_url(url.device, url.baud, exclusive=True)
-    try:
-        device.open()
-    except OSError:
-        raise
-    except Exception as error:  # exceptions of the library and of termios
-        raise OSError(*error.args) from error
-    return device
 
 
 def discard(device: BaseSerial) -> None:
@@ -100,7 +83,13 @@ class Opener:
             await asyncio.sleep(RETRY_S)
 
     def _open(self) -> BaseSerial:
-        device = open_device(self._url)
+        device = serial_for_url(self._url.device, self._url.baud, exclusive=True)
+        try:
+            device.open()
+        except OSError:
+            raise
+        except Exception as error:  # of the library and of termios, such as for an unsupported baud rate
+            raise OSError(*error.args) from error
         if self.is_closed:  # while it was being opened
             discard(device)
             raise OSError("closed")

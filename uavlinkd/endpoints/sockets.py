@@ -186,8 +186,7 @@ SEND_ATTEMPTS = 4
 """How often a datagram is sent again while each attempt reports the error of an earlier one instead."""
 REPORTS_PER_S = 20
 """Errors that the kernel reports of one socket in :class:`ErrorReports`: an initiator sends four a second at most."""
-MOST_ERRORS = 128
-"""Read at once. The kernel bounds the queue by the receive buffer."""
+MOST_ERRORS = 128  # Read at once. The kernel bounds the queue by the receive buffer.
 
 
 class ErrorReports:

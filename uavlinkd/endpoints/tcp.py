@@ -27,19 +27,16 @@ from uavlinkd.system.tasks import keep_running
 FIRST_WAIT_S = 0.25
 LONGEST_WAIT_S = 5.0
 """Wait between two attempts to connect. It doubles each time, and is up to a quarter longer at random."""
-CONNECT_TIMEOUT_S = 5.0
-"""For one address. A name may have several."""
+CONNECT_TIMEOUT_S = 5.0  # For one address. A name may have several.
 MAX_GAP_S = 2.0
 """Longest gap in a frame, and longest duration of a frame. TCP loses no bytes, but repeats some of them late. After
 this time a frame is too old, or a serial line behind the server has lost a part of it."""
 MAX_ADDRESSES = 8  # addresses of a name that one attempt tries
-ACCEPT_PAUSE_S = 1.0
-"""Wait before the next accept when the system has no file descriptor or memory for a client."""
+ACCEPT_PAUSE_S = 1.0  # Wait before the next accept when the system has no file descriptor or memory for a client.
 
 _SEND_BUFFER_BYTES = 16384
 _NOT_SENT_BYTES = 1024  # the kernel accepts a write while it holds fewer unsent bytes than this
-_WRITE_BYTES = 1400
-"""Most bytes of one write: a segment. The kernel accepts a write whole or not at all."""
+_WRITE_BYTES = 1400  # Most bytes of one write: a segment. The kernel accepts a write whole or not at all.
 _OWN_SEGMENT = socket.MSG_EOR if sys.platform == "linux" else 0
 _BACKLOG = 32
 
@@ -105,21 +102,16 @@ class TcpServer(StreamEndpoint):
 
     def __init__(self, name: str, listener: socket.socket, handler: PortHandler) -> None:
         super().__init__(name, handler)
-        self._listener = listener
+        self.listener = listener
         self._resume: asyncio.TimerHandle | None = None
         self._backlog = Backlog(handler.stall, listener.fileno(), lambda: _BACKLOG + 1)
 
-    @property
-    def address(self) -> tuple[str, int]:
-        host, port = self._listener.getsockname()[:2]
-        return host, port
-
     def share_socket(self) -> socket.socket:
         """A duplicate of the socket, for another endpoint in place of this one. Each endpoint closes its own."""
-        return self._listener.dup()
+        return self.listener.dup()
 
     def start(self) -> None:
-        asyncio.get_running_loop().add_reader(self._listener.fileno(), lambda: self.on_acceptable(monotonic()))
+        asyncio.get_running_loop().add_reader(self.listener.fileno(), lambda: self.on_acceptable(monotonic()))
 
     def on_acceptable(self, now: float) -> None:
         """Accept the waiting connections, as far as there are places."""
@@ -127,7 +119,7 @@ class TcpServer(StreamEndpoint):
         epoch = self._backlog.begin(now)
         for _ in range(_BACKLOG):
             try:
-                sock, sockaddr = self._listener.accept()
+                sock, sockaddr = self.listener.accept()
             except BlockingIOError:
                 self._backlog.end(0, is_empty=True)
                 return
@@ -148,9 +140,9 @@ class TcpServer(StreamEndpoint):
     def close(self) -> None:
         if self._resume is not None:
             self._resume.cancel()
-        if self._listener.fileno() >= 0:
-            asyncio.get_running_loop().remove_reader(self._listener.fileno())
-            self._listener.close()
+        if self.listener.fileno() >= 0:
+            asyncio.get_running_loop().remove_reader(self.listener.fileno())
+            self.listener.close()
         super().close()
 
     def _has_place(self, now: float) -> bool:
@@ -166,7 +158,7 @@ class TcpServer(StreamEndpoint):
 
     def _pause(self) -> None:
         loop = asyncio.get_running_loop()
-        loop.remove_reader(self._listener.fileno())
+        loop.remove_reader(self.listener.fileno())
         self._resume = loop.call_later(ACCEPT_PAUSE_S, self.start)
 
 

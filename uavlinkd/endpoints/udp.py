@@ -94,11 +94,6 @@ class UdpEndpoint(Endpoint):
     def ports(self) -> Sequence[UdpPort]:
         return list(self._ports.values())
 
-    @property
-    def address(self) -> tuple[str, int]:
-        host, port = self._sock.getsockname()[:2]
-        return host, port
-
     def _use(self, sock: socket.socket) -> None:
         self._sock = sock
         self._reports = ErrorReports(sock)

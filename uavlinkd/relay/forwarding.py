@@ -7,19 +7,41 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple
 
 from uavlinkd.core.drops import DropReason, Reason
 from uavlinkd.core.path import Path, SocketAddress
 from uavlinkd.core.relay_records import INNER_STARTS, RELAYED
+from uavlinkd.core.settings import PeerSettings
 from uavlinkd.relay.bindings import ConnectionEnd, MemberConnection
-from uavlinkd.relay.member_settings import RelayLimits
 
-BURST_S = 0.05
-"""A member may send what its limits allow in this time at once. The relay has no queue."""
+BURST_S = 0.05  # A member may send what its limits allow in this time at once. The relay has no queue.
 BURST_BYTES = 1500  # and at least one datagram of this length
 _START = bytes((RELAYED,))
 _HEADER_BYTES = 3
+
+
+@dataclass(frozen=True, slots=True)
+class RelayLimits:
+    """What one member, or all members together, may send through the relay. ``bits_s``: of UDP payload."""
+
+    datagrams_s: int
+    bits_s: int
+
+
+@dataclass(frozen=True, slots=True)
+class MemberSettings:
+    """A member: who it is, how many members it may ask for, and what it may send."""
+
+    peer: PeerSettings
+    most_peers: int
+    limits: RelayLimits
+
+    @property
+    def name(self) -> str:
+        """Its name in the configuration."""
+        return self.peer.name
 
 
 class RelayReason(Reason):

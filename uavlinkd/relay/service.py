@@ -21,13 +21,10 @@ from uavlinkd.core.path import Path
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.relay_records import Bind, FilterTest, FilterTested, bounds_of, token_datagram
 from uavlinkd.relay.bindings import Bindings, Changes
-from uavlinkd.relay.forwarding import Forwarding, Meter, RelayReason
-from uavlinkd.relay.member_settings import MemberSettings, RelayLimits
+from uavlinkd.relay.forwarding import Forwarding, MemberSettings, Meter, RelayLimits, RelayReason
 
-BINDS_PER_S = 32
-"""Binds of one member a second, each of up to 16 keys. Each may cause reports to other members."""
-BINDS_BURST = 256
-"""So many at once, after a quiet while: a ground station with 1,000 vehicles, along four paths."""
+BINDS_PER_S = 32  # Binds of one member a second, each of up to 16 keys. Each may cause reports to other members.
+BINDS_BURST = 256  # So many at once, after a quiet while: a ground station with 1,000 vehicles, along four paths.
 LOOK_S = 0.1
 """Paths along which members asked before they were validated are looked at so often, and after an event."""
 

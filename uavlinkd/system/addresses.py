@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from ipaddress import IPv4Address, IPv6Address, ip_address
 from typing import Any
 
-DEFAULT_PORT = 5790
-"""The usual port of a daemon. It is a convention: a configuration always names the port."""
+DEFAULT_PORT = 5790  # The usual port of a daemon. It is a convention: a configuration always names the port.
 IPV4_UDP_BYTES = 20 + 8  # header bytes of a datagram over IPv4 (RFC 791, RFC 768)
 IPV6_UDP_BYTES = 40 + 8  # header bytes of a datagram over IPv6 (RFC 8200, RFC 768)
 

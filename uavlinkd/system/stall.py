@@ -17,10 +17,8 @@ from weakref import WeakSet
 
 from uavlinkd.system.clock import monotonic
 
-STALL_S = 2.5
-"""The daemon's timer fires every second. A longer time without any turn of the loop is a pause."""
-STALE = -1
-"""In place of an epoch: the frame comes from a queue that may hold frames from before the last pause."""
+STALL_S = 2.5  # The daemon's timer fires every second. A longer time without any turn of the loop is a pause.
+STALE = -1  # In place of an epoch: the frame comes from a queue that may hold frames from before the last pause.
 
 
 class StallWatch:
@@ -85,14 +83,9 @@ class Backlog:
         self._capacity = capacity
         self.left = 0  # how much of the queue may still be from before a pause
         is_older = opened_in is not None and opened_in != watch.turn(monotonic())
-        if is_older or any(backlog.is_stale for backlog in watch.backlogs):
+        if is_older or any(backlog.left for backlog in watch.backlogs):
             self.mark()
         watch.backlogs.add(self)
-
-    @property
-    def is_stale(self) -> bool:
-        """Whether the next read may return bytes that waited during a pause."""
-        return self.left > 0
 
     def mark(self) -> None:
         """Everything in the queue may be from before now."""

@@ -19,7 +19,7 @@ from uavlinkd.lab.hostile.hostile_relay import HostileRelay, HostileRelaySetting
 from uavlinkd.lab.hostile.relay_attacks import ALL_ATTACKS, REPLAY_EVERY_S
 from uavlinkd.lab.mitm.attacks import parse_attack
 from uavlinkd.lab.sim.loopback_ports import free_port
-from uavlinkd.relay.member_settings import MemberSettings, RelayLimits
+from uavlinkd.relay.forwarding import MemberSettings, RelayLimits
 from uavlinkd.system.addresses import Address
 
 NAMES = ("drone0", "drone1", "drone2")

@@ -23,7 +23,7 @@ from uavlinkd.lab.mitm.modem import ModemEnd, ModemSettings
 from uavlinkd.lab.mitm.modem_ports import ModemPorts, PortSettings
 from uavlinkd.lab.mitm.radio import RadioSettings
 from uavlinkd.lab.sim.loopback_ports import free_ports
-from uavlinkd.relay.member_settings import MemberSettings, RelayLimits
+from uavlinkd.relay.forwarding import MemberSettings, RelayLimits
 from uavlinkd.system.addresses import Address
 
 SLOWER: Final = ("both/2", RadioSettings(delay_s=0.02))
