@@ -16,14 +16,13 @@ from uavlinkd.endpoints.line_framing import (
     MAX_ENCODED,
     LineDecoder,
     Noise,
-    RadioReport,
     encode,
     parse_report,
     report_bytes,
 )
 
 DATAGRAMS = [bytes(20), b"", b"\x40" + bytes(range(1, 255)) * 2, b"\x01" * 147, bytes(range(256)), b"\xfe\xfd" * 60]
-FIGURES = RadioReport(rssi=200, remrssi=190, txbuf=98, noise=50, remnoise=0xFE, rxerrors=0, fixed=3)
+FIGURES = dict(rssi=200, remrssi=190, txbuf=98, noise=50, remnoise=0xFE, rxerrors=0, fixed=3)
 
 datagrams = st.binary(max_size=600)
 
@@ -31,9 +30,8 @@ datagrams = st.binary(max_size=600)
 def report(version: int = 1, msgid: int = 109, payload: bytes | None = None) -> bytes:
     """A modem's report."""
     if payload is None:
-        figures = (FIGURES.rssi, FIGURES.remrssi, FIGURES.txbuf, FIGURES.noise, FIGURES.remnoise)
-        payload = b"".join(value.to_bytes(2, "little") for value in (FIGURES.rxerrors, FIGURES.fixed))
-        payload += bytes(figures)
+        payload = b"".join(FIGURES[name].to_bytes(2, "little") for name in ("rxerrors", "fixed"))
+        payload += bytes(FIGURES[name] for name in ("rssi", "remrssi", "txbuf", "noise", "remnoise"))
     head = bytes((9, 7, 51, 68, msgid)) if version == 1 else bytes((9, 0, 0, 7, 51, 68, msgid, 0, 0))
     crc = mcrf4xx(head + payload + bytes(({109: 185, 166: 21}[msgid],)))
     return bytes((0xFE if version == 1 else 0xFD,)) + head + payload + crc.to_bytes(2, "little")
@@ -181,7 +179,7 @@ def test_forged_report_inside_an_intact_datagram_stays() -> None:
 
 def test_reports_of_pymavlink_are_recognised() -> None:
     """In both versions. MAVLink 2 cuts trailing zeros, so a modem's report has the full length only without."""
-    figures = RadioReport(rssi=1, remrssi=2, txbuf=3, noise=4, remnoise=5, rxerrors=600, fixed=7)
+    figures = dict(rssi=1, remrssi=2, txbuf=3, noise=4, remnoise=5, rxerrors=600, fixed=7)
     for force_mavlink1 in (True, False):
         sender = MAVLink(None, 51, 68)
         message = sender.radio_status_encode(1, 2, 3, 4, 5, 600, 7)

@@ -23,7 +23,6 @@ from __future__ import annotations
 import re
 from binascii import crc_hqx
 from collections import Counter
-from dataclasses import dataclass
 from enum import StrEnum
 from struct import Struct
 from typing import Final
@@ -47,23 +46,10 @@ _CRC_EXTRA: Final = {109: 185, 166: 21}  # by message: RADIO_STATUS, and RADIO o
 _HEADERS: Final = {MAVLINK1: (17, 5, {1: 9}), MAVLINK2: (21, 7, {1: 9, 2: 0, 3: 0, 8: 0, 9: 0})}
 """By first byte: length of a report, place of the message, and the bytes that have one value, by their places."""
 _FIGURES: Final = Struct("<HH5B")
+RADIO_FIGURES: Final = ("rxerrors", "fixed", "rssi", "remrssi", "txbuf", "noise", "remnoise")
+"""What a modem says about the radio link. Units as in MAVLink: rssi and noise as the modem counts them; ``txbuf`` is the
+free room in its send buffer, in per cent. 255 in ``rssi`` and others: unknown."""
 _REPORT_START: Final = re.compile(b"[" + re.escape(REPORT_STARTS) + b"]")
-
-
-@dataclass(frozen=True, slots=True)
-class RadioReport:
-    """What a modem says about the radio link. Units as in MAVLink: rssi and noise as the modem counts them.
-
-    ``txbuf``: free room in the modem's send buffer, in per cent. 255 in ``rssi`` and others: unknown.
-    """
-
-    rssi: int
-    remrssi: int
-    txbuf: int
-    noise: int
-    remnoise: int
-    rxerrors: int
-    fixed: int
 
 
 def report_bytes(data: bytes, at: int) -> int | None:
@@ -82,10 +68,10 @@ def report_bytes(data: bytes, at: int) -> int | None:
     return size if int.from_bytes(data[at + size - 2 : at + size], "little") == checksum else 0
 
 
-def parse_report(frame: bytes) -> RadioReport:
-    at = len(frame) - _FIGURES.size - CRC_BYTES
-    rxerrors, fixed, rssi, remrssi, txbuf, noise, remnoise = _FIGURES.unpack_from(frame, at)
-    return RadioReport(rssi, remrssi, txbuf, noise, remnoise, rxerrors, fixed)
+def parse_report(frame: bytes) -> dict[str, int]:
+    """The figures of a whole report, by :data:`RADIO_FIGURES`."""
+    figures = _FIGURES.unpack_from(frame, len(frame) - _FIGURES.size - CRC_BYTES)
+    return dict(zip(RADIO_FIGURES, figures, strict=True))
 
 
 class Noise(StrEnum):
@@ -128,7 +114,7 @@ class LineDecoder:
         self.discarded_bytes = Counter[Noise](dict.fromkeys(Noise, 0))  # their bytes
         self.reports = 0  # reports of the modem
         self.reports_inside = 0  # those of them that were inside a datagram
-        self.report: RadioReport | None = None  # the last one
+        self.report: dict[str, int] | None = None  # the last one
 
     @property
     def line_noise(self) -> int:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict
 from functools import partial
 from typing import Final
 
@@ -226,7 +225,7 @@ class SerialNetwork:
             "failures": dict(line.failures),
             "reports": decoder.reports,
             "reports_inside": decoder.reports_inside,
-            "radio": None if report is None else asdict(report),
+            "radio": report,
         }
         return network_status(self.config, self.presence, (), serial)
 

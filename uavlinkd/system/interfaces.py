@@ -46,18 +46,9 @@ class Interface(NamedTuple):
     """An interface at one moment."""
 
     ifindex: int  # Its number. An interface that was removed returns with another one.
-    flags: int
-    hosts: tuple[str, ...]  # Its usable addresses, IPv4 first. A link-local IPv6 address has no zone here.
-
-    @property
-    def is_up(self) -> bool:
-        """Whether an administrator or a network manager switched it on. Its cable may be unplugged."""
-        return bool(self.flags & _IFF_UP)
-
-    @property
-    def has_one_end(self) -> bool:
-        """Whether everything goes to the one other end: a modem, a tunnel."""
-        return bool(self.flags & (_IFF_POINTOPOINT | _IFF_NOARP)) and not self.flags & _IFF_LOOPBACK
+    is_up: bool  # an administrator or a network manager switched it on; its cable may be unplugged
+    has_one_end: bool  # everything goes to the one other end: a modem, a tunnel
+    hosts: tuple[str, ...]  # its usable addresses, IPv4 first; a link-local IPv6 address has no zone here
 
 
 def find_interface(name: str) -> Interface | None:
@@ -69,7 +60,8 @@ def find_interface(name: str) -> Interface | None:
             index = socket.if_nametoindex(name)
             request = _REQUEST.pack(name.encode(), b"")
             (flags,) = struct.unpack_from("=H", fcntl.ioctl(sock, _SIOCGIFFLAGS, request), _NAME.size)
-            return Interface(index, flags, (*_ipv4(sock, name), *_ipv6(index)))
+            has_one_end = bool(flags & (_IFF_POINTOPOINT | _IFF_NOARP)) and not flags & _IFF_LOOPBACK
+            return Interface(index, bool(flags & _IFF_UP), has_one_end, (*_ipv4(sock, name), *_ipv6(index)))
     except OSError:
         return None
 

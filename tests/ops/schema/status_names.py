@@ -7,7 +7,7 @@ from typing import Any
 
 from tests.daemon.frames import frame
 from tests.daemon.harness import Stage
-from uavlinkd.endpoints.line_framing import RadioReport
+from uavlinkd.endpoints.line_framing import RADIO_FIGURES
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.ops.findings import Finding, Severity, Subject
 
@@ -46,7 +46,7 @@ ALSO = {
     "endpoints.*.clients.*.last_received_s": "null",
     "recording": "null",
     "networks.*.serial.radio": "object",
-    **{f"networks.*.serial.radio.{name}": "integer" for name in RadioReport.__annotations__},
+    **{f"networks.*.serial.radio.{name}": "integer" for name in RADIO_FIGURES},
 }
 """Types that the daemons here do not show."""
 
