@@ -22,7 +22,7 @@ from uavlinkd.endpoints.line_framing import (
 )
 
 DATAGRAMS = [bytes(20), b"", b"\x40" + bytes(range(1, 255)) * 2, b"\x01" * 147, bytes(range(256)), b"\xfe\xfd" * 60]
-FIGURES = dict(rssi=200, remrssi=190, txbuf=98, noise=50, remnoise=0xFE, rxerrors=0, fixed=3)
+FIGURES = {"rssi": 200, "remrssi": 190, "txbuf": 98, "noise": 50, "remnoise": 0xFE, "rxerrors": 0, "fixed": 3}
 
 datagrams = st.binary(max_size=600)
 
@@ -179,7 +179,7 @@ def test_forged_report_inside_an_intact_datagram_stays() -> None:
 
 def test_reports_of_pymavlink_are_recognised() -> None:
     """In both versions. MAVLink 2 cuts trailing zeros, so a modem's report has the full length only without."""
-    figures = dict(rssi=1, remrssi=2, txbuf=3, noise=4, remnoise=5, rxerrors=600, fixed=7)
+    figures = {"rssi": 1, "remrssi": 2, "txbuf": 3, "noise": 4, "remnoise": 5, "rxerrors": 600, "fixed": 7}
     for force_mavlink1 in (True, False):
         sender = MAVLink(None, 51, 68)
         message = sender.radio_status_encode(1, 2, 3, 4, 5, 600, 7)

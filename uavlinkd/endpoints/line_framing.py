@@ -47,8 +47,8 @@ _HEADERS: Final = {MAVLINK1: (17, 5, {1: 9}), MAVLINK2: (21, 7, {1: 9, 2: 0, 3: 
 """By first byte: length of a report, place of the message, and the bytes that have one value, by their places."""
 _FIGURES: Final = Struct("<HH5B")
 RADIO_FIGURES: Final = ("rxerrors", "fixed", "rssi", "remrssi", "txbuf", "noise", "remnoise")
-"""What a modem says about the radio link. Units as in MAVLink: rssi and noise as the modem counts them; ``txbuf`` is the
-free room in its send buffer, in per cent. 255 in ``rssi`` and others: unknown."""
+"""What a modem says about the radio link. Units as in MAVLink: rssi and noise as the modem counts them; ``txbuf`` is
+the free room in its send buffer, in per cent. 255 in ``rssi`` and others: unknown."""
 _REPORT_START: Final = re.compile(b"[" + re.escape(REPORT_STARTS) + b"]")
 
 

@@ -166,38 +166,32 @@ class SerialLine:
 
     def _write_waiting(self) -> None:
         self._timer = None
-        while self._queue and (device := self._device) is not None:
-            now = monotonic()
-            try:
-                in_kernel = device.num_unwritten_bytes()
-            except OSError as error:
-                self._lose(failure_name(error))
-                return
-            is_held = self.uses_cts and in_kernel > 0 and now > self._wire_by + WIRE_LATE_S
-            if self.cts.note(now, is_held=is_held) > STUCK_S:
-                self._lose(CTS_STUCK)
-                return
-            # For so long the radio has something to send; at least as long as the kernel holds bytes.
-            held_s = max(0.0, self._sent_by - now, in_kernel / self.bytes_s)
-            over_s = held_s + len(self._queue[0]) / self.bytes_s - MODEM_S
-            if held_s > 0 and over_s > 0:
-                wait_s = min(held_s, over_s) + LATE_S
-                self._timer = asyncio.get_running_loop().call_later(wait_s, self._write_waiting)
-                return
-            line = self._queue.popleft()
-            self._queued_bytes -= len(line)
-            if not self._write(device, line, now):
-                return
+        try:
+            while self._queue and self._device is not None and self._write_next(self._device, monotonic()):
+                pass
+        except OSError as error:
+            self._lose(failure_name(error))
 
-    def _write(self, device: BaseSerial, line: bytes, now: float) -> bool:
-        """Pass bytes to the kernel. Returns whether the device is still there."""
+    def _write_next(self, device: BaseSerial, now: float) -> bool:
+        """Pass a datagram to the kernel if the radio has little to send. Returns whether the next one may follow."""
+        in_kernel = device.num_unwritten_bytes()
+        is_held = self.uses_cts and in_kernel > 0 and now > self._wire_by + WIRE_LATE_S
+        if self.cts.note(now, is_held=is_held) > STUCK_S:
+            self._lose(CTS_STUCK)
+            return False
+        # For so long the radio has something to send; at least as long as the kernel holds bytes.
+        held_s = max(0.0, self._sent_by - now, in_kernel / self.bytes_s)
+        over_s = held_s + len(self._queue[0]) / self.bytes_s - MODEM_S
+        if held_s > 0 and over_s > 0:
+            wait_s = min(held_s, over_s) + LATE_S
+            self._timer = asyncio.get_running_loop().call_later(wait_s, self._write_waiting)
+            return False
+        line = self._queue.popleft()
+        self._queued_bytes -= len(line)
         try:
             count = os.write(device.fileno(), line)
         except BlockingIOError:
             count = 0
-        except OSError as error:
-            self._lose(failure_name(error))
-            return False
         if count < len(line):  # the kernel's queue is full: the other end drops the torn datagram
             self.failures[LINE_FULL] += 1
         self.bytes_written += count
@@ -229,10 +223,9 @@ class SerialLine:
         self.uses_cts = not self._ignores_cts and _has_cts(device) and _set_cts(device, on=True)
 
     def _on_readable(self) -> None:
-        device, backlog = self._device, self._backlog
-        if device is None or backlog is None:
-            return
-        now = monotonic()
+        device, backlog, now = self._device, self._backlog, monotonic()
+        assert device is not None, "the loop watches no device that was lost"
+        assert backlog is not None, "an open device has a backlog"
         epoch = backlog.begin(now)
         try:
             data = os.read(device.fileno(), READ_BYTES)

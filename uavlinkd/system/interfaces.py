@@ -45,7 +45,7 @@ _RTF_REJECT: Final = 0x200
 class Interface(NamedTuple):
     """An interface at one moment."""
 
-    ifindex: int  # Its number. An interface that was removed returns with another one.
+    ifindex: int  # an interface that was removed returns with another number
     is_up: bool  # an administrator or a network manager switched it on; its cable may be unplugged
     has_one_end: bool  # everything goes to the one other end: a modem, a tunnel
     hosts: tuple[str, ...]  # its usable addresses, IPv4 first; a link-local IPv6 address has no zone here
