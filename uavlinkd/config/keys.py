@@ -37,11 +37,10 @@ class KeyFileError(CommandError):
 
 
 def generate_private_key() -> str:
-    """A new private key, from the operating system's generator.
+    """A new private key, from the operating system's generator, in the form of ``wg genkey`` (RFC 7748, section 5).
 
-    The bits that X25519 sets and clears (RFC 7748, section 5) are set and cleared already, as by ``wg genkey``. One
-    of 16 public keys has such bits too. Then another pair is made, so that :func:`looks_private` distinguishes every
-    private key from every public key.
+    One of 16 public keys has this form too. Then another pair is made, so that :func:`looks_private` distinguishes
+    every private key from every public key.
     """
     while True:
         key = bytearray(secrets.token_bytes(KEY_BYTES))
@@ -65,11 +64,7 @@ def generate_psk() -> str:
 
 
 def public_key_text(private_text: str) -> str:
-    """The public key of a private key, both in base64.
-
-    Raises:
-        ValueError: the text is not a key; the message does not repeat it.
-    """
+    """The public key of a private key, both in base64. Errors as of :func:`decode_key`."""
     return encode_key(x25519_public_key(decode_key(private_text)))
 
 
@@ -131,8 +126,7 @@ def write_secret_file(path: Path, text: str) -> None:
             file.write(text.strip() + "\n")
             file.flush()
             os.fsync(file.fileno())
-        if _HAS_OWNERS:
-            _sync_folder(path.parent)
+        _sync_folder(path.parent)
     except BaseException as error:
         # Delete half a key: otherwise the next attempt would refuse to overwrite it.
         with suppress(OSError):
@@ -144,6 +138,8 @@ def write_secret_file(path: Path, text: str) -> None:
 
 def _sync_folder(folder: Path) -> None:
     """Sync the directory entry of a new file."""
+    if not _HAS_OWNERS:
+        return
     descriptor = os.open(folder, os.O_RDONLY | _CLOEXEC)
     try:
         os.fsync(descriptor)
@@ -158,14 +154,12 @@ def find_secret_file(name: str, folder: Path, environ: Mapping[str, str]) -> tup
     name for a file in a folder that it loads as ``keys``. A credential's name contains no folder. Otherwise ``name``
     is relative to ``folder``.
     """
-    path = folder / name
     credentials = environ.get(CREDENTIALS, "")
     if credentials and name not in (".", "..") and "/" not in name:
-        for credential_name in (name, f"keys_{name}"):
-            credential = Path(credentials) / credential_name
+        for credential in (Path(credentials) / name, Path(credentials) / f"keys_{name}"):
             if os.path.lexists(credential):
                 return credential, True
-    return path, False
+    return folder / name, False
 
 
 def read_secret_file(path: Path, *, credential: bool = False) -> Secret:

@@ -1,11 +1,17 @@
-"""Reading a configuration file: TOML, then each section and its key files, then the rules between sections."""
+"""Reading a configuration file: TOML, then each section and its key files, then the rules between sections.
+
+No message repeats a value, because a value in the wrong place may be a secret. Of the keys, only those that a
+configuration can have are repeated.
+"""
 
 from __future__ import annotations
 
 import os
+import re
 import shlex
 import tomllib
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,15 +19,22 @@ from typing import Any
 from uavlinkd.config import checks, key_rules, schema
 from uavlinkd.config.advice import advice
 from uavlinkd.config.build import build
-from uavlinkd.config.keys import CREDENTIALS, KeyFileError, find_secret_file, read_secret_file
+from uavlinkd.config.keys import CREDENTIALS, KeyFileError, decode_key, find_secret_file, read_secret_file
 from uavlinkd.config.model import Config, ConfigError, Problem
-from uavlinkd.config.problems import Problems, Sections, Values
-from uavlinkd.config.syntax import at, syntax_problem
+from uavlinkd.config.problems import Problems, Sections, Values, example_of
 from uavlinkd.core.crypto import Secret
 from uavlinkd.system.tasks import Threads
 
 _MAX_FILE_BYTES = 1 << 20
 _THREAD = Threads(1, "configuration")
+_AT = re.compile(r"(.*) \(at (?:line (\d+), column (\d+)|end of document)\)", re.DOTALL)
+_KEY = re.compile(r"""\s*["']?([A-Za-z0-9_-]{1,32})["']?(?![A-Za-z0-9_.'"+/-])""")
+_NEXT = re.compile(r"\s*(?:$|\[|[A-Za-z0-9_-]+\s*=)")
+"""The end of the file, a section, or a key."""
+_MOST_LINES = 20
+"""A longer value without an end is reported where the parser notices it. Each line costs a parse."""
+_HINT = 'text is in straight quotation marks ("…"), true and false are in small letters, a comment begins with #'
+_ONCE = "write a key once in its section, and for another peer or endpoint [[peer]] or [[endpoint]] above its keys"
 
 
 def load_config(path: Path, environ: Mapping[str, str]) -> Config:
@@ -107,6 +120,63 @@ def _read_toml(path: Path) -> dict[str, Any]:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         raise ConfigError((syntax_problem(path, text, error),)) from None
+
+
+def syntax_problem(path: Path, text: str, error: Exception) -> Problem:
+    """The problem of a text that is not TOML."""
+    if message := _foreign_file(text):
+        return Problem(str(path), "", message)
+    match = _AT.fullmatch(str(error))
+    if match is None:
+        return Problem(str(path), "", "is not TOML that can be read: a number too long, or brackets too deep")
+    lines = text.split("\n")
+    line, column = (int(match[2]), int(match[3])) if match[2] else (len(lines), 1)
+    # The reason without the names that it quotes, as in "Cannot declare ('a', 'b') twice".
+    reason = re.sub(r"\s*(\(.*\)|'.{3,}'|\".*\")", "", match[1])
+    if (start := _start_of_value(lines, line)) != line:
+        line, column, reason = start, 1, f"{reason}: its value has no end"
+    key = found[1] if (found := _KEY.match(lines[line - 1])) and example_of(found[1]) else ""
+    if "twice" in reason or "verwrite" in reason or "Duplicate" in reason:
+        remedy = _ONCE
+    elif key:
+        remedy = f"write {key} = {example_of(key)}; {_HINT}"
+    else:
+        remedy = f"write KEY = VALUE, [SECTION], or [[peer]] and [[endpoint]] for each of several; {_HINT}"
+    return at(path, line, column, f"is not valid TOML here: {reason}: {remedy}", key)
+
+
+def at(path: Path, line: int, column: int, message: str, key: str = "") -> Problem:
+    """A problem at a place of the file, in the form that editors open."""
+    return Problem(f"{path}:{line}:{column}", key, message)
+
+
+def _start_of_value(lines: list[str], line: int) -> int:
+    """The line of the key whose value has no end, which the parser notices at the next statement; else ``line``.
+
+    The text before that key is valid.
+    """
+    for number in range(line, max(line - _MOST_LINES, 0), -1) if _NEXT.match(lines[line - 1]) else ():
+        with suppress(ValueError, RecursionError):
+            tomllib.loads("\n".join([*lines[: number - 1], ""]))
+            return number
+    return line
+
+
+def _foreign_file(text: str) -> str | None:
+    """The message for a file that is not a configuration of this software at all."""
+    if re.search(r"(?m)^[ \t]*\[(Interface|Peer)\]", text):
+        return (
+            "is a WireGuard file (wg.conf), and uavlinkd has its own format: start from configs/drone0.toml. The keys"
+            " have the same form: write PrivateKey to a file of mode 0600 and name it in private_key_file; write each"
+            " PublicKey as public_key of a [[peer]]"
+        )
+    if re.search(r"(?mi)^[ \t]*\[(UdpEndpoint|UartEndpoint|TcpEndpoint)\b", text):
+        return "is a file of mavlink-router, and uavlinkd has its own format: start from configs/drone0.toml"
+    try:
+        decode_key(text)
+    except ValueError:
+        return None
+    return "is a key file, not a configuration: give the .toml file to --config, and name the key file in it"
 
 
 def _table(problems: Problems, table: Mapping[str, Any], key: str) -> Mapping[str, Any]:

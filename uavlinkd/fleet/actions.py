@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from dataclasses import fields
 
 from uavlinkd.fleet import operations
 from uavlinkd.fleet.manifest import DEFAULT_PLAN, NO_PLAN, FleetError, FleetSettings, MemberKind
@@ -15,22 +16,28 @@ from uavlinkd.system.terminal import OK, printable
 
 def act(options: argparse.Namespace) -> int:
     """Run ``options.action``, and print the fleet and what to do next."""
-    _print_result(options, _ACTIONS[options.action](options))
+    _print_result(options, _run(options))
     return OK
 
 
-def _init(options: argparse.Namespace) -> Result:
+def _run(options: argparse.Namespace) -> Result:
+    if options.action == "add":
+        address = None if options.address is None else _address("--address", options.address)
+        kind = MemberKind(options.kind)
+        return operations.add(options.out, options.name, kind, address=address, system_id=options.system_id)
+    if options.action == "remove":
+        return operations.remove(options.out, options.name)
+    if options.action == "rotate" and not options.finish:
+        return operations.rotate(options.out, options.name, at_once=options.at_once)
+    if options.action == "rotate":
+        if sys.stdin.isatty() and sys.stdout.isatty() and not options.yes:
+            _ask_before_finish(options.name)
+        return operations.finish_rotation(options.out, options.name)
     relays = [_address("--relay", text) for text in options.relay]
-    settings = FleetSettings(
-        address_plan=options.address_plan or (NO_PLAN if relays else DEFAULT_PLAN),
-        suite=options.suite,
-        psk=options.psk,
-        control_socket=options.control_socket,
-        drone_url=options.drone_url,
-        ground_station_url=options.ground_station_url,
-    )
+    given = {key.name: getattr(options, key.name) for key in fields(FleetSettings)}
+    given["address_plan"] = options.address_plan or (NO_PLAN if relays else DEFAULT_PLAN)
     counts = options.drones, options.ground_stations, options.observers
-    return operations.init(options.out, settings, *counts, relays)
+    return operations.init(options.out, FleetSettings(**given), *counts, relays)
 
 
 def _address(option: str, text: str) -> Address:
@@ -38,25 +45,6 @@ def _address(option: str, text: str) -> Address:
         return parse_address(text, allow_names=True)
     except AddressError as error:
         raise FleetError(f"{option}: {error}") from None
-
-
-def _add(options: argparse.Namespace) -> Result:
-    address = None if options.address is None else _address("--address", options.address)
-    return operations.add(
-        options.out, options.name, MemberKind(options.kind), address=address, system_id=options.system_id
-    )
-
-
-def _remove(options: argparse.Namespace) -> Result:
-    return operations.remove(options.out, options.name)
-
-
-def _rotate(options: argparse.Namespace) -> Result:
-    if options.finish:
-        if sys.stdin.isatty() and sys.stdout.isatty() and not options.yes:
-            _ask_before_finish(options.name)
-        return operations.finish_rotation(options.out, options.name)
-    return operations.rotate(options.out, options.name, at_once=options.at_once)
 
 
 def _ask_before_finish(name: str) -> None:
@@ -70,9 +58,6 @@ def _ask_before_finish(name: str) -> None:
     )
     if input(question).strip().lower() not in ("y", "yes"):
         raise FleetError(f"nothing was changed: carry the files of the rotation first, and restart {name}")
-
-
-_ACTIONS = {"init": _init, "add": _add, "remove": _remove, "rotate": _rotate}
 
 
 def _print_result(options: argparse.Namespace, result: Result) -> None:

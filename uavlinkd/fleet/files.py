@@ -1,11 +1,28 @@
-"""The files in a member's folder: the text of its configuration, and the names of its key files."""
+"""The files in a member's folder: their names, the text of a configuration, and changes in an edited text.
+
+A change replaces one section or a few lines, which keeps comments and order. The parsed result is then compared with
+the parsed original after the same change. If they differ, FleetError refuses the change: a multi-line string may
+contain a ``[[peer]]``. A ``kind`` of section is ``peer``, ``relay`` or ``member``.
+"""
 
 from __future__ import annotations
 
-from uavlinkd.fleet.manifest import ROLES, Fleet, Member, MemberKind, fill, literal
+import re
+import tomllib
+from collections.abc import Callable, Sequence, Set
+from typing import Any
+
+from uavlinkd.fleet.manifest import ROLES, Fleet, FleetError, Member, MemberKind, fill, literal
 
 CONFIDENTIAL = "confidential = true"
 """In ``[link]`` of a fleet with relays: otherwise their owners could read the frames."""
+_HEADER = re.compile(r"[ \t]*\[")
+_KEY = re.compile(r"[ \t]*(?:\"([^\"]*)\"|'([^']*)'|([A-Za-z0-9_-]+))[ \t]*=")
+_LINK = re.compile(r"[ \t]*\[[ \t]*link[ \t]*\]")
+_KINDS = ("peer", "relay", "member")
+_PUBLIC = ("public_key", "previous_public_key")
+
+Table = dict[str, Any]
 
 
 def config_file(member: Member) -> str:
@@ -99,3 +116,116 @@ def public_key_lines(peer: Member) -> list[str]:
     if peer.previous_public_key is not None:
         lines.append(f"previous_public_key = {literal(peer.previous_public_key)}")
     return lines
+
+
+def set_section(text: str, kind: str, name: str, section: str = "") -> str:
+    """Replace the section of a peer, relay or member, append it, or delete it if the new one is empty."""
+
+    def change(table: Table) -> None:
+        left = [peer for peer in table.pop(kind, []) if peer.get("name") != name]
+        if left := left + tomllib.loads(section).get(kind, []):
+            table[kind] = left
+
+    kept = "".join(piece for piece in _sections(text) if _name(piece, kind) != name).rstrip("\n") + "\n"
+    return _checked(text, f"{kept}\n{section}" if section else kept, change)
+
+
+def set_confidential(text: str) -> str:
+    """Encrypt the frames on all links."""
+    if not any(map(_LINK.match, _sections(text))):
+        text += "\n[link]\n"
+    place = next(number for number, section in enumerate(_sections(text)) if _LINK.match(section))
+    return _set_lines(text, place, lambda table: table["link"], ("confidential",), [CONFIDENTIAL])
+
+
+def set_public_keys(text: str, kind: str, peer: Member) -> str:
+    """Replace the public keys of a peer, relay or member by its current ones."""
+    places = [number for number, section in enumerate(_sections(text)) if _name(section, kind) == peer.name]
+    if len(places) != 1:
+        raise FleetError(f'it has no [[{kind}]] with the name "{peer.name}": add it, or move the file away')
+
+    def section(table: Table) -> Table:
+        return next(section for section in table[kind] if section.get("name") == peer.name)
+
+    return _set_lines(text, places[0], section, _PUBLIC, public_key_lines(peer))
+
+
+def set_private_keys(text: str, member: Member) -> str:
+    """Replace the names of the member's own key files by the current ones."""
+    keys = ("private_key_file", "previous_private_key_file")
+    return _set_lines(text, 0, lambda table: table, keys, key_lines(member))
+
+
+def section_with_key(text: str, public_keys: Set[str | None]) -> str | None:
+    """The section that contains one of these keys, as current or previous key; None without one."""
+    try:
+        table = tomllib.loads(text)
+    except ValueError:  # a daemon would refuse the file
+        return None
+    for kind in _KINDS:
+        peers = table.get(kind, [])
+        for number, peer in enumerate(peers if isinstance(peers, list) else []):
+            # A daemon ignores spaces around a key.
+            if isinstance(peer, dict) and public_keys & {str(peer.get(key)).strip() for key in _PUBLIC}:
+                return f"{kind}[{number}] ({peer.get('name')})"
+    return None
+
+
+def _set_lines(
+    text: str, place: int, table_of: Callable[[Table], Table], keys: Sequence[str], lines: Sequence[str]
+) -> str:
+    """Replace the lines with these keys in one section, whose table ``table_of`` finds in the parsed file.
+
+    The new lines are where the first of them was, or else at the end.
+    """
+
+    def change(table: Table) -> None:
+        section = table_of(table)
+        for key in keys:
+            section.pop(key, None)
+        section.update(tomllib.loads("\n".join(lines)))
+
+    sections = _sections(text)
+    kept: list[str] = []
+    at: int | None = None
+    for line in sections[place].splitlines(keepends=True):
+        match = _KEY.match(line)
+        if match is not None and next(filter(None, match.groups()), "") in keys:
+            at = len(kept) if at is None else at
+        else:
+            kept.append(line)
+    at = len(kept) if at is None else at
+    sections[place] = "".join([*kept[:at], *(f"{line}\n" for line in lines), *kept[at:]])
+    return _checked(text, "".join(sections), change)
+
+
+def _checked(before: str, after: str, change: Callable[[Table], None]) -> str:
+    """``after``, if it parses to the same as ``before`` with the change."""
+    try:
+        table = tomllib.loads(before)
+        change(table)
+        same = tomllib.loads(after) == table
+    except (ValueError, TypeError, AttributeError, LookupError, StopIteration):
+        same = False
+    if not same:
+        raise FleetError("its edits cannot be kept: move it away, and run the command again to write a new one")
+    return after
+
+
+def _sections(text: str) -> list[str]:
+    """The text, split before each line that starts with ``[``. The first piece is before any section."""
+    pieces: list[list[str]] = [[]]
+    for line in text.splitlines(keepends=True):
+        if _HEADER.match(line):
+            pieces.append([])
+        pieces[-1].append(line)
+    return ["".join(piece) for piece in pieces]
+
+
+def _name(section: str, kind: str) -> object:
+    """The name in a section of a kind, such as ``[[peer]]``; None for other sections."""
+    try:
+        peer = tomllib.loads(section).get(kind)
+    except ValueError:
+        return None
+    return peer[0].get("name") if isinstance(peer, list) and len(peer) == 1 else None

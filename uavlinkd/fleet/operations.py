@@ -17,7 +17,7 @@ from pathlib import Path
 
 from uavlinkd.config import keys
 from uavlinkd.core.crypto import x25519_public_key
-from uavlinkd.fleet import edit, files
+from uavlinkd.fleet import files
 from uavlinkd.fleet.manifest import (
     Fleet,
     FleetError,
@@ -116,7 +116,7 @@ def remove(folder: Path, name: str) -> Result:
         changes = FileChanges(folder, replace(before, members=tuple(one for one in before.members if one != member)))
         peers = before.peers_of(member)
         for peer in peers:
-            _edit(changes, peer, partial(edit.set_section, kind=peer.section_of(member), name=name))
+            _edit(changes, peer, partial(files.set_section, kind=peer.section_of(member), name=name))
             changes.deleted.append(folder / peer.name / files.psk_file(member))
         _check_unused(changes, member)
         apply(changes)
@@ -214,17 +214,17 @@ def _add_psks(changes: FileChanges, pairs: Iterable[tuple[Member, Member]]) -> N
 
 def _replace_keys(changes: FileChanges, member: Member) -> list[Member]:
     """Write a member's current keys into its own configuration and its peers'. Return the peers."""
-    _edit(changes, member, partial(edit.set_private_keys, member=member))
+    _edit(changes, member, partial(files.set_private_keys, member=member))
     peers = changes.fleet.peers_of(member)
     for peer in peers:
-        _edit(changes, peer, partial(edit.set_public_keys, kind=peer.section_of(member), peer=member))
+        _edit(changes, peer, partial(files.set_public_keys, kind=peer.section_of(member), peer=member))
     return peers
 
 
 def _with_peer(fleet: Fleet, member: Member, peer: Member, text: str) -> str:
     """A member's configuration with another member in it. Links that may go along a relay are encrypted."""
-    text = edit.set_section(text, member.section_of(peer), peer.name, files.peer_section(fleet, member, peer))
-    return edit.set_confidential(text) if peer.is_relay else text
+    text = files.set_section(text, member.section_of(peer), peer.name, files.peer_section(fleet, member, peer))
+    return files.set_confidential(text) if peer.is_relay else text
 
 
 def _edit(changes: FileChanges, member: Member, change: Callable[[str], str]) -> None:
@@ -253,7 +253,7 @@ def _check_unused(changes: FileChanges, former: Member) -> None:
             text = changes.texts[path] if path in changes.texts else path.read_text(encoding="utf-8")
         except (OSError, ValueError):  # on its vehicle only, or not text
             continue
-        if section := edit.section_with_key(text, {former.public_key, former.previous_public_key}):
+        if section := files.section_with_key(text, {former.public_key, former.previous_public_key}):
             raise FleetError(
                 f"{path}: {section} has a key of {former.name}, which would stay valid: delete it there first"
             )
