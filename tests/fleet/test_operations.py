@@ -1,20 +1,39 @@
-"""Fleets on disk: the files that the commands write, and the files after a failure."""
+"""Fleets on disk: the files that the commands write, and those after a failure; two commands at once; templates."""
 
 from __future__ import annotations
 
+import shutil
+import signal
+import subprocess
+import sys
 import tomllib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.fleet.vehicles import loaded
+from tests.waiting import PATIENCE_S
 from uavlinkd.config import keys
 from uavlinkd.fleet import operations, transaction
-from uavlinkd.fleet.manifest import Fleet, FleetError, FleetSettings, MemberKind, read_manifest
+from uavlinkd.fleet.manifest import (
+    Fleet,
+    FleetError,
+    FleetSettings,
+    MemberKind,
+    check_settings,
+    fill,
+    planned_address,
+    read_manifest,
+)
+from uavlinkd.fleet.transaction import check_members, lock
+from uavlinkd.lab.child_processes import end_with_parent
 from uavlinkd.system.addresses import parse_address
+
+COMMAND = end_with_parent(sys.executable, "-m", "uavlinkd", "fleet", "add", "scout", "--out", "fleet")
 
 
 def snapshot(folder: Path) -> dict[str, bytes]:
@@ -327,3 +346,60 @@ def test_compromised_key_is_removed_everywhere(folder: Path) -> None:
     for content in snapshot(folder).values():
         assert public.encode() not in content
         assert content not in secrets
+
+
+@pytest.mark.parametrize(
+    ("template", "text"),
+    [("", ""), ("10.13.0.{n}:5790", "10.13.0.7:5790"), ("{name}.local:{n}{n}", "{n}.local:77"), ("%s {n}", "%s 7")],
+)
+def test_number_and_name_are_put_in(template: str, text: str) -> None:
+    """``{n}`` and ``{name}`` are replaced. Other text is kept, and braces in a name too."""
+    assert fill(template, 7, "{n}") == text
+
+
+@pytest.mark.parametrize(
+    "template",
+    [
+        *("{name.__class__}", "{name.__class__.__mro__}", "{n.real}", "{0}", "{}", "{name!r}", "{n:>9999999}"),
+        *("{name[0]}", "{ n }", "{N}", "{{n}}", "{n", "n}"),
+    ],
+)
+def test_anything_else_in_braces_is_refused(template: str) -> None:
+    """Attributes, items, positions, conversions, widths and unpaired braces; the error names the option."""
+    with pytest.raises(FleetError, match=r"\{n\} and \{name\}"):
+        fill(template, 7, "scout")
+    with pytest.raises(FleetError, match="address plan"):
+        planned_address(f"{{name}}{template}:5790", "scout", 7, is_drone=True)
+    for key in ("control_socket", "drone_url", "ground_station_url"):
+        settings: dict[str, str] = {key: f"/run/{template}"}
+        with pytest.raises(FleetError, match=f"--{key.replace('_', '-')}"):
+            check_settings(replace(FleetSettings(), **settings))  # type: ignore[arg-type]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("is_interrupted", [False, True])
+def test_second_command_waits_for_the_first(tmp_path: Path, is_interrupted: bool) -> None:
+    """It reads the files only when it has the lock, so it keeps the first's change. Ctrl-C ends the wait."""
+    fleet, changed = tmp_path / "fleet", tmp_path / "changed"
+    operations.init(fleet, FleetSettings(), drones=2, ground_stations=0, observers=0)
+    shutil.copytree(fleet, changed)
+    operations.add(changed, "relay", MemberKind.DRONE)
+    with ExitStack() as stack:
+        held = stack.enter_context(ExitStack())
+        held.enter_context(lock(fleet))
+        second = stack.enter_context(
+            subprocess.Popen(COMMAND, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+        )
+        stack.callback(second.kill)
+        assert second.stderr is not None
+        assert second.stderr.readline() == "waiting for another fleet command in fleet\n"
+        shutil.copytree(changed, fleet, dirs_exist_ok=True)
+        if is_interrupted:
+            second.send_signal(signal.SIGINT)
+        else:
+            held.close()
+        assert second.wait(PATIENCE_S) == is_interrupted
+    members = read_manifest(fleet).members
+    assert [member.name for member in members] == ["drone1", "drone2", "relay", *["scout"] * (not is_interrupted)]
+    assert len({member.system_id for member in members}) == len(members)
+    check_members(fleet, members)
