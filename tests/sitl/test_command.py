@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.sitl import command
+from tests.sitl import __main__ as command
 from tests.sitl.scenarios import Record, Run
 
 EXECUTABLE = "/bin/sh"

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from tests.soak.command import OK, SUMMARY, report
+from tests.soak.__main__ import OK, SUMMARY, report
 from tests.soak.flows import SETTLED_S, Flow, frame, numbers_in
 from tests.soak.judge import SAMPLES, judge, read_samples
 from tests.soak.run import Plan, record
