@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Callable, Sequence, Set
+from collections.abc import Callable, Set
 from typing import Any
 
-from uavlinkd.fleet.manifest import ROLES, Fleet, FleetError, Member, MemberKind, fill, literal
+from uavlinkd.fleet.manifest import ROLES, Fleet, FleetError, Member, MemberKind, fill, toml_lines
 
-CONFIDENTIAL = "confidential = true"
+CONFIDENTIAL = {"confidential": True}
 """In ``[link]`` of a fleet with relays: otherwise their owners could read the frames."""
 _HEADER = re.compile(r"[ \t]*\[")
 _KEY = re.compile(r"[ \t]*(?:\"([^\"]*)\"|'([^']*)'|([A-Za-z0-9_-]+))[ \t]*=")
@@ -48,32 +48,31 @@ def psk_file(other: Member) -> str:
 def write_config(fleet: Fleet, member: Member) -> str:
     """The text of a member's configuration."""
     settings, kind = fleet.settings, member.kind.value.replace("-", " ")
-    url = settings.drone_url if member.is_drone else settings.ground_station_url
     numbered = "" if member.is_relay else f" with MAVLink system id {member.system_id}"
+    top = {
+        "name": member.name,
+        **private_keys(member),
+        "listen": _listen(member),
+        "control_socket": fill(settings.control_socket, member.system_id, member.name),
+    }
+    link = {"suites": [settings.suite], **(CONFIDENTIAL if fleet.relays and not member.is_relay else {})}
+    url = fill(settings.drone_url if member.is_drone else settings.ground_station_url, member.system_id, member.name)
+    endpoint = {
+        "name": "autopilot" if member.is_drone else "ground-control",
+        "url": url,
+        "system_ids": [member.system_id],
+        "role": "observer" if member.kind is MemberKind.OBSERVER else None,
+    }
     lines = [
         f"# {member.name}, {'an' if kind == 'observer' else 'a'} {kind}{numbered}.",
         "# Written by `uavlinkd fleet`. Later commands change keys and peers, and keep your other edits.",
         "",
-        f"name = {literal(member.name)}",
-        *key_lines(member),
-        f"listen = {literal(_listen(member))}",
-        f"control_socket = {literal(fill(settings.control_socket, member.system_id, member.name))}",
+        *toml_lines(top),
         "",
         "[link]",
-        f"suites = {literal([settings.suite])}",
+        *toml_lines(link),
+        *([] if member.is_relay else ["", "[[endpoint]]", *toml_lines(endpoint)]),
     ]
-    if not member.is_relay:
-        if fleet.relays:
-            lines.append(CONFIDENTIAL)
-        lines += [
-            "",
-            "[[endpoint]]",
-            f"name = {literal('autopilot' if member.is_drone else 'ground-control')}",
-            f"url = {literal(fill(url, member.system_id, member.name))}",
-            f"system_ids = [{member.system_id}]",
-        ]
-    if member.kind is MemberKind.OBSERVER:
-        lines.append('role = "observer"')
     sections = ["\n".join(lines) + "\n", *(peer_section(fleet, member, peer) for peer in fleet.peers_of(member))]
     return "\n".join(sections)
 
@@ -89,33 +88,29 @@ def _listen(member: Member) -> list[str]:
     return both[1:] if address.ip is not None and address.ip.version == 6 else both[:1]
 
 
-def key_lines(member: Member) -> list[str]:
-    """The lines that name a member's private key files."""
-    lines = [f"private_key_file = {literal(key_file(member))}"]
-    if member.previous_public_key is not None:
-        lines.append(f"previous_private_key_file = {literal(previous_key_file(member))}")
-    return lines
+def private_keys(member: Member) -> Table:
+    """The keys that name a member's private key files; None for those that it has not."""
+    previous = None if member.previous_public_key is None else previous_key_file(member)
+    return {"private_key_file": key_file(member), "previous_private_key_file": previous}
+
+
+def public_keys(peer: Member) -> Table:
+    """The keys with a peer's public keys; None for those that it has not."""
+    return {"public_key": peer.public_key, "previous_public_key": peer.previous_public_key}
 
 
 def peer_section(fleet: Fleet, member: Member, peer: Member) -> str:
     """The section about another member: ``[[peer]]``, ``[[relay]]`` or ``[[member]]``."""
     kind = member.section_of(peer)
-    lines = [f"[[{kind}]]", f"name = {literal(peer.name)}", *public_key_lines(peer)]
-    if peer.address is not None and kind != "member":
-        lines.append(f"addresses = {literal([str(peer.address)])}")
-    if fleet.settings.psk:
-        lines.append(f"psk_file = {literal(psk_file(peer))}")
+    values = {
+        "name": peer.name,
+        **public_keys(peer),
+        "addresses": None if peer.address is None or kind == "member" else [str(peer.address)],
+        "psk_file": psk_file(peer) if fleet.settings.psk else None,
+    }
     if kind == "peer":
-        lines += [f"role = {literal(ROLES[member.kind, peer.kind])}", f"system_ids = [{peer.system_id}]"]
-    return "\n".join(lines) + "\n"
-
-
-def public_key_lines(peer: Member) -> list[str]:
-    """The lines with a peer's public keys."""
-    lines = [f"public_key = {literal(peer.public_key)}"]
-    if peer.previous_public_key is not None:
-        lines.append(f"previous_public_key = {literal(peer.previous_public_key)}")
-    return lines
+        values |= {"role": ROLES[member.kind, peer.kind], "system_ids": [peer.system_id]}
+    return "\n".join([f"[[{kind}]]", *toml_lines(values)]) + "\n"
 
 
 def set_section(text: str, kind: str, name: str, section: str = "") -> str:
@@ -135,7 +130,7 @@ def set_confidential(text: str) -> str:
     if not any(map(_LINK.match, _sections(text))):
         text += "\n[link]\n"
     place = next(number for number, section in enumerate(_sections(text)) if _LINK.match(section))
-    return _set_lines(text, place, lambda table: table["link"], ("confidential",), [CONFIDENTIAL])
+    return _set_keys(text, place, lambda table: table["link"], CONFIDENTIAL)
 
 
 def set_public_keys(text: str, kind: str, peer: Member) -> str:
@@ -147,13 +142,12 @@ def set_public_keys(text: str, kind: str, peer: Member) -> str:
     def section(table: Table) -> Table:
         return next(section for section in table[kind] if section.get("name") == peer.name)
 
-    return _set_lines(text, places[0], section, _PUBLIC, public_key_lines(peer))
+    return _set_keys(text, places[0], section, public_keys(peer))
 
 
 def set_private_keys(text: str, member: Member) -> str:
     """Replace the names of the member's own key files by the current ones."""
-    keys = ("private_key_file", "previous_private_key_file")
-    return _set_lines(text, 0, lambda table: table, keys, key_lines(member))
+    return _set_keys(text, 0, lambda table: table, private_keys(member))
 
 
 def section_with_key(text: str, public_keys: Set[str | None]) -> str | None:
@@ -171,31 +165,30 @@ def section_with_key(text: str, public_keys: Set[str | None]) -> str | None:
     return None
 
 
-def _set_lines(
-    text: str, place: int, table_of: Callable[[Table], Table], keys: Sequence[str], lines: Sequence[str]
-) -> str:
-    """Replace the lines with these keys in one section, whose table ``table_of`` finds in the parsed file.
+def _set_keys(text: str, place: int, table_of: Callable[[Table], Table], values: Table) -> str:
+    """Set keys in one section, whose table ``table_of`` finds in the parsed file, and delete those that are None.
 
     The new lines are where the first of them was, or else at the end.
     """
 
     def change(table: Table) -> None:
         section = table_of(table)
-        for key in keys:
+        for key, value in values.items():
             section.pop(key, None)
-        section.update(tomllib.loads("\n".join(lines)))
+            if value is not None:
+                section[key] = value
 
     sections = _sections(text)
     kept: list[str] = []
     at: int | None = None
     for line in sections[place].splitlines(keepends=True):
         match = _KEY.match(line)
-        if match is not None and next(filter(None, match.groups()), "") in keys:
+        if match is not None and next(filter(None, match.groups()), "") in values:
             at = len(kept) if at is None else at
         else:
             kept.append(line)
     at = len(kept) if at is None else at
-    sections[place] = "".join([*kept[:at], *(f"{line}\n" for line in lines), *kept[at:]])
+    sections[place] = "".join([*kept[:at], *(f"{line}\n" for line in toml_lines(values)), *kept[at:]])
     return _checked(text, "".join(sections), change)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import re
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from ipaddress import ip_network
@@ -239,20 +239,20 @@ def write_manifest(fleet: Fleet) -> str:
         "# A fleet: public facts only. `uavlinkd fleet` reads and writes this file. The keys are in the folders.",
         "",
         "[fleet]",
+        *toml_lines({key.name: getattr(fleet.settings, key.name) for key in fields(FleetSettings)}),
     ]
-    lines += [f"{key.name} = {literal(getattr(fleet.settings, key.name))}" for key in fields(FleetSettings)]
     for member in fleet.members:
-        lines += ["", "[[member]]"]
-        for key in fields(Member):
-            value = getattr(member, key.name)
-            if value is not None:
-                lines.append(f"{key.name} = {literal(value if isinstance(value, int) else str(value))}")
+        lines += ["", "[[member]]", *toml_lines({key.name: getattr(member, key.name) for key in fields(Member)})]
     return "\n".join(lines) + "\n"
 
 
-def literal(value: object) -> str:
-    """A value in TOML. JSON writes strings, numbers, booleans and lists in the same way."""
-    return json.dumps(value, ensure_ascii=False)
+def toml_lines(values: Mapping[str, object]) -> list[str]:
+    """The lines with these keys, without those that are None. JSON writes strings, numbers and lists as TOML does."""
+    return [
+        f"{key} = {json.dumps(value, ensure_ascii=False, default=str)}"
+        for key, value in values.items()
+        if value is not None
+    ]
 
 
 def read_manifest(folder: Path) -> Fleet:
