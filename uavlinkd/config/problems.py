@@ -189,18 +189,16 @@ _SECTIONS: dict[str, type[schema.Section]] = {
     **{f"in [{key}]": model for key, model in schema.SINGLE.items()},
 }
 
-# Names that WireGuard and common usage have for these keys, where the most similar key is another one.
-_IN_A_FILE = "{} the name of a file that holds the key: this file never contains a key"
 _UDP, _SERIAL = 'url = "udpin:127.0.0.1:14550"', 'url = "serial:/dev/ttyACM0:57600"'
-_OTHERS_CALL_IT = {
-    "private_key": _IN_A_FILE.format("private_key_file,"),
-    "psk": _IN_A_FILE.format("psk_file,"),
-    "preshared_key": _IN_A_FILE.format("psk_file,"),
-    "listen_port": 'listen, with an address: listen = ["0.0.0.0:5790"]',
-    "mtu": "max_envelope_bytes, the size of the UDP payload",
-    "encryption": "confidential = true",
-}
-_OTHERS_CALL_IT_IN: dict[type[schema.Section], dict[str, str]] = {
+_IN_A_FILE = "the name of a file that holds the key: this file never contains a key"
+_OTHERS_CALL_IT: dict[type[schema.Section], dict[str, str]] = {
+    schema.Section: {
+        "private_key": f"private_key_file, {_IN_A_FILE}",
+        **dict.fromkeys(("psk", "preshared_key"), f"psk_file, {_IN_A_FILE}"),
+        "listen_port": 'listen, with an address: listen = ["0.0.0.0:5790"]',
+        "mtu": "max_envelope_bytes, the size of the UDP payload",
+        "encryption": "confidential = true",
+    },
     schema.FileSection: {"log_level": '[log] at the end of the file, and below it level = "info"'},
     schema.PeerSection: {
         **dict.fromkeys(("address", "endpoint"), 'addresses, a list: addresses = ["10.13.0.2:5790"]'),
@@ -214,16 +212,15 @@ _OTHERS_CALL_IT_IN: dict[type[schema.Section], dict[str, str]] = {
         **dict.fromkeys(("device", "baud"), _SERIAL),
     },
 }
+"""Names that WireGuard and common usage have for keys of any section or of one, where the most similar is another."""
 
 
 def unknown_key(key: str, model: type[schema.Section]) -> str:
     """What to write for a key that the section does not have."""
     plain = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|[ -]", "_", key).lower()
-    here = _OTHERS_CALL_IT_IN.get(model, {})
-    if plain in here:
-        return f"is not known here: write {here[plain]}"
-    if plain in _OTHERS_CALL_IT:
-        return f"is not known: write {_OTHERS_CALL_IT[plain]}"
+    for section in (model, schema.Section):
+        if remedy := _OTHERS_CALL_IT.get(section, {}).get(plain):
+            return f"is not known here: write {remedy}"
     for where, other in _SECTIONS.items():
         if key in other.model_fields and key not in model.model_fields:
             return f"does not belong here: write it {where}"

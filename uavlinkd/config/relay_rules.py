@@ -18,17 +18,12 @@ def members(file: Sections) -> Found:
     """Members can reach the relay. One may also be a peer, with the same key: then one session serves both."""
     by_name = {peer.get("name"): peer for peer in file.peers}
     for section in file.members:
-        name, key = section.get("name"), section.get("public_key")
-        if name is None or key is None:
-            continue
-        peer = peer_of(section, file.peers)
+        name, peer = section.get("name"), peer_of(section, file.peers)
         if peer is not None:
             yield from _of_peer(section, peer)
-        if (other := by_name.get(name)) is not None and other is not peer:
-            yield (
-                section.at("name"),
-                f"is the name of {other.at()} too, which has another key: write another name",
-            )
+        if "public_key" in section.valid and name is not None and by_name.get(name, peer) is not peer:
+            text = f"is the name of {by_name[name].at()} too, which has another key: write another name"
+            yield section.at("name"), text
     if len(file.members) > MOST_MEMBERS:
         yield "member", f"has more than {MOST_MEMBERS:,} sections: run several relays, each on a port of its own"
     if file.members and file.top.lacks("listen"):
@@ -45,8 +40,7 @@ def _of_peer(section: Values, peer: Values) -> Found:
     """A member or relay that is a peer too leaves to the peer what belongs to their one session."""
     for key in ("psk_file", "previous_public_key"):
         if key in section.valid:
-            text = f"has no effect, because {peer.at()} has the same public_key: write it there only"
-            yield section.at(key), text
+            yield section.at(key), f"has no effect, because {peer.at()} has the same public_key: write it there only"
 
 
 def relays(file: Sections) -> Found:
@@ -88,11 +82,8 @@ def _addresses(section: Values, peer: Values | None, others: Sequence[Values]) -
     for other in others:
         shared = [written for written in over_ip(section) if written in over_ip(other)]
         if shared and section.get("public_key") != other.get("public_key"):
-            yield (
-                place,
-                f"has {shared[0]}, an address of {other.at()} too, which has another key: write the address of this"
-                " relay",
-            )
+            text = f"has {shared[0]}, an address of {other.at()} too, which has another key: write the address of"
+            yield place, f"{text} this relay"
 
 
 def over_ip(section: Values) -> list[PeerAddress]:
