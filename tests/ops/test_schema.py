@@ -2,14 +2,150 @@
 
 from __future__ import annotations
 
-from tests.ops.schema import golden, status_names
+from collections.abc import Mapping
+from typing import Any
+
+from tests.daemon.frames import frame
+from tests.daemon.harness import Stage
+from tests.ops.schema import golden
 from tests.test_readmes import ROOT, names_in_table
+from uavlinkd.endpoints.line_framing import RADIO_FIGURES
+from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.ops import STATUS_SCHEMA
+from uavlinkd.ops.findings import Finding, Severity, Subject
+
+MAPS = ("peers", "relays", "relays.*.peers", "endpoints", "endpoints.*.clients", "networks", "relay.members")
+"""Objects whose keys are names of the configuration or addresses."""
+COUNTS: Mapping[str, int] = {
+    "drops": 1,
+    "stale": 1,
+    "unrouted": 1,
+    "send_failures": 1,
+    "recording.failures": 1,
+    "relay.dropped": 1,
+    "peers.*.drops": 1,
+    "relays.*.drops": 1,
+    "peers.*.malformed": 1,
+    "peers.*.waiting_dropped": 1,
+    "peers.*.copies_dropped": 1,
+    "networks.*.serial.failures": 1,
+    "peers.*.refused": 3,
+    "peers.*.refused_commands": 3,
+    "endpoints.*.faults": 1,
+    "endpoints.*.failures": 1,
+    "endpoints.*.refused": 3,
+    "endpoints.*.refused_commands": 3,
+}
+"""Objects that count by reason, or by direction, message and reason: how many keys lead to a count."""
+ALSO = {
+    "peers.*.freshness_unverified_s": "number",
+    "peers.*.role": "null",
+    "peers.*.paths[].lag_s": "number",
+    "peers.*.paths[].network": "string",
+    "peers.*.paths[].relay": "string",
+    "peers.*.paths[].relay_address": "string",
+    "relays.*.paths[].lag_s": "number",
+    "relays.*.paths[].network": "string",
+    "endpoints.*.clients.*.last_received_s": "null",
+    "recording": "null",
+    "networks.*.serial.radio": "object",
+    **{f"networks.*.serial.radio.{name}": "integer" for name in RADIO_FIGURES},
+}
+"""Types that the daemons here do not show."""
+
+_TYPES = {bool: "boolean", int: "integer", float: "number", str: "string", type(None): "null", list: "list"}
+
+
+async def observed() -> dict[str, str]:
+    """Every name with its types: of a daemon, then its peer, with a frame to each; with networks, and relays."""
+    statuses: list[dict[str, Any]] = []
+    async with Stage() as stage:
+        a, b = stage.pair(probe_interval_s=0.1)
+        a.config["peer"][0]["system_ids"] = [9]
+        a.config["recording"] = {"folder": "recordings"}
+        into_a, into_b = a.add_endpoint("autopilot"), b.add_endpoint("autopilot")
+        await stage.start(a, linked=False)
+        statuses.append(await a.status())
+        await stage.start(b)
+        clients = await stage.client(), await stage.client()
+
+        def is_complete(status: dict[str, Any]) -> bool:
+            clients[0].send(frame(1, 7), into_a)  # again each time: what was refused 10 s ago is not shown
+            clients[1].send(frame(1, 2), into_b)
+            is_measured = status["peers"]["drone1"]["round_trip_s"] is not None
+            return is_measured and bool(status["blocked"]) and bool(status["endpoints"]["autopilot"]["clients"])
+
+        statuses.append(await a.until(is_complete))
+        roaming = stage.daemon("roaming", [f"0.0.0.0:{free_port()}"])
+        roaming.config["network"] = [
+            {"name": "present", "address": "127.0.0.1"},
+            {"name": "absent", "interface": "absent0"},
+            {"name": "line", "serial": f"{stage.folder}/absent:57600"},
+        ]
+        roaming.add_peer(a, [])
+        roaming.config["peer"][0]["addresses"] = [{"network": "line"}]
+        await stage.start(roaming, linked=False)
+        statuses.append(await roaming.status())
+        relay = stage.daemon("relay0")
+        far = stage.daemon("far", [])
+        far.config["relay"] = [{"name": "vps", "public_key": relay.public_key, "addresses": [relay.address]}]
+        far.add_peer(a, [])
+        relay.config["member"] = [
+            {"name": "drone1", "public_key": b.public_key},
+            {"name": "far", "public_key": far.public_key},
+        ]
+        relay.add_peer(b, [b.address])
+        b.add_peer(relay, [relay.address])
+        b.config["relay"] = [{"name": "station", "public_key": relay.public_key, "addresses": []}]
+        await b.stop()
+        await stage.start(far, linked=False)
+        statuses.append(await far.status())
+        await stage.start(relay, b, linked=False)
+        statuses.append(await far.until(lambda status: bool(status["relays"]["vps"]["seen_as"])))
+        statuses.append(await relay.until(lambda status: bool(status["relay"]["members"]["drone1"]["addresses"])))
+
+        def is_refused_there(status: dict[str, Any]) -> bool:
+            clients[1].send(frame(1, 2), into_b)  # what was refused before its restart may be reported no more
+            return bool(status["peers"][a.name]["refused_there"])
+
+        statuses.append(await b.until(is_refused_there))
+    findings = [Finding("cause", Severity.FAULT, Subject.PEER, "name", "text", "remedy").as_json()]
+    types: dict[str, set[str]] = {name: {kind} for name, kind in ALSO.items()}
+    for status in statuses:
+        _walk(status | {"findings": findings}, "", types)
+    return {name: "|".join(sorted(kinds)) for name, kinds in types.items()}
+
+
+def _walk(value: Any, path: str, types: dict[str, set[str]]) -> None:
+    if path in COUNTS:
+        _check_counts(value, COUNTS[path], path)
+        types.setdefault(path, set()).add("counts" if COUNTS[path] == 1 else f"counts of {COUNTS[path]} levels")
+    elif isinstance(value, dict):
+        if path:
+            types.setdefault(path, set()).add("object")
+        for key, item in value.items():
+            name = "*" if path in MAPS else key
+            _walk(item, f"{path}.{name}" if path else name, types)
+    elif isinstance(value, list):
+        types.setdefault(path, set()).add("list")
+        for item in value:
+            _walk(item, f"{path}[]", types)
+    else:
+        types.setdefault(path, set()).add(_TYPES[type(value)])
+
+
+def _check_counts(value: Any, levels: int, path: str) -> None:
+    assert isinstance(value, dict), path
+    for item in value.values():
+        if levels == 1:
+            assert isinstance(item, int), path
+        else:
+            _check_counts(item, levels - 1, path)
 
 
 async def test_status_has_the_declared_names() -> None:
     """Of real daemons: one alone, and one with a peer and clients."""
-    names = await status_names.observed()
+    names = await observed()
     problems = golden.differences("status", STATUS_SCHEMA, golden.load("status"), names)
     assert not problems, "\n".join(problems)
 

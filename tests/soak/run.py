@@ -28,7 +28,7 @@ from tests.daemon.harness import Stage
 from tests.daemon.process import DaemonProcess
 from tests.daemon.relay import End, Relay
 from tests.daemon.toml import to_toml
-from tests.daemon.udp import Sockaddr, open_socket
+from tests.daemon.udp import Client, Sockaddr, open_socket, shown
 from tests.soak.flows import SETTLED_S, Flow, frame, numbers_in
 from tests.waiting import PATIENCE_S
 from uavlinkd.lab.child_processes import end_with_parent
@@ -59,44 +59,38 @@ class Plan:
     seed: int = 0
 
 
-class Speaker(asyncio.DatagramProtocol):
+class Speaker(Client):
     """A client at a daemon's endpoint: sends numbered frames, and counts those of others that it receives."""
 
     def __init__(self, name: str, into: Sockaddr) -> None:
+        super().__init__(open_socket("127.0.0.1"))
         self.name = name
         self.flows: dict[str, Flow] = {}
-        self.received: dict[int, Flow] = {}
-        self.sock = open_socket("127.0.0.1")
+        self.expected: dict[int, Flow] = {}
         self._into = into
         self._number = 0
-        self._transport: asyncio.BaseTransport
 
     async def open(self) -> None:
-        await asyncio.get_running_loop().create_datagram_endpoint(lambda: self, sock=self.sock)
+        await asyncio.get_running_loop().create_datagram_endpoint(lambda: self, sock=self._sock)
 
     def greet(self) -> None:
         """Send a frame without a number, so that the daemon learns the client's address."""
-        self.sock.sendto(frame(2**30, SYSTEMS[self.name]), self._into)
+        self.send(frame(2**30, SYSTEMS[self.name]), self._into)
 
     def say(self) -> None:
         self._number += 1
         now = monotonic()
         for flow in self.flows.values():
             flow.on_sent(self._number, now)
-        self.sock.sendto(frame(self._number, SYSTEMS[self.name]), self._into)
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self._transport = transport
+        self.send(frame(self._number, SYSTEMS[self.name]), self._into)
 
     def datagram_received(self, data: bytes, addr: tuple[str | Any, int]) -> None:
+        """Count it, and do not keep it: a run takes hours."""
         now = monotonic()
-        for system, flow in self.received.items():
+        for system, flow in self.expected.items():
             for number in numbers_in(data, system):
                 if number < 2**30:
                     flow.on_delivered(number, now)
-
-    def close(self) -> None:
-        self._transport.close()
 
 
 class Link:
@@ -179,21 +173,21 @@ class Soak:
         there, back = self.flows[f"{drone}>{GROUND}"], self.flows[f"{GROUND}>{drone}"]
         link = Link(drone, near, far, there, back)
         self.links.append(link)
-        self.speakers[drone].flows[GROUND] = self.speakers[GROUND].received[SYSTEMS[drone]] = there
-        self.speakers[GROUND].flows[drone] = self.speakers[drone].received[SYSTEMS[GROUND]] = back
+        self.speakers[drone].flows[GROUND] = self.speakers[GROUND].expected[SYSTEMS[drone]] = there
+        self.speakers[GROUND].flows[drone] = self.speakers[drone].expected[SYSTEMS[GROUND]] = back
         faces = [("127.0.0.1", free_port()) for _ in range(2)]
         near.attach(End.A, self.daemons[drone].sockaddr)
         near.attach(End.B, faces[0])
         far.attach(End.A, faces[1])
         far.attach(End.B, self.daemons[GROUND].sockaddr)
         psk = self.stage.psk()
-        self.daemons[drone].add_peer(self.daemons[GROUND], [_shown(near.address_for(End.A))], psk)
-        self.daemons[GROUND].add_peer(self.daemons[drone], [_shown(far.address_for(End.B))], psk)
+        self.daemons[drone].add_peer(self.daemons[GROUND], [shown(near.address_for(End.A))], psk)
+        self.daemons[GROUND].add_peer(self.daemons[drone], [shown(far.address_for(End.B))], psk)
         radio["peer"] += [
-            {"name": drone, "address": _shown(near.address_for(End.B))},
-            {"name": link.at_ground, "address": _shown(far.address_for(End.A))},
+            {"name": drone, "address": shown(near.address_for(End.B))},
+            {"name": link.at_ground, "address": shown(far.address_for(End.A))},
         ]
-        radio["link"].append({"between": [drone, link.at_ground], "listen": [_shown(face) for face in faces]})
+        radio["link"].append({"between": [drone, link.at_ground], "listen": [shown(face) for face in faces]})
 
     async def _start_radio(self, config: dict[str, Any]) -> None:
         path = self.stage.folder / "radio.toml"
@@ -330,7 +324,3 @@ def _process(pid: int) -> dict[str, int]:
 
 def _part(ordered: list[float], share: float) -> float | None:
     return round(ordered[min(len(ordered) - 1, int(share * len(ordered)))], 6) if ordered else None
-
-
-def _shown(address: Sockaddr) -> str:
-    return "{}:{}".format(*address)

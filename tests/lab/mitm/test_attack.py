@@ -70,3 +70,27 @@ def test_no_datagram_raises(name: str, data: st.DataObject) -> None:
         now += data.draw(st.floats(0, 1))
         attack.due(now)
         assert attack.next_deadline() >= 0
+
+
+ENVELOPE = CONVERSATION.envelopes()[5]
+
+
+def test_bit_flip_goes_through_every_bit() -> None:
+    """As many datagrams as there are bits: each bit is flipped once, alone."""
+    bits = 8 * len(ENVELOPE)
+    attack = parse_attack("bit-flip").make(CONVERSATION.context, 1)
+    flipped = [sent.datagram for _ in range(bits) for sent in sends(attack.on_datagram(ENVELOPE, AB, 0.0))]
+    differences = [int.from_bytes(ENVELOPE, "big") ^ int.from_bytes(datagram, "big") for datagram in flipped]
+    assert sorted(differences) == [1 << n for n in range(bits)]
+
+
+# What an attacker without keys cannot do: the full relay (H2), group keys and stolen keys (H6, H7, D19, D20), clocks
+# (H17), snapshots (H22), and what only an authentic peer can send (D13, D14).
+WITH_KEYS = {"H2", "H6", "H7", "H17", "H22", "D13", "D14", "D19", "D20"}
+
+
+def test_catalogue_is_covered() -> None:
+    """Every number from H1 to H22 and D1 to D21 has an attack, but for those that take a key or the machine."""
+    numbers = {f"H{n}" for n in range(1, 23)} | {f"D{n}" for n in range(1, 22)}
+    covered = {number for attack in ATTACKS.values() for number in attack.catalogue}
+    assert covered == numbers - WITH_KEYS

@@ -1,16 +1,161 @@
 """Attacks on a pair with two paths: no critical frame is lost, and the link stays up while one path works.
 
 The simulated network checks at every delivery that the frame was sent, is unaltered, and is delivered once.
+Planted faults show that the attacks are effective.
 """
 
 from __future__ import annotations
 
+from collections import Counter
+from math import inf
+from typing import Any
+
 import pytest
 
-from tests.lab.mitm.two_paths import CRITICAL_S, TwoPaths
+from tests.lab.mitm.middle import Middle
+from tests.network.network import Drone, Flow, Network
+from uavlinkd.core import constants as c
+from uavlinkd.core import establish, probing
 from uavlinkd.core.constants import LATE_AFTER_S
+from uavlinkd.core.outputs import PathChanged, PeerLost
+from uavlinkd.core.path import Path
+from uavlinkd.core.path_measures import PathLoss
+from uavlinkd.core.path_state import PathCondition, PathState
+from uavlinkd.core.settings import Class, Link
 from uavlinkd.lab.evaluation.ledger import IN_TIME_S
 from uavlinkd.lab.evaluation.tampering_plan import SPOILED_PLANS
+from uavlinkd.lab.mitm.attack import Attack, AttackObject
+from uavlinkd.lab.mitm.attacks import parse_attack
+from uavlinkd.lab.mitm.channel import AttackChannel
+from uavlinkd.lab.mitm.radio import RadioSettings
+
+SLOWER = RadioSettings(delay_s=0.02)
+"""The second path, in each direction, beyond the delay of the first one."""
+STREAM_S, CRITICAL_S = 0.02, 0.1
+SETTLE_S = 6.0
+
+
+class TwoPaths:
+    """A linked pair. The first path is the faster one.
+
+    ``learns``: b has no address of a, so that its paths are learned ones. ``streams``: there are other frames than
+    critical ones.
+    """
+
+    def __init__(self, name: str, *, learns: bool = False, starts: bool = True, streams: bool = True) -> None:
+        self.network = Network(f"two paths {name}", RadioSettings(delay_s=0.01))
+        self.network.checks_bounds = False
+        self.a, self.b = self.network.add("a"), self.network.add("b")
+        self.middle = Middle(self.network, self.a, self.b, paths=2)
+        context = self.middle.context
+        radios = {direction: SLOWER for direction in context.directions if direction.path == 2}
+        self.middle.channel = AttackChannel(context, radios=radios)
+        self.middle.introduce(Link())
+        if learns:
+            self.b.acquaintances["a"] = self.b.acquaintances["a"][0], ()
+        self.stream = self._flows(Class.STREAM, STREAM_S) if streams else ()
+        self.critical = self._flows(Class.CRITICAL, CRITICAL_S)
+        self.begun_at = self.ended_at = 0.0
+        self._before: Counter[str] = Counter()
+        if starts:
+            self.start()
+
+    def start(self) -> None:
+        """Start both, and let them choose the best path."""
+        self.a.start()
+        self.b.start()
+        self.network.run(SETTLE_S)
+
+    def attack(self, line: str, seconds: float, *others: AttackObject, spoils_s: float = 0.0) -> list[Attack]:
+        """Attack for some seconds, as the line for the man in the middle says. What ``spoils_s`` before loses is not
+        counted.
+        """
+        now = self.network.now
+        made = [
+            parse_attack(text if "seconds=" in text else f"{text},seconds={seconds}").make(
+                self.middle.context, position, now
+            )
+            for position, text in enumerate(line.split())
+        ]
+        self._before = self.drops
+        self.middle.attack(*made, *others)
+        self.network.run(spoils_s)
+        self.begun_at = self.network.now
+        self.network.run(seconds)
+        self.ended_at = self.network.now
+        return made
+
+    @property
+    def drops(self) -> Counter[str]:
+        counts: Counter[str] = Counter()
+        for drone, other in self._ends():
+            counts.update(drone.peer(other).traffic.drops)
+            counts["paths_unproven"] += drone.peer(other).paths.unproven
+        return counts
+
+    @property
+    def counted(self) -> Counter[str]:
+        """What both have counted since the attack began."""
+        return self.drops - self._before
+
+    def lost(self, flows: tuple[Flow, ...]) -> int:
+        """How many frames that were sent during the attack were never delivered."""
+        return sum(len(flow.lost(self.begun_at, self.ended_at)) for flow in flows)
+
+    def longest_gap_s(self, flows: tuple[Flow, Flow]) -> float:
+        """The longest silence during the attack, in either direction."""
+        return max(flow.longest_gap(self.begun_at, self.ended_at) for flow in flows)
+
+    def changes(self) -> list[str]:
+        """Why the best paths changed since the attack began."""
+        return [
+            output.reason
+            for drone in (self.a, self.b)
+            for at, output in drone.outputs
+            if isinstance(output, PathChanged) and at >= self.begun_at
+        ]
+
+    @property
+    def stayed_up(self) -> bool:
+        """Whether no side lost the other since the attack began."""
+        return not any(
+            isinstance(output, PeerLost) and at >= self.begun_at
+            for drone in (self.a, self.b)
+            for at, output in drone.outputs
+        )
+
+    def numbers_of_best(self) -> set[int]:
+        """The paths that both sides prefer; 0 for an address of the attacker."""
+        context, numbers = self.middle.context, set()
+        for drone, other in self._ends():
+            best = drone.peer(other).path
+            assert best is not None
+            numbers.add(
+                next(
+                    (
+                        direction.path
+                        for direction in context.directions
+                        if self.middle.listener(*direction) == best.address and direction.sender == drone.name
+                    ),
+                    0,
+                )
+            )
+        return numbers
+
+    def amplified(self) -> list[tuple[str, int]]:
+        """The strangers that received more than they sent."""
+        return list(self.middle.amplification.excess)
+
+    def _ends(self) -> tuple[tuple[Drone, Drone], ...]:
+        return (self.a, self.b), (self.b, self.a)
+
+    def _flows(self, cls: Class, interval_s: float) -> tuple[Flow, Flow]:
+        network = self.network
+        return (
+            network.traffic(self.a, self.b, interval_s, cls=cls),
+            network.traffic(self.b, self.a, interval_s, cls=cls),
+        )
+
 
 pytestmark = pytest.mark.long
 
@@ -90,3 +235,79 @@ def test_responses_dropped_on_the_fastest_path_do_not_prevent_a_session(learns: 
     (attack,) = pair.attack("drop-message,message=response,direction=both/1", 5.0)
     assert attack.attempts > 0
     assert all(flow.first_delivery(0.0) < 1.0 for flow in pair.stream)
+
+
+# Each attack succeeds against a receiver without the check that prevents it.
+
+
+def attacked(name: str, seconds: float = LASTING_S) -> TwoPaths:
+    pair = TwoPaths(name)
+    pair.attack(ATTACKS[name][0], seconds)
+    return pair
+
+
+def test_sender_that_does_not_compare_delays_stays_on_the_slow_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its stream is late as long as the attack lasts."""
+    monkeypatch.setattr(c, "BETTER_BY_S", inf)
+    pair = attacked("slowed")
+    assert pair.numbers_of_best() == {1}
+    assert all(flow.delivered[max(flow.delivered)] - flow.sent_at[max(flow.delivered)] > 0.2 for flow in pair.stream)
+
+
+def test_sender_that_trusts_probes_loses_its_stream(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only the counts of the peer show the loss."""
+    monkeypatch.setattr(PathLoss, "recent", lambda _self, _window_s: (0, 0))
+    pair = attacked("frames dropped")
+    assert pair.numbers_of_best() == {1}
+    assert pair.lost(pair.stream) > 0.8 * 2 * LASTING_S / 0.02
+
+
+def test_responder_that_answers_one_copy_never_links(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The fastest path carries every first copy, and loses every response."""
+    monkeypatch.setattr(establish, "answer_copy", lambda *_: [])
+    pair = TwoPaths("responses", learns=True, starts=False)
+    pair.a.start()
+    pair.b.start()
+    pair.attack("drop-message,message=response,direction=both/1", 10.0)
+    assert not any(flow.delivered for flow in pair.stream)
+
+
+@pytest.mark.parametrize("is_weak", [False, True])
+def test_spoofed_source_gets_no_more_than_it_sent(is_weak: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One captured envelope: without a count of bytes, questions would go there for seconds."""
+    if is_weak:
+        monkeypatch.setattr(PathState, "allows", lambda _self, _size: True)
+    pair = TwoPaths("one source")
+    pair.attack("roam,direction=both/1,limit=2", LASTING_S)
+    assert bool(pair.amplified()) is is_weak
+
+
+def test_receiver_that_ignores_repeated_probes_loses_its_stream(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The untouched path looks dead, because the attacker is faster with its probes."""
+    before, genuine = attacked("frames replaced"), probing.receive_probe
+    monkeypatch.setattr(probing, "receive_probe", lambda *of, is_copy=False: [] if is_copy else genuine(*of))
+    after = attacked("frames replaced")
+    assert after.lost(after.stream) > 2 * before.lost(before.stream)
+
+
+@pytest.mark.parametrize("is_weak", [False, True])
+def test_answers_along_another_path_prove_nothing(is_weak: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second path drops everything, and carries the probes of the first one instead."""
+
+    def take_any(self: PathState, answer: int, *rest: Any) -> float | None:
+        round_trip_s = genuine(self, answer, *rest)
+        if round_trip_s is None:
+            self.answered_at, self._unanswered, self._unanswered_since = rest[-1], 0, inf
+            return 0.02
+        return round_trip_s
+
+    genuine = PathState.receive_answer
+    if is_weak:
+        monkeypatch.setattr(PathState, "receive_answer", take_any)
+    pair = TwoPaths("answers")
+    pair.attack("drop,direction=both/2 move,kinds=probe,direction=both/1,onto=2,beside=true", LASTING_S)
+    state = pair.a.peer(pair.b).paths.find(Path(0, pair.middle.listener("a", "b", 2)))
+    assert state is not None
+    assert (state.answered_at > pair.begun_at + 5.0) is is_weak
+    assert state.condition is PathCondition.DOWN or is_weak
+    assert pair.lost(pair.critical) == 0

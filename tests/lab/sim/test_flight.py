@@ -1,4 +1,4 @@
-"""The simulated autopilot on real sockets: its report and frames."""
+"""The simulated autopilot on real sockets: its report, frames and links."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from tests import waiting
-from tests.lab.sim.recorded import Collector
+from tests.lab.sim.recorded import Collector, frames
 from tests.lab.sim.station import decode, of_type
 from uavlinkd.lab.sim.autopilot import AutopilotSettings
 from uavlinkd.lab.sim.flight import Flight
@@ -33,3 +33,18 @@ async def test_the_report_has_the_frames_of_both_directions() -> None:
             assert flight.report().frames_received == 2
         await station.until(lambda: len(station.frames) == flight.report().frames_sent)
         assert len(of_type(decode(station.frames), "COMMAND_ACK")) == 1
+
+
+async def test_frames_pass_unchanged_in_both_directions() -> None:
+    """What one end sends, the other collects byte for byte; a listener answers who called."""
+    sent, answers = frames(20), frames(20, system_id=255)
+    async with Collector("udpin:127.0.0.1:0") as ground:
+        assert not ground.send(answers[0])
+        async with Collector(f"udpout:127.0.0.1:{ground.address[1]}") as air:
+            for frame in sent:
+                assert air.send(frame)
+            await ground.until(lambda: len(ground.frames) == len(sent))
+            for frame in answers:
+                assert ground.send(frame)
+            await air.until(lambda: len(air.frames) == len(answers))
+            assert (ground.frames, air.frames) == (sent, answers)
