@@ -11,7 +11,7 @@ from uavlinkd.config import key_rules, network_rules, relay_rules
 from uavlinkd.config.build import inherited, policy_data
 from uavlinkd.config.problems import Found, Sections, Values, unique
 from uavlinkd.config.schema import LinkSection
-from uavlinkd.endpoints.url import EndpointKind, EndpointUrl, NetworkUrl
+from uavlinkd.endpoints.url import EndpointKind, NetworkUrl
 from uavlinkd.mavlink.policy.settings import PolicyError, read_settings
 from uavlinkd.system.addresses import Address, overlaps
 
@@ -72,10 +72,8 @@ def _endpoints(file: Sections) -> Found:
     """Each endpoint has a port of its own, which is not a port for peers, and does not feed another endpoint."""
     listen: list[Address] = file.top.get("listen", [])
     metrics: Address | None = file.metrics.get("listen")
-    seen: list[tuple[Values, EndpointUrl]] = []
-    for section in file.endpoints:
-        if (url := section.get("url")) is None:
-            continue
+    urls = [(section, url) for section in file.endpoints if isinstance(url := section.get("url"), NetworkUrl)]
+    for section, url in urls:
         key = section.at("url")
         if url.kind is EndpointKind.UDPIN and any(own.port == url.address.port for own in listen):
             yield key, f"has the port that `listen` has for peers, {url.address.port}: write another"
@@ -83,18 +81,15 @@ def _endpoints(file: Sections) -> Found:
             yield key, "sends to this daemon's own port for peers: write the address of the MAVLink client"
         if metrics and url.kind is EndpointKind.TCPIN and overlaps(metrics, url.address):
             yield file.metrics.at("listen"), f"is where {section.at()} listens: write another port"
-        for other, other_url in seen:
-            if message := _clash(url, other_url):
-                yield key, message.format(other=other.at())
-        seen.append((section, url))
+    for (other, other_url), (section, url) in combinations(urls, 2):
+        if message := _clash(url, other_url):
+            yield section.at("url"), message.format(other=other.at())
 
 
 _FEEDS = {(EndpointKind.UDPOUT, EndpointKind.UDPIN), (EndpointKind.TCP, EndpointKind.TCPIN)}
 
 
-def _clash(a: EndpointUrl, b: EndpointUrl) -> str | None:
-    if not isinstance(a, NetworkUrl) or not isinstance(b, NetworkUrl):
-        return None
+def _clash(a: NetworkUrl, b: NetworkUrl) -> str | None:
     if a.listens and a.kind is b.kind and overlaps(a.address, b.address):
         return "listens where {other} does: write another port"
     if a == b:

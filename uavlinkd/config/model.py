@@ -6,7 +6,6 @@ import socket
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import MappingProxyType
 from typing import Final, NamedTuple
 
 from uavlinkd.core.crypto import Secret
@@ -23,8 +22,6 @@ SERIAL = Address(SERIAL_HOST, 0)
 """The other end of a serial network."""
 PolicyData = Mapping[str, object]
 """A policy as immutable plain data. :mod:`uavlinkd.mavlink.policy.compilation` documents its keys."""
-
-
 KEY_GRACE_S: Final = 7 * 24 * 3600.0
 """How long previous keys stay valid after the start or reload in which the daemon read them."""
 
@@ -51,10 +48,6 @@ class ConfigError(UsageError):
         return "\n".join(map(str, self.problems))
 
 
-def _trust_all() -> PolicyData:
-    return MappingProxyType({})
-
-
 @dataclass(frozen=True, slots=True)
 class EndpointConfig:
     """A local MAVLink port.
@@ -65,7 +58,7 @@ class EndpointConfig:
 
     name: str
     url: EndpointUrl
-    policy: PolicyData = field(default_factory=_trust_all)
+    policy: PolicyData = field(default_factory=dict)
     radio_status: bool = False
     status_text: bool = False
 
