@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 from uavlinkd.config.model import Config, ConfigError, EndpointConfig, PeerConfig, Problem, RelayConfig
 from uavlinkd.relay.forwarding import MemberSettings
@@ -22,14 +22,7 @@ _FIXED = {
 }
 """Fields that cannot change while the daemon runs, with the key of each in the file."""
 _NEEDS_RESTART = "cannot change while the daemon runs: restart it, or put the old value back"
-
-
-class _Named(Protocol):
-    @property
-    def name(self) -> str: ...
-
-
-_Section = TypeVar("_Section", bound=_Named)
+_Section = TypeVar("_Section", PeerConfig, EndpointConfig, MemberSettings, RelayConfig)
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,17 +70,11 @@ def compare(old: Config, new: Config) -> ConfigChanges:
         raise ConfigError(tuple(Problem(str(new.path), key, _NEEDS_RESTART) for key in fixed))
     peers = _compare(old.peers, new.peers, _is_accepted_already)
     new_peers = {peer.name for peer in peers[1]}
-
-    def is_same_relay(before: RelayConfig, relay: RelayConfig) -> bool:
-        is_known = relay.previous_public_key in (None, before.previous_public_key)
-        is_same = (relay.settings, relay.peer) == (before.settings, before.peer)
-        return is_same and is_known and relay.peer not in new_peers
-
     return ConfigChanges(
         *peers,
         *_compare(old.endpoints, new.endpoints, lambda before, endpoint: before.url == endpoint.url),
         *_compare(_members(old), _members(new), lambda before, member: True),
-        *_compare(old.relays, new.relays, is_same_relay),
+        *_compare(old.relays, new.relays, lambda *both: _is_same_relay(*both) and both[1].peer not in new_peers),
     )
 
 
@@ -113,3 +100,8 @@ def _is_accepted_already(before: PeerConfig, peer: PeerConfig) -> bool:
     link = replace(peer.settings.link, features=before.settings.link.features)  # new keys are enough for others
     is_same = replace(peer.settings, link=link) == before.settings
     return is_same and peer.previous_public_key in (None, before.previous_public_key)
+
+
+def _is_same_relay(before: RelayConfig, relay: RelayConfig) -> bool:
+    is_same = (relay.settings, relay.peer) == (before.settings, before.peer)
+    return is_same and relay.previous_public_key in (None, before.previous_public_key)
