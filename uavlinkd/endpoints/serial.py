@@ -24,7 +24,7 @@ REFILL = 0.75
 """The kernel gets more when it holds no more than this part of that, so that several frames share a wake-up."""
 IN_FLIGHT_BYTES = 4096  # the limit for a device without a line rate, as its driver counts
 POLL_S = 0.005  # time until the next look at a device without a line rate
-LATE_S = 0.001  # Added to timers, because event loops round to milliseconds and a timer must not fire too early.
+LATE_S = 0.001  # added to timers: event loops round to milliseconds, and a timer must not fire too early
 TERMINAL_BYTES = 4096 + 640 * 1024
 """Most received bytes that the kernel holds for a terminal (Linux: N_TTY_BUF_SIZE, TTYB_DEFAULT_MEM_LIMIT)."""
 _BITS_PER_BYTE = 10  # with start and stop bit

@@ -32,7 +32,7 @@ from uavlinkd.system.stall import STALE, Backlog, StallWatch
 from uavlinkd.system.tasks import keep_running
 
 MODEM_S: Final = 0.25  # the modem gets no more than the air carries in this time, or one datagram
-QUEUE_S: Final = 0.25  # So much may wait here for the modem, and `QUEUE_BYTES` more.
+QUEUE_S: Final = 0.25  # so much may wait here for the modem, and `QUEUE_BYTES` more
 QUEUE_BYTES: Final = 320
 """An initiation and a response of a handshake wait here together, however slow the radio is."""
 READ_BYTES: Final = 4096
@@ -43,7 +43,7 @@ WIRE_LATE_S: Final = 0.05  # a USB adapter reports later than this wire's rate s
 CLOSE_S: Final = 0.5  # at the end of the daemon, the last datagram has this time to leave the kernel
 LINE_FULL: Final = "LINE_FULL"
 """In place of an error's name: a datagram was dropped because too much waits for the radio."""
-CTS_STUCK: Final = "CTS_STUCK"  # In place of an error's name: see `STUCK_S`.
+CTS_STUCK: Final = "CTS_STUCK"  # in place of an error's name: see `STUCK_S`
 _BITS_PER_BYTE: Final = 10  # with start and stop bit
 
 
@@ -73,19 +73,18 @@ class CtsHold:
         self._since = None
 
 
-OnDatagrams = Callable[[list[bytes], float, int], None]
-"""Receives the datagrams that one read completed, its monotonic time and epoch (:mod:`uavlinkd.system.stall`)."""
-
-
 class SerialLine:
-    """One serial network. ``on_change`` is called after the device was opened or lost."""
+    """One serial network. ``on_change`` is called after the device was opened or lost.
+
+    ``on_datagrams`` receives the datagrams that one read completed, and its monotonic time and epoch.
+    """
 
     def __init__(
         self,
         name: str,
         url: SerialUrl,
         bytes_s: float,
-        on_datagrams: OnDatagrams,
+        on_datagrams: Callable[[list[bytes], float, int], None],
         on_change: Callable[[], None],
         stall: StallWatch,
     ) -> None:

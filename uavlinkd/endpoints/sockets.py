@@ -186,7 +186,7 @@ SEND_ATTEMPTS = 4
 """How often a datagram is sent again while each attempt reports the error of an earlier one instead."""
 REPORTS_PER_S = 20
 """Errors that the kernel reports of one socket in :class:`ErrorReports`: an initiator sends four a second at most."""
-MOST_ERRORS = 128  # Read at once. The kernel bounds the queue by the receive buffer.
+MOST_ERRORS = 128  # read at once; the kernel bounds the queue by the receive buffer
 
 
 class ErrorReports:
@@ -268,7 +268,7 @@ LINK_LOCAL: Final = "fe80:"  # the start of a link-local IPv6 address
 class Presence(NamedTuple):
     """What the machine has of a network at one moment."""
 
-    ifindex: int = 0  # The number of the interface. For an address it is 0, unless the address is link-local.
+    ifindex: int = 0  # of the interface; for an address 0, unless it is link-local
     hosts: tuple[str, ...] = ()  # its addresses; empty if it is absent
     reason: str = ""  # why it is absent
 

@@ -86,7 +86,8 @@ class SocketChannel:
 
     def close(self, *, abort: bool) -> None:
         if abort:
-            _try_option(self._sock, socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            with suppress(OSError):
+                self._sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         self._sock.close()
 
 
@@ -248,11 +249,5 @@ def _prepare(sock: socket.socket) -> None:
     """Configure a socket to hold few bytes, and to detect that the other side has gone."""
     sock.setblocking(False)
     for level, name, value in _OPTIONS:
-        number = getattr(socket, name, None)
-        if number is not None:
-            _try_option(sock, level, number, value)
-
-
-def _try_option(sock: socket.socket, level: int, number: int, value: int | bytes) -> None:
-    with suppress(OSError):
-        sock.setsockopt(level, number, value)
+        with suppress(OSError, AttributeError):
+            sock.setsockopt(level, getattr(socket, name), value)

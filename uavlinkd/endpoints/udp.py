@@ -285,8 +285,8 @@ class UdpClient(UdpEndpoint):
 
     def _interval_s(self) -> float:
         """The interval between look-ups: none while the client answers."""
-        received = [port.received_at for port in self.ports if port.received_at is not None]
-        is_silent = self._remote.ip is None and (not received or monotonic() - max(received) >= REMOTE_SILENT_S)
+        received_at = max((port.received_at or -inf for port in self.ports), default=-inf)
+        is_silent = self._remote.ip is None and monotonic() - received_at >= REMOTE_SILENT_S
         return LONGEST_WAIT_S if is_silent or not self.ports else inf
 
     def _on_resolved(self, resolved: Resolved) -> bool:

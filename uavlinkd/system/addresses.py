@@ -54,13 +54,9 @@ class Address:
     @property
     def family(self) -> socket.AddressFamily:
         """The address family; ``AF_UNSPEC`` for a name, which may have addresses of both families."""
-        match self.ip:
-            case IPv4Address():
-                return socket.AF_INET
-            case IPv6Address():
-                return socket.AF_INET6
-            case _:
-                return socket.AF_UNSPEC
+        if (ip := self.ip) is None:
+            return socket.AF_UNSPEC
+        return socket.AF_INET if ip.version == 4 else socket.AF_INET6
 
     @property
     def is_loopback(self) -> bool:
