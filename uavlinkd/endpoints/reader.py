@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import socket
-import sys
 from array import array
 from collections.abc import Callable
 from math import inf
@@ -13,9 +12,13 @@ from typing import Any
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.stall import STALE, STALL_S, Backlog, StallWatch
 
-if sys.platform != "win32":
+try:
     import fcntl
     import termios
+except ImportError:  # Windows
+    _CAN_ASK = False
+else:
+    _CAN_ASK = True
 
 DATAGRAMS_PER_WAKE_UP = 128
 """Most datagrams that one read takes from a socket. Then the other sockets have their turn."""
@@ -184,7 +187,7 @@ class Reader:
         except OSError as error:
             return not self._is_drained(error)
         datagrams.append((bytes(_buffer[:size]), source))
-        if sys.platform == "win32":
+        if not _CAN_ASK:
             return True
         fcntl.ioctl(self._sock, termios.FIONREAD, self._waiting)
         return self._waiting[0] > 0

@@ -14,8 +14,12 @@ from ipaddress import IPv4Network, IPv6Address, IPv6Network, ip_address
 from pathlib import Path
 from typing import Final, NamedTuple
 
-if sys.platform == "linux":
+try:
     import fcntl
+except ImportError:  # Windows
+    _CAN_ASK = False
+else:
+    _CAN_ASK = True
 
 # linux/sockios.h
 _SIOCGIFCONF: Final = 0x8912
@@ -53,7 +57,7 @@ class Interface(NamedTuple):
 
 def find_interface(name: str) -> Interface | None:
     """The interface of this name, if the machine has it now. None on systems other than Linux."""
-    if sys.platform != "linux":
+    if not _CAN_ASK:
         return None
     try:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
