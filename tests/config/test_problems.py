@@ -55,6 +55,7 @@ _PEER_ROWS = [
     ('Endpoint = "10.0.0.1:1"', "Endpoint", "addresses"),
     ('interface = "wlan0"', "interface", 'a [[network]] "mesh" with this'),
     ("colour = 'red'", "colour", "the keys are"),
+    ("metrics = 1", "metrics", "write [metrics], a section of its own"),
     ("confidental = true", "confidental", "did you mean confidential?"),
 ]
 # Old and new text in the good file.

@@ -221,6 +221,8 @@ def unknown_key(key: str, model: type[schema.Section]) -> str:
     for section in (model, schema.Section):
         if remedy := _OTHERS_CALL_IT.get(section, {}).get(plain):
             return f"is not known here: write {remedy}"
+    if key in _SECTION_NAMES:
+        return f"does not belong here: write {_SECTION_NAMES[key]}, a section of its own"
     for where, other in _SECTIONS.items():
         if key in other.model_fields and key not in model.model_fields:
             return f"does not belong here: write it {where}"
@@ -230,4 +232,4 @@ def unknown_key(key: str, model: type[schema.Section]) -> str:
     return f"is not known here: the keys are {', '.join(known)}"
 
 
-_SECTION_NAMES = {key: key for key in schema.SINGLE} | {key: f"[[{key}]]" for key in schema.REPEATED}
+_SECTION_NAMES = {key: f"[{key}]" for key in schema.SINGLE} | {key: f"[[{key}]]" for key in schema.REPEATED}
