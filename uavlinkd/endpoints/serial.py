@@ -18,15 +18,12 @@ from uavlinkd.system.stall import StallWatch
 from uavlinkd.system.tasks import Threads, keep_running
 
 RETRY_S = 0.5  # wait between two attempts to open a device that is missing or not permitted
-IN_FLIGHT_S = 0.02
-"""The kernel gets no more bytes than the line carries in this time, or one frame: they cannot be overtaken there."""
-REFILL = 0.75
-"""The kernel gets more when it holds no more than this part of that, so that several frames share a wake-up."""
+IN_FLIGHT_S = 0.02  # the kernel gets no more than the line carries in this time, or one frame: it cannot be overtaken
+REFILL = 0.75  # it gets more when it holds no more than this part of that, so that frames share a wake-up
 IN_FLIGHT_BYTES = 4096  # the limit for a device without a line rate, as its driver counts
 POLL_S = 0.005  # time until the next look at a device without a line rate
 LATE_S = 0.001  # added to timers: event loops round to milliseconds, and a timer must not fire too early
-TERMINAL_BYTES = 4096 + 640 * 1024
-"""Most received bytes that the kernel holds for a terminal (Linux: N_TTY_BUF_SIZE, TTYB_DEFAULT_MEM_LIMIT)."""
+TERMINAL_BYTES = 4096 + 640 * 1024  # most that the kernel receives (N_TTY_BUF_SIZE, TTYB_DEFAULT_MEM_LIMIT)
 _BITS_PER_BYTE = 10  # with start and stop bit
 _WITHOUT_RATE = ("ttyACM", "ttyGS", "rfcomm", "cu.usbmodem", "tty.usbmodem")
 _PSEUDO_TERMINALS = "/dev/pts/"

@@ -33,16 +33,14 @@ from uavlinkd.system.tasks import keep_running
 
 MODEM_S: Final = 0.25  # the modem gets no more than the air carries in this time, or one datagram
 QUEUE_S: Final = 0.25  # so much may wait here for the modem, and `QUEUE_BYTES` more
-QUEUE_BYTES: Final = 320
-"""An initiation and a response of a handshake wait here together, however slow the radio is."""
+QUEUE_BYTES: Final = 320  # an initiation and a response of a handshake wait here together, however slow it is
 READ_BYTES: Final = 4096
 STUCK_S: Final = 5.0
 """The modem withholds CTS for longer: the wire is broken or not connected. Then the daemon opens the device again,
 and ignores CTS until the device is lost for another reason."""
 WIRE_LATE_S: Final = 0.05  # a USB adapter reports later than this wire's rate shows that bytes were sent
 CLOSE_S: Final = 0.5  # at the end of the daemon, the last datagram has this time to leave the kernel
-LINE_FULL: Final = "LINE_FULL"
-"""In place of an error's name: a datagram was dropped because too much waits for the radio."""
+LINE_FULL: Final = "LINE_FULL"  # in place of an error's name: a datagram was dropped, too much waits
 CTS_STUCK: Final = "CTS_STUCK"  # in place of an error's name: see `STUCK_S`
 _BITS_PER_BYTE: Final = 10  # with start and stop bit
 

@@ -182,10 +182,8 @@ _RECVERR = {
 }
 _ERROR = struct.Struct("=I")  # the first field of struct sock_extended_err: the error's number (linux/errqueue.h)
 _CONTROL_BYTES = 256  # the error, and the address that reported it
-SEND_ATTEMPTS = 4
-"""How often a datagram is sent again while each attempt reports the error of an earlier one instead."""
-REPORTS_PER_S = 20
-"""Errors that the kernel reports of one socket in :class:`ErrorReports`: an initiator sends four a second at most."""
+SEND_ATTEMPTS = 4  # while each attempt reports the error of an earlier datagram instead
+REPORTS_PER_S = 20  # errors of one socket; an initiator sends four datagrams a second at most
 MOST_ERRORS = 128  # read at once; the kernel bounds the queue by the receive buffer
 
 

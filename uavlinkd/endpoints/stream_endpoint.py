@@ -22,13 +22,9 @@ from uavlinkd.system.clock import monotonic
 from uavlinkd.system.error_meanings import NAME_NOT_RESOLVED, meaning_of
 from uavlinkd.system.stall import STALE, Backlog
 
-READ_BYTES = 4096
-"""Read from one connection in a wake-up. Then the other connections have their turn. The costliest bytes take some
-10 ms."""
-STALLED_S = 30.0
-"""A connection that accepted no byte for this long is closed, so that its queue is not held indefinitely."""
-LASTED_S = 60.0
-"""After an endpoint was open for this long, its next failure is logged again. Shorter times would fill the log."""
+READ_BYTES = 4096  # from one connection in a wake-up; the costliest bytes take some 10 ms
+STALLED_S = 30.0  # a connection that accepted no byte for this long is closed, with its queue
+LASTED_S = 60.0  # after an endpoint was open for this long, its next failure is logged again
 
 DISCONNECTED = "disconnected"
 

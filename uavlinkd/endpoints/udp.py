@@ -33,10 +33,8 @@ from uavlinkd.system.resolver import LONGEST_WAIT_S, Resolved, keep_resolving
 from uavlinkd.system.stall import STALE
 from uavlinkd.system.tasks import keep_running
 
-CLIENT_IDLE_S = 60.0
-"""``udpin`` forgets a client that is silent for this long. Even a listener sends a heartbeat each second."""
-REMOTE_SILENT_S = 5.0
-"""The name of a ``udpout`` endpoint is looked up again when its address is silent for this long."""
+CLIENT_IDLE_S = 60.0  # `udpin` forgets a client that is silent for this long; even a listener sends heartbeats
+REMOTE_SILENT_S = 5.0  # the name of a `udpout` endpoint is looked up again when its address is silent for this long
 LOCAL_DATAGRAM_BYTES = 296
 """Frames for one client share a datagram up to this size: MAVROS reads no more of a datagram and loses the rest
 (libmavconn, MsgBuffer::MAX_SIZE)."""

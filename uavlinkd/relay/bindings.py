@@ -18,8 +18,7 @@ from uavlinkd.core.limits import TokenBucket
 from uavlinkd.core.path import Path
 
 HANDLE_BYTES = 2
-QUARANTINED_PER_MEMBER = 4096
-"""Quarantined handles of one member. A member that changes its paths fast must not use up the handles of another."""
+QUARANTINED_PER_MEMBER = 4096  # a member that changes its paths fast must not use up the handles of another
 FEWEST_PEERS = 16  # A member that may ask for fewer has the budget for new wishes of one that may ask for so many.
 
 

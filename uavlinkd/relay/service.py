@@ -25,8 +25,7 @@ from uavlinkd.relay.forwarding import Forwarding, MemberSettings, Meter, RelayLi
 
 BINDS_PER_S = 32  # Binds of one member a second, each of up to 16 keys. Each may cause reports to other members.
 BINDS_BURST = 256  # So many at once, after a quiet while: a ground station with 1,000 vehicles, along four paths.
-LOOK_S = 0.1
-"""Paths along which members asked before they were validated are looked at so often, and after an event."""
+LOOK_S = 0.1  # paths of binds that came before their validation are looked at so often, and after an event
 
 
 class RelayMember:
