@@ -19,7 +19,7 @@ from tests.bench.traffic import TrafficError
 from tests.namespaces import NamespaceError, why_not
 from uavlinkd.lab.child_processes import interrupted_by_signals
 from uavlinkd.lab.evaluation.frame import ReportSection, Table, percentile, to_markdown
-from uavlinkd.lab.evaluation.records import Record, RecordsError, RecordWriter, Value, machine_facts, read_records
+from uavlinkd.lab.evaluation.records import EvaluationError, Record, RecordWriter, Value, machine_facts, read_records
 
 PAGE: Final = "RESULTS.md"
 RATES: Final = (1_000, 10_000)
@@ -79,7 +79,7 @@ def write_report(folder: Path, name: str) -> str:
     """Write the page, ``RESULTS.md`` in the folder; returns its text.
 
     Raises:
-        RecordsError: there are no records in the folder.
+        EvaluationError: there are no records in the folder.
     """
     text = page_text(Findings(*read_records(folder / f"{name}.jsonl")))
     (folder / PAGE).write_text(text, encoding="utf-8")
@@ -234,7 +234,7 @@ def _run(plan: Plan, out: Path, contenders: Sequence[Contender], scales: Sequenc
             Run(plan, bench, writer, lambda line: print(line, flush=True)).all(contenders, scales)
     except KeyboardInterrupt:
         print(f"interrupted: what was measured until then is in {out}", file=sys.stderr)
-        with suppress(RecordsError):  # nothing was measured yet
+        with suppress(EvaluationError):  # nothing was measured yet
             write_report(out, RECORDS)
         return FAILED
     except (NamespaceError, TrafficError) as error:

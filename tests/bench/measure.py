@@ -10,7 +10,7 @@ from typing import Final
 from tests.bench.cable import Cable
 from tests.bench.contenders import NotMeasuredError, Running
 from tests.bench.traffic import Flow, Traffic
-from uavlinkd.lab.evaluation.records import CpuTimeError, Value, cpu_seconds
+from uavlinkd.lab.evaluation.records import EvaluationError, Value, cpu_seconds
 
 NO_LOSS: Final = 0.001
 """Up to this share of loss, a rate passes: one pause of the machine is not the contender's limit."""
@@ -63,7 +63,7 @@ def used(running: Running) -> Used:
     try:
         left = sum(cpu_seconds(process.pid) for process in running.left)
         return Used(left, sum(cpu_seconds(process.pid) for process in running.right))
-    except CpuTimeError as error:
+    except EvaluationError as error:
         raise NotMeasuredError(f"it has ended: {error}") from None
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from datetime import UTC, datetime
 from pathlib import Path
 from statistics import median
 from time import monotonic
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 from uavlinkd.lab.child_processes import private_folder
 from uavlinkd.lab.evaluation.records import Record, RecordWriter, RunRecords, Value, load, machine_facts, read_records
@@ -49,12 +49,6 @@ class Work(Generic[S]):
     show: Show
 
 
-class RunFunction(Protocol[S]):
-    """Makes all measurements, and returns further values for the last record."""
-
-    async def __call__(self, work: Work[S], /) -> dict[str, Any]: ...
-
-
 @dataclass(frozen=True, slots=True)
 class Table:
     """A table with cells of text."""
@@ -80,7 +74,8 @@ class Evaluation(Generic[F, S]):
     name: str
     title: str
     settings: type[S]
-    run: RunFunction[S]
+    run: Callable[[Work[S]], Awaitable[dict[str, Any]]]
+    """Makes all measurements, and returns further values for the last record."""
     findings: Callable[[Mapping[str, Value], Sequence[Record]], F]
     sections: Callable[[F], list[ReportSection]]
     problems: Callable[[F], list[str]]
@@ -102,7 +97,7 @@ class Evaluation(Generic[F, S]):
         """The findings in a folder.
 
         Raises:
-            RecordsError: there are no records, or they cannot be read.
+            EvaluationError: there are no records, or they cannot be read.
         """
         return self.findings(*read_records(folder / f"{self.name}.jsonl"))
 

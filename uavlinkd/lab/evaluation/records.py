@@ -15,7 +15,6 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from types import TracebackType
 from typing import IO, Any, Self, TypeVar
 
 from uavlinkd import __version__
@@ -28,10 +27,6 @@ Value = str | int | float | bool | None | list[float]
 
 class EvaluationError(Exception):
     """An evaluation failed. The message is for the operator."""
-
-
-class RecordsError(EvaluationError):
-    """The records cannot be read."""
 
 
 class Status(StrEnum):
@@ -104,9 +99,6 @@ class RecordWriter:
         line = {"kind": record.kind, "status": record.status.value, "reason": record.reason}
         self._line({**line, "point": dict(record.point), "values": dict(record.values)})
 
-    def close(self) -> None:
-        self._file.close()
-
     def _line(self, content: Mapping[str, object]) -> None:
         self._file.write(json.dumps(content) + "\n")
         self._file.flush()
@@ -114,26 +106,24 @@ class RecordWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
 
 
 def read_records(path: Path) -> tuple[dict[str, Value], list[Record]]:
     """The facts of a run, and its records.
 
     Raises:
-        RecordsError: there are no records, or a line is malformed.
+        EvaluationError: there are no records, or a line is malformed.
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except OSError as error:
-        raise RecordsError(f"{path}: {error.strerror}") from None
+        raise EvaluationError(f"{path}: {error.strerror}") from None
     except UnicodeDecodeError:
-        raise RecordsError(f"{path}: is not text") from None
+        raise EvaluationError(f"{path}: is not text") from None
     if not lines:
-        raise RecordsError(f"{path}: is empty")
+        raise EvaluationError(f"{path}: is empty")
     facts = _parse(path, 1, lines[0], lambda content: dict[str, Value](content["run"]))
     return facts, [_parse(path, number, line, _record) for number, line in enumerate(lines[1:], 2)]
 
@@ -142,7 +132,7 @@ def _parse(path: Path, number: int, line: str, read: Callable[[Any], T]) -> T:
     try:
         return read(json.loads(line))
     except (ValueError, KeyError, TypeError, AttributeError):
-        raise RecordsError(f"{path}: line {number} is not a record of an evaluation") from None
+        raise EvaluationError(f"{path}: line {number} is not a record of an evaluation") from None
 
 
 def _record(content: Any) -> Record:
@@ -198,18 +188,14 @@ def _version_of(package: str) -> str | None:
         return None
 
 
-class CpuTimeError(Exception):
-    """The processor time of a process cannot be read: it has ended, or the kernel has no schedstat."""
-
-
 def cpu_seconds(pid: int) -> float:
     """The processor time of all threads of a process, from the scheduler (``/proc/PID/task/*/schedstat``).
 
     Raises:
-        CpuTimeError: it cannot be read.
+        EvaluationError: it cannot be read. The process has ended, or the kernel has no schedstat.
     """
     threads = Path(f"/proc/{pid}/task")
     try:
         return sum(int((thread / "schedstat").read_bytes().split()[0]) for thread in threads.iterdir()) / 1e9
     except (OSError, IndexError, ValueError) as error:
-        raise CpuTimeError(f"the processor time of process {pid} cannot be read") from error
+        raise EvaluationError(f"the processor time of process {pid} cannot be read") from error

@@ -35,7 +35,7 @@ from uavlinkd.core.suites import Suite
 from uavlinkd.lab.child_processes import private_folder
 from uavlinkd.lab.evaluation.ledger import numbered_frame
 from uavlinkd.lab.evaluation.middle import HOST, MiddleHere
-from uavlinkd.lab.evaluation.records import CpuTimeError, EvaluationError, Record, Status, Value, cpu_seconds
+from uavlinkd.lab.evaluation.records import EvaluationError, Record, Status, Value, cpu_seconds
 from uavlinkd.lab.evaluation.stage import until
 from uavlinkd.lab.mitm.attack import Action, Direction, PassiveAttack, Send
 from uavlinkd.lab.sim.drone_process import DroneError, DroneProcess
@@ -210,7 +210,7 @@ async def measured(kind: str, point: dict[str, Value], measure: Awaitable[dict[s
     """The record of a measurement, also of one that fails."""
     try:
         return Record(kind, point, await measure)
-    except (EvaluationError, DroneError, CpuTimeError, OSError) as error:
+    except (EvaluationError, DroneError, OSError) as error:
         return Record(kind, point, {}, Status.FAILED, str(error))
 
 
