@@ -59,7 +59,7 @@ async def check(
         if daemon is drone:
             assert reported["frames_received"] > 15, "it went another way"
             arrived = reported["frames_received"]
-            await waiting.until(lambda arrived=arrived: flight.report().frames_received >= arrived)  # type: ignore[misc]
+            await waiting.until(lambda arrived=arrived: flight.report.frames_received >= arrived)  # type: ignore[misc]
         else:
             assert reported["frames_received"] > 200, "it went another way"
 

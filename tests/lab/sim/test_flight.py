@@ -30,8 +30,8 @@ async def test_the_report_has_the_frames_of_both_directions() -> None:
             station.send(HEARTBEAT)
             station.send(ARM)
             await waiting.until(lambda: flight.autopilot.vehicle.armed)
-            assert flight.report().frames_received == 2
-        await station.until(lambda: len(station.frames) == flight.report().frames_sent)
+            assert flight.report.frames_received == 2
+        await station.until(lambda: len(station.frames) == flight.report.frames_sent)
         assert len(of_type(decode(station.frames), "COMMAND_ACK")) == 1
 
 

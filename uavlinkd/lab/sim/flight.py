@@ -8,22 +8,11 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from uavlinkd.lab.sim.autopilot import Autopilot, AutopilotSettings, Event
 from uavlinkd.lab.sim.links import LinkURL, MavlinkConnection, open_connection
 from uavlinkd.lab.sim.tlog import PlaybackReport, play_tlog, read_tlog
-
-
-@dataclass(frozen=True, slots=True)
-class FlightReport:
-    """The counters of a simulated flight."""
-
-    seconds: float
-    frames_sent: int
-    frames_received: int
-    frames_unsent: int  # without a receiver
 
 
 class Flight:
@@ -46,16 +35,14 @@ class Flight:
         )
         self._timer: asyncio.TimerHandle | None = None
         self._deadline = self._started_at
-        self._frames_sent = self._frames_unsent = 0
+        self._frames_sent = self.frames_unsent = 0
         self._failure: asyncio.Future[None] = self._loop.create_future()
 
-    def report(self) -> FlightReport:
-        return FlightReport(
-            seconds=self._loop.time() - self._started_at,
-            frames_sent=self._frames_sent,
-            frames_received=self.autopilot.frames_received,
-            frames_unsent=self._frames_unsent,
-        )
+    @property
+    def report(self) -> PlaybackReport:
+        """The counters so far."""
+        seconds = self._loop.time() - self._started_at
+        return PlaybackReport(self._frames_sent, self.autopilot.frames_received, seconds)
 
     async def run(self, seconds: float | None = None) -> None:
         """Fly for ``seconds``, or until cancelled. Raises what a callback raised."""
@@ -68,9 +55,7 @@ class Flight:
         self._on_timer()
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if self._timer:
             self._timer.cancel()
         await self.link.close()
@@ -102,7 +87,7 @@ class Flight:
     def _transmit(self, frames: list[bytes]) -> None:
         for frame in frames:
             if not self.link.send(frame):
-                self._frames_unsent += 1
+                self.frames_unsent += 1
                 continue
             self._frames_sent += 1
 
@@ -145,17 +130,14 @@ async def _fly(options: SimOptions, write: Write) -> None:
 
     async with Flight(str(options.url), settings, on_event=on_event) as flight:
         write(f"copter with system ID {options.system_id}, {_where(flight.link.url)}; Ctrl-C ends it")
-        watching = asyncio.create_task(_watch(flight.link, lambda: flight.report().frames_received > 0, write))
+        watching = asyncio.create_task(_watch(flight.link, lambda: flight.report.frames_received > 0, write))
         try:
             await flight.run(options.seconds)
         finally:
             watching.cancel()
-            report = flight.report()
-            write(
-                f"sent {report.frames_sent:,} frames, received {report.frames_received:,} in {report.seconds:.1f} s"
-            )
-            if report.frames_unsent:
-                write(f"{report.frames_unsent:,} frames had no receiver")
+            write(str(flight.report))
+            if flight.frames_unsent:
+                write(f"{flight.frames_unsent:,} frames had no receiver")
 
 
 async def _play(options: SimOptions, path: Path, write: Write) -> None:
@@ -176,7 +158,7 @@ async def _play(options: SimOptions, path: Path, write: Write) -> None:
     finally:
         for task in watching:
             task.cancel()
-        write(f"sent {report.frames_sent:,} frames, received {report.frames_received:,} in {report.seconds:.1f} s")
+        write(str(report))
 
 
 def _where(url: LinkURL) -> str:

@@ -18,7 +18,6 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
 from time import monotonic
-from types import TracebackType
 from typing import Self
 
 from uavlinkd.lab.child_processes import end_with_parent
@@ -178,9 +177,7 @@ class RealAutopilot:
             raise
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         await self.stop()
 
     def _ardupilot(self) -> Sequence[str]:

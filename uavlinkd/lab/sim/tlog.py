@@ -149,11 +149,14 @@ TICK_S: Final = 0.002
 
 @dataclass(slots=True)
 class PlaybackReport:
-    """The result of a playback."""
+    """The counters of a playback, or of a simulated flight."""
 
     frames_sent: int = 0
     frames_received: int = 0
     seconds: float = 0.0
+
+    def __str__(self) -> str:
+        return f"sent {self.frames_sent:,} frames, received {self.frames_received:,} in {self.seconds:.1f} s"
 
 
 async def play_tlog(
