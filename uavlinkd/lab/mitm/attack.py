@@ -20,7 +20,7 @@ from uavlinkd.lab.mitm.options import Options, options_with
 
 NEVER = math.inf
 CATCH_UP_LIMIT = 256
-"""Datagrams that one call of ``due`` may send. After a pause, those beyond this count are never sent."""
+"""Interventions of one call of ``due``. After a pause, those beyond this count are never made."""
 
 
 class AttackError(ValueError):

@@ -18,13 +18,11 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from uavlinkd.core import wire
 from uavlinkd.endpoints.line_framing import DELIMITER, LineDecoder, encode
 from uavlinkd.lab.mitm.anatomy import DatagramKind, kind_of
-from uavlinkd.lab.mitm.attack import NEVER, AttackError, Direction, Intervention, Operation
+from uavlinkd.lab.mitm.attack import CATCH_UP_LIMIT, NEVER, AttackError, Direction, Intervention, Operation
 from uavlinkd.lab.mitm.modem import ModemEnd, ModemLink
 
 RECORD_LIMIT: Final = 1024
 """Datagrams recorded at each end, for replays and forgeries."""
-CATCH_UP_LIMIT: Final = 256
-"""Interventions of one call of :meth:`LineAttacker.due`. Those beyond it are never made."""
 _FORGED_BYTES = 40
 
 
@@ -67,10 +65,6 @@ class LineAttacker:
     @property
     def names(self) -> list[str]:
         return [running.attack.name for running in self._attacks]
-
-    def recorded(self, end: ModemEnd) -> Sequence[bytes]:
-        """The last datagrams that came out at an end."""
-        return self._recorded[end]
 
     def observe(self, end: ModemEnd, data: bytes) -> None:
         self._recorded[end].extend(self._decoders[end].feed(data))
