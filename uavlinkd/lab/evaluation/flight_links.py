@@ -6,10 +6,8 @@ Each link has a man in the middle of its own. The attacks are the same, except i
 from __future__ import annotations
 
 import asyncio
-import socket
 from collections import Counter
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from random import Random
@@ -26,9 +24,9 @@ from uavlinkd.lab.evaluation.flight_plan import (
     FlightSettings,
     LinkKind,
 )
-from uavlinkd.lab.evaluation.middle import HOST, MiddleHere
+from uavlinkd.lab.evaluation.middle import HOST, Clients, MiddleHere
 from uavlinkd.lab.evaluation.paper_attacks import PaperRelay
-from uavlinkd.lab.evaluation.paper_protocol import PaperEnd
+from uavlinkd.lab.evaluation.paper_protocol import PaperEnd, paper_pair
 from uavlinkd.lab.mitm.attack import AttackObject, Direction
 from uavlinkd.lab.sim.drone_process import DroneProcess
 from uavlinkd.lab.sim.loopback_ports import free_ports
@@ -38,7 +36,6 @@ from uavlinkd.ops.findings import LinkProblem
 OnDelivered = Callable[[str, bytes], None]
 """Called with the name of the receiver and a frame."""
 
-_DATAGRAM_BYTES = 65536
 _HALF = DisplacePositions.options_model.model_validate({"share": ALTERED_SHARE})
 _WAYS = (PAIR, PAIR[::-1])
 
@@ -63,36 +60,25 @@ class PlainLink:
         self.settings = settings
         self.middle = MiddleHere(PAIR, log, settings.seed)
         self._on_delivered = on_delivered
-        self._clients: dict[str, socket.socket] = {}
+        self._clients = Clients(self._on_datagram)
 
     async def open(self) -> None:
         """Start the link, and in a secured one the exchange of keys."""
-        self._open_clients()
-        await self.middle.start({name: int(sock.getsockname()[1]) for name, sock in self._clients.items()}, {})
+        self._clients.open(PAIR)
+        await self.middle.start(self._clients.ports, {})
 
-    def _open_clients(self) -> None:
-        for name in PAIR:
-            sock = self._clients[name] = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-            sock.setblocking(False)
-            sock.bind((HOST, 0))
-            asyncio.get_running_loop().add_reader(sock, self._on_readable, name, sock)
-
-    def _on_readable(self, name: str, sock: socket.socket) -> None:
-        with suppress(OSError):
-            # A daemon may deliver several frames in one datagram.
-            for frame in split_datagram(sock.recv(_DATAGRAM_BYTES), SplitCounters()):
-                self._on_delivered(name, frame.raw)
+    def _on_datagram(self, name: str, datagram: bytes) -> None:
+        # A daemon may deliver several frames in one datagram.
+        for frame in split_datagram(datagram, SplitCounters()):
+            self._on_delivered(name, frame.raw)
 
     async def close(self) -> None:
-        for sock in self._clients.values():
-            asyncio.get_running_loop().remove_reader(sock)
-            sock.close()
+        self._clients.close()
         await self.middle.stop()
 
     def send(self, name: str, frame: bytes) -> None:
         """An aircraft sends a frame to the other."""
-        with suppress(OSError):  # an earlier one was refused: the other end is starting
-            self._clients[name].sendto(frame, (HOST, self._port(name)))
+        self._clients.send(name, frame, self._port(name))
 
     def _port(self, name: str) -> int:
         (other,) = set(PAIR) - {name}
@@ -134,15 +120,7 @@ class PaperLink(PlainLink):
 
     async def open(self) -> None:
         """Start both ends; the first one initiates."""
-        self._ends = {
-            name: PaperEnd(
-                name,
-                is_initiator=name == PAIR[0],
-                on_frame=lambda frame, name=name: self._on_delivered(name, frame),  # type: ignore[misc]
-                renew_s=None,
-            )
-            for name in PAIR
-        }
+        self._ends = paper_pair(PAIR, self._on_delivered, renew_s=None)
         await self.middle.start({name: end.port for name, end in self._ends.items()}, {})
         for name, end in self._ends.items():
             end.start((HOST, self._port(name)))
@@ -184,7 +162,7 @@ class DaemonLink(PlainLink):
 
     async def open(self) -> None:
         """Start both daemons, which then link."""
-        self._open_clients()
+        self._clients.open(PAIR)
         keys = {name: decode_key(drone.public_key) for name, drone in self._drones.items()}
         await self.middle.start({name: drone.port for name, drone in self._drones.items()}, keys)
         psk = generate_psk()

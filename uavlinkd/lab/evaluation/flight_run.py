@@ -32,13 +32,11 @@ from uavlinkd.lab.evaluation.flight_plan import (
 )
 from uavlinkd.lab.evaluation.flight_report import FlightFindings, flight_problems, sections, summary
 from uavlinkd.lab.evaluation.frame import Evaluation, Work
-from uavlinkd.lab.evaluation.records import EvaluationError, Record, Value
+from uavlinkd.lab.evaluation.records import Record, Value
+from uavlinkd.lab.evaluation.stage import until
 from uavlinkd.lab.sim.aircraft import Aircraft, AircraftChoice, choice_of
 from uavlinkd.lab.sim.autopilot import HOME
 
-LINK_UP_S = 120.0
-"""How long the links may take; 1 s on a quiet machine."""
-_LOOK_S = 0.02
 _NOTICE_S = 0.25
 
 
@@ -124,13 +122,11 @@ class _Run:
             stack.push_async_callback(link.close)
             await link.open()
             self._links.append(link)
-        begin = monotonic()
-        while missing := [
-            kind for kind, both in self._receivers.items() if not all(one.beliefs for one in both.values())
-        ]:
-            if monotonic() > begin + LINK_UP_S:
-                raise EvaluationError(f"no position arrived within {LINK_UP_S:g} s over: {', '.join(missing)}")
-            await asyncio.sleep(_LOOK_S)
+        for kind in LinkKind:
+            await until(partial(self._has_arrived, kind), f"no position arrived over {kind}")
+
+    async def _has_arrived(self, kind: LinkKind) -> bool:
+        return all(receiver.beliefs for receiver in self._receivers[kind].values())
 
     async def _run_phase(self, phase: AttackPhase, attack: AttackPhase | None, duration_s: float) -> None:
         """One phase; ``attack``: what begins with it, None if the attack before goes on."""

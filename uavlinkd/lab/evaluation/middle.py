@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import asyncio
+import socket
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import monotonic
@@ -10,9 +13,10 @@ from typing import Any, Protocol
 
 import structlog
 
+from uavlinkd.endpoints.sockets import udp_socket
 from uavlinkd.lab.mitm.attack import AttackContext, AttackObject, Direction
 from uavlinkd.lab.mitm.attacks import parse_attack
-from uavlinkd.lab.mitm.proxy import Proxy
+from uavlinkd.lab.mitm.proxy import Proxy, received
 from uavlinkd.lab.mitm.proxy_settings import MitmLink, MitmPeer, ProxySettings
 from uavlinkd.lab.mitm.radio import RadioSettings
 from uavlinkd.lab.sim.loopback_ports import free_ports
@@ -133,3 +137,37 @@ def silent_log() -> Any:
 
 def _drop_event(_logger: Any, _name: str, _event: Any) -> Any:
     raise structlog.DropEvent
+
+
+class Clients:
+    """The local clients of drones or aircraft: a UDP socket each, by name.
+
+    Args:
+        on_datagram: called with the name of the receiver and each datagram.
+    """
+
+    def __init__(self, on_datagram: Callable[[str, bytes], None]) -> None:
+        self._on_datagram = on_datagram
+        self._sockets: dict[str, socket.socket] = {}
+
+    @property
+    def ports(self) -> dict[str, int]:
+        return {name: sock.getsockname()[1] for name, sock in self._sockets.items()}
+
+    def open(self, names: Sequence[str]) -> None:
+        for name in names:
+            sock = self._sockets[name] = udp_socket(Address(HOST, 0))
+            asyncio.get_running_loop().add_reader(sock, self._on_readable, name, sock)
+
+    def close(self) -> None:
+        for sock in self._sockets.values():
+            asyncio.get_running_loop().remove_reader(sock)
+            sock.close()
+
+    def send(self, name: str, datagram: bytes, port: int) -> None:
+        with suppress(OSError):  # an earlier one was refused: the receiver is starting
+            self._sockets[name].sendto(datagram, (HOST, port))
+
+    def _on_readable(self, name: str, sock: socket.socket) -> None:
+        for datagram, _ in received(sock):
+            self._on_datagram(name, datagram)

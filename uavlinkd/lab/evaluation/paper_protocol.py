@@ -24,13 +24,14 @@ import hmac
 import socket
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, partial
 
 from uavlinkd.core import wire
 from uavlinkd.core.crypto import hmac_sha256
 from uavlinkd.lab.evaluation.paper import GroupKey, Parameters, mac_key, make_parameters
+from uavlinkd.lab.mitm.proxy import received
 
 HELLO, ANSWER = 1, 2
 GROUP_BITS = 2048
@@ -38,8 +39,6 @@ KEY_BYTES = GROUP_BITS // 8
 MAC_KEY_BITS = 256
 TAG_BYTES = 32
 RENEW_S = 0.25
-_DATAGRAM_BYTES = 65536
-_DATAGRAMS_PER_WAKE_UP = 128
 
 
 class PaperKey:
@@ -115,10 +114,7 @@ class PaperEnd:
         renew_s: seconds between two exchanges; None for one exchange, and others by :meth:`renew`.
     """
 
-    def __init__(
-        self, name: str, *, is_initiator: bool, on_frame: Callable[[bytes], None], renew_s: float | None = RENEW_S
-    ) -> None:
-        self.name = name
+    def __init__(self, *, is_initiator: bool, on_frame: Callable[[bytes], None], renew_s: float | None) -> None:
         self.counters: Counter[str] = Counter()
         """Refused datagrams by reason: ``hmac_mismatch``, ``bad_public_key``, ``malformed``, ``unexpected_key`` (that
         was not requested)."""
@@ -172,13 +168,7 @@ class PaperEnd:
             self.counters["send_failed"] += 1
 
     def _on_readable(self) -> None:
-        for _ in range(_DATAGRAMS_PER_WAKE_UP):
-            try:
-                datagram = self._sock.recv(_DATAGRAM_BYTES)
-            except BlockingIOError:
-                return
-            except OSError:  # an earlier datagram was refused
-                continue
+        for datagram, _ in received(self._sock):
             self._receive(datagram)
 
     def _receive(self, datagram: bytes) -> None:
@@ -212,3 +202,13 @@ class PaperEnd:
                 self._on_frame(frame)
                 return
         self.counters["hmac_mismatch"] += 1
+
+
+def paper_pair(
+    names: Sequence[str], on_frame: Callable[[str, bytes], None], renew_s: float | None = RENEW_S
+) -> dict[str, PaperEnd]:
+    """Two ends, by name. The first one initiates. ``on_frame`` is called with the receiver and each frame."""
+    return {
+        name: PaperEnd(is_initiator=name == names[0], on_frame=partial(on_frame, name), renew_s=renew_s)
+        for name in names
+    }

@@ -26,13 +26,12 @@ from uavlinkd.lab.evaluation.paths_plan import (
 )
 from uavlinkd.lab.evaluation.paths_report import sections
 from uavlinkd.lab.evaluation.paths_traffic import DaemonsLink, PathLink, PathRadio, TrafficLog, flows_of
-from uavlinkd.lab.evaluation.records import EvaluationError, Record, Value
+from uavlinkd.lab.evaluation.records import Record, Value
+from uavlinkd.lab.evaluation.stage import until
 from uavlinkd.lab.sim.tlog import play_tlog, read_tlog
 from uavlinkd.mavlink.frames import parse_frame
 from uavlinkd.mavlink.payloads import HEARTBEAT, claims_to_be_ground_station
 
-LINK_UP_S: Final = 120.0
-"""How long linking may take; 1 s on a quiet machine."""
 SETTLE_S: Final = 6.0
 """How long a link may take to use all its paths, before the scenario begins."""
 GRACE_S: Final = 1.5
@@ -102,14 +101,13 @@ class PathTrial:
         """
         await self._link.open()
         self._talking = asyncio.create_task(self._traffic.talk(self._link.send))
-        until = monotonic() + LINK_UP_S
-        while self._traffic.arrived_from != {VEHICLE, STATION}:
-            if monotonic() > until:
-                raise EvaluationError(f"{self.point}: no link within {LINK_UP_S:g} s")
-            await asyncio.sleep(_LOOK_S)
-            await self._link.check()
+        await until(self._is_linked, f"{self.point}: no link")
         # Daemons that use one path only are not an error here: the figures show it.
         await self._until(lambda: all(self._is_used(number, 0.0) for number in self._radios), SETTLE_S)
+
+    async def _is_linked(self) -> bool:
+        await self._link.check()
+        return self._traffic.arrived_from == {VEHICLE, STATION}
 
     async def play(self) -> None:
         """Play the scenario: from here on, everything counts."""

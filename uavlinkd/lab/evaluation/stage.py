@@ -9,19 +9,17 @@ from __future__ import annotations
 import asyncio
 import json
 import signal
-import socket
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 from time import monotonic
 from typing import Any, Self
 
 from uavlinkd.config.keys import decode_key, generate_psk
 from uavlinkd.lab.evaluation.ledger import Ledger
-from uavlinkd.lab.evaluation.middle import HOST, Middle, MiddleHere
-from uavlinkd.lab.evaluation.paper_protocol import PaperEnd
+from uavlinkd.lab.evaluation.middle import HOST, Clients, Middle, MiddleHere
+from uavlinkd.lab.evaluation.paper_protocol import PaperEnd, paper_pair
 from uavlinkd.lab.evaluation.records import EvaluationError
 from uavlinkd.lab.evaluation.tampering_records import OURS, PAPER
 from uavlinkd.lab.mitm.attack import Direction
@@ -32,7 +30,6 @@ from uavlinkd.ops.findings import LinkProblem
 PATIENCE_S = 120.0
 """How long linking may take; 0.5 s on a quiet machine."""
 _LOOK_S = 0.01
-_DATAGRAM_BYTES = 65536
 _TICK_S = 0.001
 _MOST_A_TICK = 20
 """Frames that are sent at once after a pause of this process; the rest is never sent."""
@@ -165,7 +162,7 @@ class DaemonStage(Stage):
         self.psks: dict[frozenset[str], str] = {}
         self._link = link
         self._silent = frozenset(silent)
-        self._clients: dict[str, socket.socket] = {}
+        self._clients = Clients(lambda name, datagram: self.ledger.on_received(name, datagram, monotonic()))
         self._before: dict[str, Counter[str]] = {name: Counter() for name in names}
 
     @property
@@ -178,12 +175,7 @@ class DaemonStage(Stage):
             peers = [self._peer(one, other) for other in self.names if other != one]
             self.drones[one].configure(self._link, peers, self.networks(one), self.relays(one))
         await self.middle.start(*self.attacked())
-        loop = asyncio.get_running_loop()
-        for name in self.names:
-            sock = self._clients[name] = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-            sock.setblocking(False)
-            sock.bind((HOST, 0))
-            loop.add_reader(sock, self._on_readable, name, sock)
+        self._clients.open(self.names)
         for drone in self.drones.values():
             await drone.start()
         for drone in self.drones.values():
@@ -229,25 +221,10 @@ class DaemonStage(Stage):
     async def close(self) -> None:
         await asyncio.gather(*(drone.stop() for drone in self.drones.values()))
         await self.middle.stop()
-        loop = asyncio.get_running_loop()
-        for sock in self._clients.values():
-            loop.remove_reader(sock)
-            sock.close()
+        self._clients.close()
 
     def send(self, name: str, frame: bytes) -> None:
-        with suppress(OSError):  # its daemon is being restarted
-            self._clients[name].sendto(frame, (HOST, self.drones[name].endpoint_port))
-
-    def _on_readable(self, name: str, sock: socket.socket) -> None:
-        now = monotonic()
-        for _ in range(64):
-            try:
-                datagram = sock.recv(_DATAGRAM_BYTES)
-            except BlockingIOError:
-                return
-            except OSError:
-                continue
-            self.ledger.on_received(name, datagram, now)
+        self._clients.send(name, frame, self.drones[name].endpoint_port)
 
     async def notices(self) -> dict[str, Counter[str]]:
         """The counters of each daemon's status, with those before a restart."""
@@ -304,12 +281,7 @@ class PaperStage(Stage):
         self.ends: dict[str, PaperEnd] = {}
 
     async def open(self) -> None:
-        for number, name in enumerate(self.names):
-            self.ends[name] = PaperEnd(
-                name,
-                is_initiator=number == 0,
-                on_frame=lambda frame, name=name: self.ledger.on_received(name, frame, monotonic()),  # type: ignore[misc]
-            )
+        self.ends = paper_pair(self.names, lambda name, frame: self.ledger.on_received(name, frame, monotonic()))
         await self.middle.start({name: end.port for name, end in self.ends.items()}, {})
         for one, other in (self.names, self.names[::-1]):
             self.ends[one].start((HOST, self.middle.ports[Direction(one, other)]))

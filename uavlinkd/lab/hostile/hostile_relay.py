@@ -32,13 +32,14 @@ from uavlinkd.core.relay_records import (
     token_of,
     wrap,
 )
-from uavlinkd.endpoints.reader import DATAGRAMS_PER_WAKE_UP, RECEIVE_BYTES
+from uavlinkd.endpoints.reader import RECEIVE_BYTES
 from uavlinkd.endpoints.sockets import send_from_new_port, udp_socket
 from uavlinkd.lab.hostile.relay_attacks import ALL_ATTACKS, Lie, LieAboutFilters, RelayAttack, RelayContext
 from uavlinkd.lab.mitm.attack import Action, AttackContext, AttackObject, Direction, Intervention
 from uavlinkd.lab.mitm.attack_service import ChannelService, RunSettings
 from uavlinkd.lab.mitm.attacks import AttackSpec
 from uavlinkd.lab.mitm.channel import AttackChannel
+from uavlinkd.lab.mitm.proxy import received
 from uavlinkd.relay.bindings import MemberConnection
 from uavlinkd.relay.forwarding import Forwarding, Meter
 from uavlinkd.relay.service import RelayService, RelayShell
@@ -260,13 +261,7 @@ class HostileRelay(ChannelService):
     # Datagrams.
 
     def _on_readable(self, number: int, sock: socket.socket) -> None:
-        for _ in range(DATAGRAMS_PER_WAKE_UP):
-            try:
-                data, source = sock.recvfrom(RECEIVE_BYTES)
-            except BlockingIOError:
-                break
-            except OSError:  # an earlier datagram was refused
-                continue
+        for data, source in received(sock):
             if data.startswith(_START):
                 self._service.forwarding.take(number, data, source)
             else:

@@ -11,9 +11,10 @@ from __future__ import annotations
 import asyncio
 import socket
 from collections import Counter, deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from time import monotonic
+from typing import Any
 
 from uavlinkd.endpoints.reader import DATAGRAMS_PER_WAKE_UP, RECEIVE_BYTES
 from uavlinkd.endpoints.sockets import BindError, udp_socket
@@ -68,6 +69,21 @@ class Amplification:
 
 
 Sockaddr = tuple[str, int]
+
+
+def received(
+    sock: socket.socket, on_error: Callable[[OSError], object] = lambda error: None
+) -> Iterator[tuple[bytes, Any]]:
+    """The waiting datagrams with their sources, at most :data:`DATAGRAMS_PER_WAKE_UP`."""
+    for _ in range(DATAGRAMS_PER_WAKE_UP):
+        try:
+            datagram, source = sock.recvfrom(RECEIVE_BYTES)
+        except BlockingIOError:
+            return
+        except OSError as error:  # an earlier datagram was refused
+            on_error(error)
+            continue
+        yield datagram, source
 
 
 class Proxy(ChannelService):
@@ -176,10 +192,10 @@ class Proxy(ChannelService):
 
     def _on_listener_readable(self, sock: socket.socket, direction: Direction) -> None:
         now, end = monotonic(), (direction.sender, direction.path)
-        for datagram, source in self._received(sock):
+        for datagram, source in received(sock, self._count_error):
             if not self._is_fixed[direction.sender]:
-                self._addresses[end] = source
-            elif source != self._addresses[end]:
+                self._addresses[end] = source[:2]
+            elif source[:2] != self._addresses[end]:
                 self.errors["unknown sender"] += 1
                 continue
             self.received[direction] += 1
@@ -188,8 +204,8 @@ class Proxy(ChannelService):
 
     def _on_stranger_readable(self, sock: socket.socket, stranger: int) -> None:
         now = monotonic()
-        for datagram, source in self._received(sock):
-            peer = next((name for (name, _), at in self._addresses.items() if at == source), None)
+        for datagram, source in received(sock, self._count_error):
+            peer = next((name for (name, _), at in self._addresses.items() if at == source[:2]), None)
             if peer is None:
                 self.errors["unknown sender"] += 1
                 continue
@@ -197,17 +213,6 @@ class Proxy(ChannelService):
             self.amplification.received(peer, stranger, len(datagram), now)
             self._perform(self.channel.on_answer(datagram, peer, stranger, now))
         self.arm()
-
-    def _received(self, sock: socket.socket) -> Iterator[tuple[bytes, Sockaddr]]:
-        for _ in range(DATAGRAMS_PER_WAKE_UP):
-            try:
-                datagram, source = sock.recvfrom(RECEIVE_BYTES)
-            except BlockingIOError:
-                return
-            except OSError as error:  # an earlier datagram was refused
-                self._count_error(error)
-                continue
-            yield datagram, source[:2]
 
     def _perform(self, actions: Sequence[Action]) -> None:
         for action in actions:
