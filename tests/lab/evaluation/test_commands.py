@@ -10,9 +10,8 @@ from pathlib import Path
 import pytest
 
 from uavlinkd.cli import main
-from uavlinkd.lab.evaluation.commands import EVALUATIONS, STAGES, add_evaluations, evaluation_of, settings_of
+from uavlinkd.lab.evaluation.commands import EVALUATIONS, add_evaluations, evaluation_of, settings_of
 from uavlinkd.lab.evaluation.records import Record, RecordWriter
-from uavlinkd.lab.evaluation.tampering_plan import STAGES as PLANNED
 
 
 def parse(*arguments: str) -> argparse.Namespace:
@@ -26,7 +25,6 @@ def test_defaults_are_those_of_the_settings(name: str) -> None:
     """Written twice, because the settings' modules are too heavy to import for a parser."""
     evaluation = evaluation_of(name)
     assert settings_of(evaluation, parse(name, "--out", "x")) == evaluation.settings()
-    assert STAGES == PLANNED
 
 
 @pytest.mark.parametrize("arguments", [("report", "{}"), ("flight", "--quick", "--out", "{}/file")])

@@ -37,7 +37,6 @@ from uavlinkd.lab.mitm.anatomy import DatagramKind, kind_of
 from uavlinkd.lab.mitm.attack import (
     NEVER,
     Action,
-    AttackObject,
     Direction,
     Intervention,
     Operation,
@@ -232,9 +231,6 @@ class KeyAttack:
     relays: bool = False
     frames: tuple[bytes, ...] = ()
 
-    def make(self) -> Impostor:
-        return Impostor(self.name, self.disguises, monotonic(), relays=self.relays, frames=self.frames)
-
 
 def key_attacks(stage: DaemonStage) -> list[KeyAttack]:
     """The attacks with own or stolen keys on the first two drones of three."""
@@ -275,17 +271,13 @@ def key_attacks(stage: DaemonStage) -> list[KeyAttack]:
 
 
 async def run_key_attack(bench: Bench, attack: KeyAttack) -> None:
-    impostor: list[Impostor] = []
-
-    def objects() -> list[AttackObject]:
-        impostor.append(attack.make())
-        return [*impostor]
+    impostor = Impostor(attack.name, attack.disguises, monotonic(), relays=attack.relays, frames=attack.frames)
 
     def total(name: str) -> int:
-        return sum(getattr(achieved, name) for achieved in impostor[0].achieved.values())
+        return sum(getattr(achieved, name) for achieved in impostor.achieved.values())
 
     attacker = KeyHolder(
-        objects,
+        [impostor],
         # As itself, a captured drone has a genuine session: only its frames matter.
         sessions=lambda: 0 if attack.frames else total("sessions"),
         achieved=lambda: {name: total(name) for name in ("initiations", "answers", "sessions", "frames_read")},
@@ -299,7 +291,7 @@ async def run_paper_relay(bench: Bench) -> None:
     """Run the full relay between the two ends of the paper's protocol."""
     relay = PaperRelay()
     attacker = KeyHolder(
-        lambda: [relay],
+        [relay],
         sessions=lambda: relay.exchanges,
         achieved=lambda: {"sessions": relay.exchanges, "frames_read": relay.read, "frames_altered": relay.altered},
     )
@@ -309,5 +301,5 @@ async def run_paper_relay(bench: Bench) -> None:
 
 async def run_sealed_cookies(bench: Bench, public_keys: dict[str, bytes]) -> None:
     """Run the attacker with the public keys that sends valid cookie replies."""
-    attacker = KeyHolder(lambda: [SealedCookies(public_keys, monotonic())])
-    await bench.run(TrialPlan("sealed-cookies", HANDSHAKE, (), least_s=1.0), attacker)
+    plan = TrialPlan("sealed-cookies", HANDSHAKE, (), least_s=1.0)
+    await bench.run(plan, KeyHolder([SealedCookies(public_keys, monotonic())]))

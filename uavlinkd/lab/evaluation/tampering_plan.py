@@ -15,8 +15,6 @@ from uavlinkd.lab.evaluation.tampering_records import PAPER
 
 HANDSHAKE, DATA, FLOOD, TRAFFIC, KEYS = "handshake", "data", "flood", "traffic", "keys"
 PATHS, SPOILED, LINE, RELAYED = "paths", "spoiled", "line", "relay"
-STAGES = (HANDSHAKE, DATA, KEYS, "paper", PATHS, SPOILED, LINE, RELAYED)
-"""What a run may be limited to. Each has its own daemons."""
 LOAD: Final = "flood-initiations,rate_per_s=600"
 """The load at which daemons require cookies."""
 

@@ -15,13 +15,13 @@ from typing import Any, Final
 
 from uavlinkd.core.drops import DropReason
 from uavlinkd.lab.evaluation import tampering_plan as plans
-from uavlinkd.lab.evaluation.flood import run_floods
+from uavlinkd.lab.evaluation.commands import STAGES
 from uavlinkd.lab.evaluation.frame import Evaluation, Work, duration
 from uavlinkd.lab.evaluation.impostors import key_attacks, run_key_attack, run_paper_relay, run_sealed_cookies
 from uavlinkd.lab.evaluation.middle import MiddleHere
 from uavlinkd.lab.evaluation.paper_attacks import CHANGES, AlterKeys
 from uavlinkd.lab.evaluation.stage import DaemonStage, PaperStage, Stage
-from uavlinkd.lab.evaluation.tampering_bench import Bench, KeyHolder
+from uavlinkd.lab.evaluation.tampering_bench import Bench, KeyHolder, run_floods
 from uavlinkd.lab.evaluation.tampering_plan import TamperingSettings, TrialPlan
 from uavlinkd.lab.evaluation.tampering_records import TamperingFindings, Trial
 from uavlinkd.lab.evaluation.tampering_report import sections
@@ -105,7 +105,7 @@ class _Run:
         self._unlogged: list[str] = []
 
     async def run(self) -> dict[str, Any]:
-        chosen = self._settings.only or plans.STAGES
+        chosen = self._settings.only or STAGES
         lanes: list[Coroutine[Any, Any, None]] = [
             self._run_lane(label, lane) for label, lane in _LANES.items() if label.partition("-")[0] in chosen
         ]
@@ -190,8 +190,7 @@ class _Run:
                 name = str(plan.paper)
                 if name in CHANGES:
                     rng = Random(f"{name} {self._settings.seed}")  # noqa: S311  not a secret
-                    attack = AlterKeys(name, rng)
-                    await bench.run(plan, KeyHolder(lambda attack=attack: [attack]), phases=())  # type: ignore[misc]
+                    await bench.run(plan, KeyHolder([AlterKeys(name, rng)]), phases=())
                 else:
                     await bench.run(plan, phases=(name,))
             await run_paper_relay(bench)
