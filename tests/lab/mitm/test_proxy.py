@@ -95,8 +95,8 @@ async def test_strangers_have_addresses_of_their_own_and_hear_answers() -> None:
         assert len(set(b.sources)) > 30
         assert not {proxy.listeners[Direction("b", "a")]} & set(b.sources)
         b.send(b"who is there", b.sources[0])
-        await _until(lambda: bool(proxy.stranger_bytes_back))
-        assert proxy.stranger_bytes_back.total() == len(b"who is there")
+        await _until(lambda: bool(proxy.amplification.bytes_back))
+        assert proxy.amplification.bytes_back == len(b"who is there")
         await _until(lambda: proxy.journal.counts["flood-garbage", "injected"] == 300)
 
 

@@ -21,9 +21,8 @@ from collections import Counter
 from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack, suppress
 from dataclasses import dataclass
-from pathlib import Path
 from time import monotonic
-from typing import Any, Self
+from typing import Any
 
 from uavlinkd.config.keys import generate_psk
 from uavlinkd.core import wire
@@ -127,7 +126,7 @@ class Watch(PassiveAttack):
 
 
 class Pair:
-    """Two daemons, a client of each, and the proxy between them. Entering it starts all."""
+    """Two daemons, a client of each, and the proxy between them."""
 
     def __init__(self, choice: LinkChoice) -> None:
         self.watch = Watch()
@@ -137,18 +136,10 @@ class Pair:
         self._clients: dict[str, socket.socket] = {}
         self._number = 0
         self._delivered = asyncio.Event()
-        self._stack = AsyncExitStack()
 
-    async def __aenter__(self) -> Self:
-        async with AsyncExitStack() as stack:
-            await self._open(stack, stack.enter_context(private_folder("uavlinkd-")))
-            self._stack = stack.pop_all()
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        await self._stack.aclose()
-
-    async def _open(self, stack: AsyncExitStack, folder: Path) -> None:
+    async def open(self, stack: AsyncExitStack) -> None:
+        """Start all. The end of ``stack`` stops it."""
+        folder = stack.enter_context(private_folder("uavlinkd-"))
         names, ports = (_INITIATOR, _RESPONDER), free_ports(4)
         self.drones = {name: DroneProcess(name, folder / name, *ports[2 * n :][:2]) for n, name in enumerate(names)}
         initiator, responder = self.drones.values()
@@ -216,7 +207,9 @@ async def measured(kind: str, point: dict[str, Value], measure: Awaitable[dict[s
 
 async def time_handshake(choice: LinkChoice) -> dict[str, Any]:
     """One handshake between two new processes with new keys."""
-    async with Pair(choice) as pair:
+    async with AsyncExitStack() as stack:
+        pair = Pair(choice)
+        await pair.open(stack)
         watch = pair.watch
 
         async def has_initiated() -> bool:

@@ -40,16 +40,20 @@ class Amplification:
     def __init__(self) -> None:
         self.excess: Counter[tuple[str, int]] = Counter()
         """By peer and stranger: bytes received beyond those recently sent."""
+        self.bytes_sent = self.bytes_back = 0
+        """Of all strangers: to peers, and from peers."""
         self._credits: dict[tuple[str, int], deque[list[float]]] = {}  # time, remaining bytes
 
     def sent(self, peer: str, stranger: int, size: int, now: float) -> None:
         """The stranger sent ``size`` bytes to the peer."""
+        self.bytes_sent += size
         unanswered = self._credits.setdefault((peer, stranger), deque())
         self._expire(unanswered, now)
         unanswered.append([now, size])
 
     def received(self, peer: str, stranger: int, size: int, now: float) -> None:
         """The peer sent ``size`` bytes to the stranger. They use up the oldest sent bytes first."""
+        self.bytes_back += size
         unanswered = self._credits.get((peer, stranger), deque())
         self._expire(unanswered, now)
         left = float(size)
@@ -104,9 +108,6 @@ class Proxy(ChannelService):
         """The address at which the sender reaches the receiver."""
         self.sent: Counter[Direction] = Counter()
         self.received: Counter[Direction] = Counter()
-        self.stranger_bytes_sent: Counter[tuple[str, int]] = Counter()
-        self.stranger_bytes_back: Counter[tuple[str, int]] = Counter()
-        """By peer and stranger: bytes sent to the peer, and bytes received from it. Strangers are not validated."""
         self.amplification = Amplification()
         self.errors: Counter[str] = Counter()
         """Datagrams that were not forwarded, by reason."""
@@ -180,8 +181,8 @@ class Proxy(ChannelService):
             "received": {str(direction): count for direction, count in self.received.items()},
             "sent": {str(direction): count for direction, count in self.sent.items()},
             "strangers": {
-                "bytes_sent": self.stranger_bytes_sent.total(),
-                "bytes_back": self.stranger_bytes_back.total(),
+                "bytes_sent": self.amplification.bytes_sent,
+                "bytes_back": self.amplification.bytes_back,
                 "amplified": {f"{peer} to {number}": count for (peer, number), count in excess},
             },
             "radios": {str(direction): dict(radio.outcomes) for direction, radio in self.channel.radios.items()},
@@ -209,7 +210,6 @@ class Proxy(ChannelService):
             if peer is None:
                 self.errors["unknown sender"] += 1
                 continue
-            self.stranger_bytes_back[peer, stranger] += len(datagram)
             self.amplification.received(peer, stranger, len(datagram), now)
             self._perform(self.channel.on_answer(datagram, peer, stranger, now))
         self.arm()
@@ -235,7 +235,6 @@ class Proxy(ChannelService):
             if stranger is None:
                 self.sent[direction] += 1
             else:
-                self.stranger_bytes_sent[direction.receiver, stranger] += len(datagram)
                 self.amplification.sent(direction.receiver, stranger, len(datagram), monotonic())
 
     def _stranger(self, number: int, to: Sockaddr) -> socket.socket:
