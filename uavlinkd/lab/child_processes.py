@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import signal
 import subprocess
@@ -50,6 +51,18 @@ def end_with_parent(*command: str) -> tuple[str, ...]:
     The process IDs before and after the call of ``command`` are the same.
     """
     return (sys.executable, "-I", "-S", "-c", _BOUND, str(os.getpid()), *command)
+
+
+async def stop_child(process: asyncio.subprocess.Process, number: signal.Signals, patience_s: float) -> None:
+    """Stop a process: first with a signal, then by killing it."""
+    if process.returncode is not None:
+        return
+    process.send_signal(number)
+    with suppress(TimeoutError):
+        await asyncio.wait_for(process.wait(), patience_s)
+    if process.returncode is None:
+        process.kill()
+        await process.wait()
 
 
 @contextmanager

@@ -69,6 +69,9 @@ class Ledger:
         self._delivered = {direction: bytearray() for direction in self._directions}
         self._arrived_at: dict[tuple[str, str], float] = {}
         self._newest: dict[tuple[str, str], tuple[float, float]] = {}
+        self._gap_s = 0.0
+        self._since = float("inf")
+        self._recovered: dict[tuple[str, str], float] = {}
 
     def next_frame(self, sender: str, now: float) -> bytes:
         times = self.sent_at[sender]
@@ -98,11 +101,10 @@ class Ledger:
         elif self._delivered[sender, receiver][number]:
             self.faults[Fault.REPLAYED] += 1
         else:
-            is_late = now > self.sent_at[sender][number] + IN_TIME_S
-            self._delivered[sender, receiver][number] = 1 + is_late
+            sent_at = self.sent_at[sender][number]
+            self._delivered[sender, receiver][number] = 1 + (now > sent_at + IN_TIME_S)
             self._gap_s = max(self._gap_s, now - self._arrived_at.get((sender, receiver), now))
             self._arrived_at[sender, receiver] = now
-            sent_at = self.sent_at[sender][number]
             if now - sent_at > STALE_S:
                 self.faults[Fault.STALE] += 1
             if sent_at >= self._newest.get((sender, receiver), (-1.0, 0.0))[0]:
@@ -140,14 +142,9 @@ class Ledger:
         """The longest time without a frame in any direction, the time since the last one included."""
         return max(self._gap_s, *(now - at for at in self._arrived_at.values()))
 
-    _gap_s = 0.0
-
     def await_recovery(self, since: float) -> None:
         self._since = since
-        self._recovered: dict[tuple[str, str], float] = {}
-
-    _since = float("inf")
-    _recovered: dict[tuple[str, str], float]
+        self._recovered.clear()
 
     def _note_recovery(self, sender: str, receiver: str, sent_at: float, now: float) -> None:
         if sent_at > self._since and (sender, receiver) not in self._recovered:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from random import Random
 from typing import ClassVar, NamedTuple, Protocol
@@ -91,9 +91,6 @@ class Intervention:
     length: int
     """Of the datagram, in bytes."""
     detail: str = ""
-
-    def to_dict(self) -> dict[str, object]:
-        return {**asdict(self), "at": round(self.at, 6), "direction": str(self.direction)}
 
 
 Action = Send | Intervention

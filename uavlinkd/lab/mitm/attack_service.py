@@ -14,7 +14,7 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from time import monotonic
 from types import MappingProxyType
@@ -69,9 +69,8 @@ class Journal:
         if self.counts[key] > LOG_DETAIL:
             self._not_logged[key] += 1
         elif self._file is not None:
-            facts = done.to_dict()
-            facts["at"] = round(done.at - self._began_at, 6)
-            self._write({"event": "intervention", **facts})
+            facts = {"at": round(done.at - self._began_at, 6), "direction": str(done.direction)}
+            self._write({"event": "intervention", **asdict(done), **facts})
 
     def flush(self, now: float) -> None:
         if now < self._sum_at:

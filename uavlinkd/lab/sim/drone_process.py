@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from uavlinkd.config.keys import decode_key, generate_private_key, public_key_text, write_secret_file
-from uavlinkd.lab.child_processes import end_with_parent
+from uavlinkd.lab.child_processes import end_with_parent, stop_child
 from uavlinkd.ops.control import ControlError, ask
 
 STOP_S = 60.0
@@ -117,14 +117,8 @@ class DroneProcess:
 
     async def stop(self, number: signal.Signals = signal.SIGTERM) -> None:
         """Stop the process: first with a signal, then by killing it."""
-        if self._process is None or self._process.returncode is not None:
-            return
-        self._process.send_signal(number)
-        try:
-            await asyncio.wait_for(self._process.wait(), STOP_S)
-        except TimeoutError:
-            self._process.kill()
-            await self._process.wait()
+        if self._process is not None:
+            await stop_child(self._process, number, STOP_S)
 
     async def ask(self) -> dict[str, Any]:
         """Request the daemon's status. While it does not listen, return the last status, or an empty one.

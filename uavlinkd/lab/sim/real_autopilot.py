@@ -13,14 +13,13 @@ import re
 import shutil
 import signal
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
 from time import monotonic
 from typing import Self
 
-from uavlinkd.lab.child_processes import end_with_parent
+from uavlinkd.lab.child_processes import end_with_parent, stop_child
 from uavlinkd.lab.sim.loopback_ports import free_ports
 from uavlinkd.lab.sim.vehicle import GeoPoint
 
@@ -147,14 +146,8 @@ class RealAutopilot:
 
     async def stop(self, number: signal.Signals = signal.SIGTERM) -> None:
         """Stop the process: first with a signal, then by killing it."""
-        if self._process is None or self._process.returncode is not None:
-            return
-        self._process.send_signal(number)
-        with suppress(TimeoutError):
-            await asyncio.wait_for(self._process.wait(), STOP_S)
-        if self._process.returncode is None:
-            self._process.kill()
-            await self._process.wait()
+        if self._process is not None:
+            await stop_child(self._process, number, STOP_S)
 
     def check(self) -> None:
         """Raise if the process has ended.
@@ -190,15 +183,8 @@ class RealAutopilot:
         serial |= {number: f"udpclient:127.0.0.1:{port}" for number, port in enumerate(ports)}
         base, radio_in, simulator_in, simulator_out = free_ports(4)
         return (
-            *(
-                str(settings.binary),
-                "--model",
-                _MODELS[settings.firmware],
-                "--speedup",
-                "1",
-                "--defaults",
-                str(defaults),
-            ),
+            *(str(settings.binary), "--model", _MODELS[settings.firmware]),
+            *("--speedup", "1", "--defaults", str(defaults)),
             *("--home", f"{home.latitude_deg},{home.longitude_deg},{home.altitude_m},0"),
             *("--sysid", str(settings.system_id)),
             *("--base-port", str(base), "--rc-in-port", str(radio_in)),
