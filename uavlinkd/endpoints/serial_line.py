@@ -33,7 +33,7 @@ from uavlinkd.system.tasks import keep_running
 
 MODEM_S: Final = 0.25  # the modem gets no more than the air carries in this time, or one datagram
 QUEUE_S: Final = 0.25  # so much may wait here for the modem, and `QUEUE_BYTES` more
-QUEUE_BYTES: Final = 320  # an initiation and a response of a handshake wait here together, however slow it is
+QUEUE_BYTES: Final = 320  # an initiation and a response of a handshake wait here, however slow the radio is
 READ_BYTES: Final = 4096
 STUCK_S: Final = 5.0
 """The modem withholds CTS for longer: the wire is broken or not connected. Then the daemon opens the device again,
