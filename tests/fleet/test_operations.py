@@ -273,10 +273,11 @@ ACTIONS: dict[str, Callable[[Path], object]] = {
 }
 
 
+@pytest.mark.parametrize("has_links", [True, False])
 @pytest.mark.parametrize("step", ["prepare", "replace"])
 @pytest.mark.parametrize("action", ACTIONS.values(), ids=ACTIONS)
 def test_failed_write_changes_nothing(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, action: Callable[[Path], object], step: str
+    folder: Path, monkeypatch: pytest.MonkeyPatch, action: Callable[[Path], object], step: str, has_links: bool
 ) -> None:
     """If the last file cannot be written, the files before it are restored."""
     genuine = getattr(transaction.Rollback, step)
@@ -290,9 +291,27 @@ def test_failed_write_changes_nothing(
         return genuine(self, path, what)
 
     monkeypatch.setattr(transaction.Rollback, step, fail_at_the_manifest)
+    if not has_links:
+        monkeypatch.setattr(Path, "hardlink_to", refuse_link)
     with refused(folder, "No space left"):
         action(folder)
     assert not (folder / "scout").exists()
+
+
+@pytest.mark.parametrize("action", ACTIONS.values(), ids=ACTIONS)
+def test_file_system_without_hard_links(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, action: Callable[[Path], object]
+) -> None:
+    """Each command works there, and leaves nothing beside its files."""
+    monkeypatch.setattr(Path, "hardlink_to", refuse_link)
+    action(folder)
+    check_fleet(folder)
+    assert not list(folder.rglob(".*"))
+
+
+def refuse_link(*_: object) -> None:
+    """As such a file system does."""
+    raise PermissionError(1, "Operation not permitted")
 
 
 def test_interrupted_command_changes_nothing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

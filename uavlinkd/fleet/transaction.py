@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
+import shutil
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -98,7 +98,7 @@ class Rollback:
             try:
                 aside.hardlink_to(path)
             except OSError:  # a file system without hard links
-                path.rename(aside)
+                shutil.copy2(path, aside)
         self.steps.append((path, aside))
 
     def prepare(self, path: Path, text: str) -> Path:
@@ -189,6 +189,8 @@ def lock(folder: Path) -> Iterator[None]:
 
 
 def _acquire(descriptor: int, folder: Path) -> None:
+    import fcntl  # noqa: PLC0415  Windows has no such module
+
     try:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
