@@ -55,7 +55,7 @@ RELAY_ROWS = (
         "86",
         "link through a relay not confidential",
         scenes.readable,
-        check=r"owner of the relay .*can read them; write confidential = true",
+        check=r"its owner .*can read them; write confidential = true",
     ),
     Mistake(
         "87",
