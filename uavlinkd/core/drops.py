@@ -36,120 +36,252 @@ class Reason(StrEnum):
 class DropReason(Reason):
     """Why a datagram or a frame is dropped. README.md, section 13, has the order of the checks."""
 
-    # fmt: off
-
     # Not our protocol.
-    MALFORMED = ("malformed", "the length or type fits no message, or an index or counter has an invalid value",
-        "malformed datagrams")
-    RAW_MAVLINK = ("raw_mavlink", "a bare MAVLink frame arrived at the port for peers: any sender could have sent it",
-        "bare MAVLink frames")
+    MALFORMED = (
+        "malformed",
+        "the length or type fits no message, or an index or counter has an invalid value",
+        "malformed datagrams",
+    )
+    RAW_MAVLINK = (
+        "raw_mavlink",
+        "a bare MAVLink frame arrived at the port for peers: any sender could have sent it",
+        "bare MAVLink frames",
+    )
 
     # Along relays: section 21. The shell counts these.
-    RELAY_MALFORMED = ("relay_malformed", "data along a relay has no handle, or contains no datagram of a session",
-        "malformed along a relay")
-    RELAY_UNKNOWN_HANDLE = ("relay_unknown_handle",
+    RELAY_MALFORMED = (
+        "relay_malformed",
+        "data along a relay has no handle, or contains no datagram of a session",
+        "malformed along a relay",
+    )
+    RELAY_UNKNOWN_HANDLE = (
+        "relay_unknown_handle",
         "data along a relay has a handle that is not assigned to its sender: it is old or forged",
-        "of an unknown handle of a relay", Attention.EVERYDAY)
-    RELAY_UNEXPECTED_TOKEN = ("relay_unexpected_token",
+        "of an unknown handle of a relay",
+        Attention.EVERYDAY,
+    )
+
+    RELAY_UNEXPECTED_TOKEN = (
+        "relay_unexpected_token",
         "a token arrived that this daemon did not ask a relay for, or not from another port of that relay",
-        "with tokens that no relay was asked for", Attention.EVERYDAY)
-    RELAY_OVER_LIMIT = ("relay_over_limit", "a member sends more along this relay than its limit allows",
-        "above a member's limit")
-    RECORD_OVER_LIMIT = ("record_over_limit", "a member asks this relay for more, or more often, than it may",
-        "with wishes above a member's limit")
-    UNEXPECTED_RECORD = ("unexpected_record",
-        "an authentic record of a relay or a member has no effect: this daemon asked for nothing that it names, or "
-        "may not act on it along this path",
-        "with records that are not for this daemon", Attention.EVERYDAY)
-    OLD_RECORD = ("old_record", "an authentic record of a relay or a member is older than one that came before it",
-        "with records older than others", Attention.EVERYDAY)
+        "with tokens that no relay was asked for",
+        Attention.EVERYDAY,
+    )
+    RELAY_OVER_LIMIT = (
+        "relay_over_limit",
+        "a member sends more along this relay than its limit allows",
+        "above a member's limit",
+    )
+    RECORD_OVER_LIMIT = (
+        "record_over_limit",
+        "a member asks this relay for more, or more often, than it may",
+        "with wishes above a member's limit",
+    )
+    UNEXPECTED_RECORD = (
+        "unexpected_record",
+        "an authentic record of a relay or a member has no effect: this daemon asked for nothing that it names, or"
+        " may not act on it along this path",
+        "with records that are not for this daemon",
+        Attention.EVERYDAY,
+    )
+    OLD_RECORD = (
+        "old_record",
+        "an authentic record of a relay or a member is older than one that came before it",
+        "with records older than others",
+        Attention.EVERYDAY,
+    )
 
     # Handshake.
-    UNEXPECTED_RESPONSE = ("unexpected_response", "the response belongs to no pending initiation of this daemon",
-        "unexpected responses", Attention.EVERYDAY)
-    BAD_MAC1 = ("bad_mac1", "the sender does not know this daemon's public key, or the message was altered",
-        "handshakes for another key than this daemon's", Attention.SECURITY)
-    OTHER_VERSION = ("other_version",
+    UNEXPECTED_RESPONSE = (
+        "unexpected_response",
+        "the response belongs to no pending initiation of this daemon",
+        "unexpected responses",
+        Attention.EVERYDAY,
+    )
+    BAD_MAC1 = (
+        "bad_mac1",
+        "the sender does not know this daemon's public key, or the message was altered",
+        "handshakes for another key than this daemon's",
+        Attention.SECURITY,
+    )
+    OTHER_VERSION = (
+        "other_version",
         "the sender knows this daemon's public key, but uses another protocol version: update the older side",
-        "handshakes of another protocol version")
-    COOKIE_REQUIRED = ("cookie_required",
+        "handshakes of another protocol version",
+    )
+    COOKIE_REQUIRED = (
+        "cookie_required",
         "the daemon is under load, or a peer initiates too often: it sent a cookie, which the sender must return",
-        "handshakes that have to return a cookie")
-    RATE_LIMITED = ("rate_limited",
+        "handshakes that have to return a cookie",
+    )
+    RATE_LIMITED = (
+        "rate_limited",
         "handshake messages or cookie replies exceed the limit of one source, or of all sources together",
-        "handshakes above the rate limit")
-    REPLAYED_INITIATION = ("replayed_initiation", "the daemon read this initiation before: a sender replays it",
-        "replayed handshakes", Attention.SECURITY)
-    WRONG_NETWORK = ("wrong_network",
+        "handshakes above the rate limit",
+    )
+    REPLAYED_INITIATION = (
+        "replayed_initiation",
+        "the daemon read this initiation before: a sender replays it",
+        "replayed handshakes",
+        Attention.SECURITY,
+    )
+    WRONG_NETWORK = (
+        "wrong_network",
         "the datagram is of a peer that is not at the other end of this line or other point-to-point network",
-        "of a peer not at the other end of the line")
-    INVALID_KEY_SHARE = ("invalid_key_share",
+        "of a peer not at the other end of the line",
+    )
+    INVALID_KEY_SHARE = (
+        "invalid_key_share",
         "the public value is outside its group, or leads to a secret that anyone knows",
-        "invalid key shares", Attention.SECURITY)
-    BAD_HANDSHAKE = ("bad_handshake",
+        "invalid key shares",
+        Attention.SECURITY,
+    )
+    BAD_HANDSHAKE = (
+        "bad_handshake",
         "the Noise message does not authenticate: it was altered, or the sender uses another key or PSK",
-        "handshakes with another key or PSK", Attention.SECURITY)
-    UNKNOWN_PEER = ("unknown_peer", "the initiation is authentic, but its static key is not configured",
-        "handshakes with an unknown key", Attention.SECURITY)
-    SUITE_NOT_ACCEPTED = ("suite_not_accepted", "the peer offers a suite that is not in its list",
-        "handshakes with another suite")
-    HEADER_MISMATCH = ("header_mismatch", "the header in clear differs from the one sealed inside: it was altered",
-        "altered handshakes", Attention.SECURITY)
-    BAD_PARAMETERS = ("bad_parameters", "the peer's parameters are outside the protocol",
-        "invalid parameters", Attention.SECURITY)
-    GROUP_BUDGET_SPENT = ("group_budget_spent",
+        "handshakes with another key or PSK",
+        Attention.SECURITY,
+    )
+    UNKNOWN_PEER = (
+        "unknown_peer",
+        "the initiation is authentic, but its static key is not configured",
+        "handshakes with an unknown key",
+        Attention.SECURITY,
+    )
+    SUITE_NOT_ACCEPTED = (
+        "suite_not_accepted",
+        "the peer offers a suite that is not in its list",
+        "handshakes with another suite",
+    )
+    HEADER_MISMATCH = (
+        "header_mismatch",
+        "the header in clear differs from the one sealed inside: it was altered",
+        "altered handshakes",
+        Attention.SECURITY,
+    )
+    BAD_PARAMETERS = (
+        "bad_parameters",
+        "the peer's parameters are outside the protocol",
+        "invalid parameters",
+        Attention.SECURITY,
+    )
+    GROUP_BUDGET_SPENT = (
+        "group_budget_spent",
         "the handshake is authentic, but its group needs more CPU time than the sender may cause now",
-        "handshakes above the CPU budget")
-    NO_FREE_INDEX = ("no_free_index", "every session index is in use or in quarantine",
-        "without a free session index")
-    UNEXPECTED_COOKIE = ("unexpected_cookie",
+        "handshakes above the CPU budget",
+    )
+    NO_FREE_INDEX = (
+        "no_free_index",
+        "every session index is in use or in quarantine",
+        "without a free session index",
+    )
+    UNEXPECTED_COOKIE = (
+        "unexpected_cookie",
         "the cookie belongs to no pending message, or the message has a cookie already",
-        "unexpected cookies", Attention.EVERYDAY)
+        "unexpected cookies",
+        Attention.EVERYDAY,
+    )
     BAD_COOKIE = ("bad_cookie", "the cookie does not decrypt", "invalid cookies", Attention.SECURITY)
 
     # Envelopes.
-    UNKNOWN_INDEX = ("unknown_index",
+    UNKNOWN_INDEX = (
+        "unknown_index",
         "the envelope names a session that does not exist here: one side restarted, or the envelope is forged",
-        "of an unknown session", Attention.EVERYDAY)
-    LATE = ("late", "the envelope belongs to a session that ended recently",
-        "of an ended session", Attention.EVERYDAY)
-    OVER_SHARE = ("over_share", "the daemon is busy, and more datagrams wait than the share of their sender or kind",
-        "above the sender's share", Attention.EVERYDAY)
+        "of an unknown session",
+        Attention.EVERYDAY,
+    )
+    LATE = (
+        "late",
+        "the envelope belongs to a session that ended recently",
+        "of an ended session",
+        Attention.EVERYDAY,
+    )
+    OVER_SHARE = (
+        "over_share",
+        "the daemon is busy, and more datagrams wait than the share of their sender or kind",
+        "above the sender's share",
+        Attention.EVERYDAY,
+    )
     TOO_LONG = ("too_long", "the envelope is longer than both ends agreed", "longer than agreed", Attention.SECURITY)
-    SESSION_EXPIRED = ("session_expired", "the keys of the envelope are too old",
-        "with expired keys", Attention.EVERYDAY)
-    LONG_COUNTER = ("long_counter", "the envelope has a small counter in the long form",
-        "with an invalid counter form", Attention.SECURITY)
-    DUPLICATE = ("duplicate",
+    SESSION_EXPIRED = (
+        "session_expired",
+        "the keys of the envelope are too old",
+        "with expired keys",
+        Attention.EVERYDAY,
+    )
+    LONG_COUNTER = (
+        "long_counter",
+        "the envelope has a small counter in the long form",
+        "with an invalid counter form",
+        Attention.SECURITY,
+    )
+    DUPLICATE = (
+        "duplicate",
         "a copy of an envelope or initiation that had just arrived: peers send copies along several paths",
-        "copies along other paths", Attention.EXPLAINED)
-    LATE_COPY = ("late_copy",
+        "copies along other paths",
+        Attention.EXPLAINED,
+    )
+    LATE_COPY = (
+        "late_copy",
         "a copy of an older envelope came along a path of the peer, which is slow or was blocked",
-        "late copies along slow paths", Attention.EXPLAINED)
-    REPLAYED = ("replayed", "an older envelope came again, along no proven path of the peer: an attacker replays it",
-        "replayed", Attention.SECURITY)
-    DELAYED = ("delayed", "the peer sent the envelope too long ago: it was delayed on its path",
-        "delayed on the path", Attention.SECURITY)
-    BAD_TAG = ("bad_tag", "the tag does not verify: the envelope was altered or forged",
-        "altered or forged", Attention.SECURITY)
-    BAD_CONTROL = ("bad_control", "the envelope is authentic, but its control record is invalid",
-        "invalid control records", Attention.SECURITY)
-    FRAMES_NOT_ALLOWED = ("frames_not_allowed", "a relay, or a member that is not a peer, sent frames",
-        "with frames of a relay or a member", Attention.SECURITY)
-    UNEXPECTED_ANSWER = ("unexpected_answer",
+        "late copies along slow paths",
+        Attention.EXPLAINED,
+    )
+    REPLAYED = (
+        "replayed",
+        "an older envelope came again, along no proven path of the peer: an attacker replays it",
+        "replayed",
+        Attention.SECURITY,
+    )
+    DELAYED = (
+        "delayed",
+        "the peer sent the envelope too long ago: it was delayed on its path",
+        "delayed on the path",
+        Attention.SECURITY,
+    )
+    BAD_TAG = (
+        "bad_tag",
+        "the tag does not verify: the envelope was altered or forged",
+        "altered or forged",
+        Attention.SECURITY,
+    )
+    BAD_CONTROL = (
+        "bad_control",
+        "the envelope is authentic, but its control record is invalid",
+        "invalid control records",
+        Attention.SECURITY,
+    )
+    FRAMES_NOT_ALLOWED = (
+        "frames_not_allowed",
+        "a relay, or a member that is not a peer, sent frames",
+        "with frames of a relay or a member",
+        Attention.SECURITY,
+    )
+    UNEXPECTED_ANSWER = (
+        "unexpected_answer",
         "the answer belongs to no question that waits, or came along another path than the question",
-        "unexpected answers to probes", Attention.EVERYDAY)
-    DOUBTFUL = ("doubtful",
+        "unexpected answers to probes",
+        Attention.EVERYDAY,
+    )
+    DOUBTFUL = (
+        "doubtful",
         "the peer did not confirm in time that the frames are new, after a silence or while freshness is unverified",
-        "not confirmed as new in time", Attention.EVERYDAY)
+        "not confirmed as new in time",
+        Attention.EVERYDAY,
+    )
 
     # Outgoing frames.
-    NO_SESSION = ("no_session",
+    NO_SESSION = (
+        "no_session",
         "outgoing frames have no session with the peer: the daemon does not keep them for later",
-        "while the link was down", Attention.EXPLAINED)
-    TOO_LARGE = ("too_large", "an outgoing frame is larger than an envelope to the peer may be",
-        "too large for an envelope")
-    # fmt: on
+        "while the link was down",
+        Attention.EXPLAINED,
+    )
+    TOO_LARGE = (
+        "too_large",
+        "an outgoing frame is larger than an envelope to the peer may be",
+        "too large for an envelope",
+    )
 
 
 Detail = bytes | str | int
