@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import socket
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -108,7 +109,7 @@ class MiddleHere:
     async def start(self, addresses: Mapping[str, int], public_keys: Mapping[str, bytes]) -> None:
         peers = tuple(MitmPeer(name, Address(HOST, port), public_keys.get(name)) for name, port in addresses.items())
         links = tuple(_links(self.ports))
-        proxy = Proxy(ProxySettings(peers, links, radios=self._radios, seed=self._seed, log=self._log), [])
+        proxy = Proxy(ProxySettings(peers, links, radios=self._radios, seed=self._seed, log=self._log))
         proxy.log = silent_log()
         await proxy.start()
         self._proxy = proxy
@@ -132,11 +133,8 @@ class MiddleHere:
 
 def silent_log() -> Any:
     """A logger without output: the proxy's journal has its interventions."""
-    return structlog.wrap_logger(structlog.ReturnLogger(), processors=[_drop_event])
-
-
-def _drop_event(_logger: Any, _name: str, _event: Any) -> Any:
-    raise structlog.DropEvent
+    above_all = structlog.make_filtering_bound_logger(logging.CRITICAL)
+    return structlog.wrap_logger(structlog.ReturnLogger(), wrapper_class=above_all)
 
 
 class Clients:

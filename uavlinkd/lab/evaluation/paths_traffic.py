@@ -253,9 +253,10 @@ class PathRadio:
         peers = (MitmPeer(VEHICLE), MitmPeer(STATION, Address(HOST, station_port)))
         link = MitmLink((VEHICLE, STATION), (_FREE, _FREE))
         settings = ProxySettings(peers, (link,), radios=((BOTH, self.settings),), seed=self._seed)
-        self._proxy = Proxy(settings, [self.watch])
+        self._proxy = Proxy(settings)
         self._proxy.log = silent_log()
         await self._proxy.start()
+        self._proxy.change_attacks([self.watch])
 
     @property
     def address(self) -> str:

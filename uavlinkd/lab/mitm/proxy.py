@@ -18,7 +18,7 @@ from typing import Any
 
 from uavlinkd.endpoints.reader import DATAGRAMS_PER_WAKE_UP, RECEIVE_BYTES
 from uavlinkd.endpoints.sockets import BindError, udp_socket
-from uavlinkd.lab.mitm.attack import Action, AttackContext, AttackObject, Direction, Intervention
+from uavlinkd.lab.mitm.attack import Action, AttackContext, Direction, Intervention
 from uavlinkd.lab.mitm.attack_service import ChannelService
 from uavlinkd.lab.mitm.channel import AttackChannel
 from uavlinkd.lab.mitm.proxy_settings import ProxySettings
@@ -91,16 +91,11 @@ def received(
 
 
 class Proxy(ChannelService):
-    """A man in the middle between daemons.
-
-    Args:
-        settings: the peers, links, attacks and radios.
-        attacks: replace the attacks of the settings, unless None.
-    """
+    """A man in the middle between daemons."""
 
     kind = "mitm"
 
-    def __init__(self, settings: ProxySettings, attacks: Sequence[AttackObject] | None = None) -> None:
+    def __init__(self, settings: ProxySettings) -> None:
         super().__init__(settings)
         self.settings = settings
         self.context: AttackContext = settings.context
@@ -111,7 +106,6 @@ class Proxy(ChannelService):
         self.amplification = Amplification()
         self.errors: Counter[str] = Counter()
         """Datagrams that were not forwarded, by reason."""
-        self._attacks = attacks
         self._sockets: dict[Direction, socket.socket] = {}
         self._strangers: dict[tuple[int, int], socket.socket] = {}
         self._addresses: dict[tuple[str, int], Sockaddr] = {}  # by peer and path
@@ -119,7 +113,7 @@ class Proxy(ChannelService):
 
     async def start(self) -> None:
         self._began_at = monotonic()
-        attacks = self.make(self.settings.attacks) if self._attacks is None else self._attacks
+        attacks = self.make(self.settings.attacks)
         radios = self.settings.radio_of()
         self.channel = AttackChannel(self.context, attacks, radios, self.settings.seed, self._began_at)
         try:
