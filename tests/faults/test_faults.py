@@ -3,21 +3,185 @@
 from __future__ import annotations
 
 import asyncio
+import os
+import random
+import signal
 from collections.abc import Awaitable, Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from functools import partial
+from pathlib import Path
+from time import monotonic
 
 import pytest
 
+from tests.daemon.fleet import Rogue
+from tests.daemon.frames import frame
 from tests.daemon.harness import Stage
 from tests.daemon.process import DaemonProcess
-from tests.faults import machine, network
-from tests.faults.machine import LINES_AT_MOST
+from tests.faults import network
 from tests.faults.network import FAULT_S
-from tests.faults.talk import Outcome
+from tests.faults.talk import Log, Outcome, Talk, grew, prepare, reported
 from tests.namespaces import why_not as why_no_namespaces
 from tests.needs import need
+from tests.waiting import until
 from uavlinkd.link.conditions import LINES_BURST, LINES_PER_S
+
+SUSPENDED_S = float(os.environ.get("UAVLINKD_SIGSTOP_S", FAULT_S))
+"""How long a process is stopped; 10 in CI."""
+LINES_AT_MOST = 12
+"""That a daemon may log for one of these faults, and two more each ten seconds."""
+
+
+async def _linked(stage: Stage, a: DaemonProcess, b: DaemonProcess, talk: Talk) -> None:
+    await stage.start(a, b)
+    await talk.start()
+
+
+# Clocks.
+
+
+def faked_clock(at: str) -> dict[str, str]:
+    """The environment in which a process believes that it is another time; its monotonic clock is genuine."""
+    folders = [Path("/usr/lib"), Path("/usr/lib64"), Path("/usr/local/lib")]
+    libraries = [library for folder in folders for library in sorted(folder.glob("**/faketime/libfaketime.so.1"))]
+    need(bool(libraries), "libfaketime (Debian: faketime)")
+    return {"LD_PRELOAD": str(libraries[0]), "FAKETIME": f"@{at}", "FAKETIME_DONT_FAKE_MONOTONIC": "1", "TZ": "UTC"}
+
+
+async def clock_jumps(stage: Stage) -> Outcome:
+    """The system's clock leaps ten years ahead, and then 54 back; keys are made in either time."""
+    environ = faked_clock("2026-01-01 00:00:00")
+    del environ["FAKETIME"]
+    a, b = stage.pair(rekey_after_s=1.0, reject_after_s=5.0)
+    clock = a.folder / "clock"
+    clock.write_text("+0")
+    a.config["recording"] = {"folder": "recordings", "min_free_bytes": 100_000}
+    a.config["log"] = {"level": "debug"}  # rekeys are logged
+    talk = prepare(a, b)
+    environ |= {"FAKETIME_TIMESTAMP_FILE": str(clock), "FAKETIME_NO_CACHE": "1"}
+    a.environ = environ
+    await stage.start(a, b)
+    await talk.start()
+    await a.until(lambda status: status["recording"]["frames"] > 0)
+    began, log = monotonic(), Log(a)
+    recovered_s = 0.0
+    recordings = a.folder / "recordings"
+    for files, years in ((2, 10), (3, -54)):
+        clock.write_text(f"{365 * years:+}d")
+        jumped = monotonic()
+        recovered_s = max(recovered_s, await talk.back(jumped))
+        await until(lambda years=years: _has_keys_of(a, years))  # type: ignore[misc]
+        await until(lambda files=files: len(list(recordings.iterdir())) == files)  # type: ignore[misc]
+    ended = monotonic()
+    await talk.check_lost_none(began, ended, a, b)
+    assert not a.events("peer_lost")
+    status = await a.status()
+    assert status["recording"]["frames_lost"] == 0
+    talk.stop()
+    return Outcome(
+        "no frame lost, new keys made meanwhile; three recordings, one for each time", recovered_s, log.count
+    )
+
+
+def _has_keys_of(daemon: DaemonProcess, years: int) -> bool:
+    """Whether keys were made at a time so far from now, by the daemon's clock."""
+    days = [
+        (datetime.fromisoformat(event["timestamp"]) - datetime.now(UTC)).days
+        for event in daemon.events("session_established")
+    ]
+    return any(abs(day - 365 * years) < 2 for day in days)
+
+
+# The scheduler.
+
+
+async def suspended(stage: Stage) -> Outcome:
+    """The process is stopped, and goes on."""
+    a, b = stage.pair()
+    talk = prepare(a, b)
+    await _linked(stage, a, b, talk)
+    log = Log(a)
+    await a.send_signal(signal.SIGSTOP)
+    began = monotonic()
+    await asyncio.sleep(SUSPENDED_S)
+    waiting, sent = monotonic(), len(talk.voices[1].sent_at)
+    # What the other daemon passes on later is new to this one.
+    await b.until(lambda status: status["endpoints"]["talk"]["frames_received"] >= sent)
+    ended = monotonic()
+    await a.send_signal(signal.SIGCONT)
+    recovered_s = await talk.back(ended)
+    for speaker, hearer in (talk.voices, talk.voices[::-1]):
+        old = {n for n, at in speaker.sent_at.items() if began + 0.1 < at < waiting}
+        assert not [n for n in old if speaker.frame(n) in hearer.received_at], (
+            "what had waited came as if it were new"
+        )
+    talk.check_no_copies()
+    talk.stop()
+    await a.until_logged("daemon_paused")
+    await a.until_logged("frames_dropped", reason="stale")
+    dropped = sum((await a.status())["stale"].values())  # the log's counts come in portions
+    return Outcome(
+        f"daemon_paused reported; {dropped} frames that had waited dropped as stale", recovered_s, log.count
+    )
+
+
+# A peer.
+
+
+async def garbage_with_valid_keys(stage: Stage) -> Outcome:
+    """A peer's own keys seal thousands of records and invalid frames; another peer talks meanwhile."""
+    a, b = stage.pair()
+    captured = stage.daemon("captured")
+    psk = stage.psk()
+    a.add_peer(captured, [], psk)
+    talk = prepare(a, b)
+    await stage.start(b, a, linked=False)
+    await talk.start()
+    rng = random.Random(8)
+    genuine = frame(1 << 21, 7)
+    began = monotonic()
+    before, log = await a.status(), Log(a)
+    async with Rogue(captured, a, psk) as rogue:
+        while monotonic() < began + FAULT_S:
+            for _ in range(50):
+                if rogue.is_up:
+                    with suppress(AssertionError):  # it sent a close itself: there are no keys for a moment
+                        rogue.say(garbage(rng, genuine))
+            await asyncio.sleep(0.02)
+        ended = monotonic()
+        recovered_s = await talk.back(ended)
+        await rogue.until(lambda: rogue.is_up)
+    after = await a.status()
+    await talk.check_lost_none(began, ended, a, b)
+    talk.check_no_copies()
+    talk.stop()
+    drops = grew(before, after, "peers", "captured", "drops")
+    malformed = grew(before, after, "peers", "captured", "malformed")
+    assert drops.get("bad_control", 0) > 100
+    assert malformed
+    return Outcome(
+        f"the other peer lost no frame; dropped: {reported(drops)}; malformed: {reported(malformed)}",
+        recovered_s,
+        log.count,
+    )
+
+
+def garbage(rng: random.Random, genuine: bytes) -> bytes:
+    """An invalid payload: noise, records with a right first byte, frames cut or altered."""
+    noise = rng.randbytes(rng.randrange(1, 400))
+    at = rng.randrange(len(genuine))
+    return rng.choice(
+        (
+            noise,
+            bytes((rng.randrange(8),)) + noise[: rng.randrange(40)],
+            genuine[: at + 1],
+            genuine[:at] + bytes((genuine[at] ^ 1 << rng.randrange(8),)) + genuine[at + 1 :],
+            genuine + noise,
+        )
+    )
+
 
 AT_ONCE = 8
 """Faults that are there at the same time: mostly they wait."""
@@ -45,13 +209,13 @@ class Fault:
 
 
 FAULTS: Mapping[str, Fault] = {
-    "suspended": Fault("the process is stopped (`SIGSTOP`)", machine.suspended),
+    "suspended": Fault("the process is stopped (`SIGSTOP`)", suspended),
     **{
         name: Fault(fault.what, partial(network.suffer, name=name), True)
         for name, fault in network.NETWORK_FAULTS.items()
     },
-    "clock_jumps": Fault("the clock leaps ten years ahead, and 54 back", machine.clock_jumps),
-    "garbage": Fault("a peer seals garbage with its valid keys", machine.garbage_with_valid_keys),
+    "clock_jumps": Fault("the clock leaps ten years ahead, and 54 back", clock_jumps),
+    "garbage": Fault("a peer seals garbage with its valid keys", garbage_with_valid_keys),
 }
 
 
