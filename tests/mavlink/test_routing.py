@@ -69,14 +69,18 @@ def test_senders_own_repetition_passes() -> None:
         assert r.route(frame(raw=copy), "radio", now) == ()
 
 
-def test_returned_own_frames_go_nowhere() -> None:
-    """What the daemon sent to its clients is a duplicate from each of them."""
+def test_returned_own_frames_go_nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the daemon sent to its clients is a duplicate from each of them, also a minute later."""
+    monkeypatch.setattr(routing, "MAX_OWN_FRAMES", 2)
     r = router("gcs", "autopilot", peers=("lte",))
-    r.note_own(b"x", 0.0)
-    assert r.route(frame(1, 240, raw=b"x"), "autopilot", 0.5) == ()
-    assert not r.is_first(b"x", "gcs", 0.9)
-    assert r.unrouted == {Unrouted.DUPLICATE: 2}
-    assert r.route(frame(1, 240, raw=b"y"), "autopilot", 0.9) == ("gcs", "lte")
+    for number in range(3):
+        r.note_own(bytes([number]), 0.0)
+    for number, ports in ((1, ()), (2, ()), (0, ("gcs", "lte"))):  # the first one is forgotten
+        assert r.route(frame(1, 240, raw=bytes([number])), "autopilot", 60.0) == ports
+    r.note_own(b"x", 61.0)
+    assert not r.is_first(b"x", "autopilot", 61.5)
+    assert r.unrouted[Unrouted.DUPLICATE] == 3
+    assert r.route(frame(1, 240, raw=b"y"), "autopilot", 61.5) == ("gcs", "lte")
 
 
 def test_route_ages_out() -> None:

@@ -35,6 +35,9 @@ def handle_timeout(peer: Peer, now: float) -> list[Output]:
 
 def _expire(peer: Peer, now: float) -> list[Output]:
     peer.initiator.expire(now)
+    if now < peer.sessions.next_expiry():
+        peer.set_expiry()
+        return []
     out = freshness.end(peer, peer.sessions.expire(now))
     peer.set_expiry()
     if peer.is_up and peer.sessions.current is None:

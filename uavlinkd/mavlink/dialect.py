@@ -43,18 +43,19 @@ from typing import Final, NamedTuple
 
 from uavlinkd.core.settings import Class
 
-_TABLES: Final = json.loads(Path(__file__).with_name("dialect.json").read_bytes())
+_tables = json.loads(Path(__file__).with_name("dialect.json").read_bytes())
 
 Row = tuple[str, int, int, int, int | None, int | None, int | None]
 """Name, CRC_EXTRA, shortest and longest payload, and the offsets of target_system, of target_component and of the
 number of the command that it carries. Lengths and offsets are in bytes of the payload. The shortest payload is
 MAVLink 1's: all fields but the extensions."""
-MESSAGES: Final[Mapping[int, Row]] = {int(msgid): tuple(row) for msgid, row in _TABLES["messages"].items()}
-OTHER_EXTRAS: Final[Mapping[int, list[int]]] = {int(msgid): row for msgid, row in _TABLES["other_extras"].items()}
+MESSAGES: Final[Mapping[int, Row]] = {int(msgid): tuple(row) for msgid, row in _tables["messages"].items()}
+OTHER_EXTRAS: Final[Mapping[int, list[int]]] = {int(msgid): row for msgid, row in _tables["other_extras"].items()}
 """CRC_EXTRAs that other dialects have for the same message id, or for one that MESSAGES lacks."""
-INSTANCES: Final[Mapping[str, tuple[int, int]]] = {name: (at, n) for name, (_, at, n) in _TABLES["instances"].items()}
+INSTANCES: Final[Mapping[str, tuple[int, int]]] = {name: (at, n) for name, (_, at, n) in _tables["instances"].items()}
 """By message name: offset and length, in bytes of the payload, of the fields that tell instances apart."""
-COMMANDS: Final[Mapping[str, int]] = {f"MAV_CMD_{name}": number for name, number in _TABLES["commands"].items()}
+COMMANDS: Final[Mapping[str, int]] = {f"MAV_CMD_{name}": number for name, number in _tables["commands"].items()}
+del _tables  # 100 kB
 IDS: Final[Mapping[str, int]] = {row[0]: msgid for msgid, row in MESSAGES.items()}
 """Each message's id by its name."""
 _COMMAND_NAMES: Final = {number: name for name, number in COMMANDS.items()}

@@ -45,6 +45,7 @@ MAX_ADDRESSES_PER_PORT: Final = 512
 MAX_FRAMES_REMEMBERED: Final = 4096
 """In each half of the window."""
 MAX_DECISIONS: Final = 4096
+MAX_OWN_FRAMES: Final = 64
 
 SystemComponent = tuple[int, int]
 """A MAVLink address: system id and component id."""
@@ -74,11 +75,15 @@ class Router(Generic[P]):
         self._silent: set[P] = set()
         self._received_at: dict[P, dict[SystemComponent, float]] = {}
         """By port: when each address was received last. The least recently received is first."""
+        self._ports_of: dict[int, dict[int, set[P]]] = {}
+        """The reverse: by system and component."""
         self._decisions: dict[tuple[P, int, int], tuple[P, ...] | Unrouted] = {}
         self._seen: dict[bytes, Hashable] = {}
         """The port that each frame came from, in the current half of the window."""
         self._seen_before: dict[bytes, Hashable] = {}
         """The same for the previous half."""
+        self._own: dict[bytes, None] = {}
+        """The daemon's own frames, the oldest first: a client that was stopped returns them late."""
         self._window_ends_at = float("-inf")
         self.refresh_at = float("-inf")
         """When :meth:`refresh` is due."""
@@ -94,8 +99,9 @@ class Router(Generic[P]):
     def remove_port(self, port: P) -> None:
         """Forget the port and the addresses behind it."""
         self._is_peer.pop(port, None)
-        self._received_at.pop(port, None)
         self._silent.discard(port)
+        for address in self._received_at.pop(port, {}):
+            self._unlink(port, address)
         self._forget_decisions()
 
     def set_silent(self, port: P, *, is_silent: bool) -> None:
@@ -111,6 +117,7 @@ class Router(Generic[P]):
         received_at = self._received_at.get(port, {})
         for address in [address for address in received_at if which(address[0])]:
             del received_at[address]
+            self._unlink(port, address)
         self._forget_decisions()
 
     def refresh(self, now: float) -> None:
@@ -121,9 +128,10 @@ class Router(Generic[P]):
         """
         self.refresh_at = now + ROUTE_LIFETIME_S / LIFETIME_PARTS
         self._forget_decisions()
-        for received_at in self._received_at.values():
+        for port, received_at in self._received_at.items():
             for address in [a for a, at in received_at.items() if now - at >= ROUTE_LIFETIME_S]:
                 del received_at[address]
+                self._unlink(port, address)
 
     def route(self, frame: Frame, source: P, now: float) -> tuple[P, ...]:
         """The ports to send this frame to. Learns its sender; counts the reason if there is no port.
@@ -132,16 +140,16 @@ class Router(Generic[P]):
             KeyError: the source is not a port that was added.
         """
         received_at = self._received_at[source]
+        if frame.raw in self._own:
+            self.unrouted[Unrouted.DUPLICATE] += 1
+            return ()
         if not self.is_first(frame.raw, source, now):
             return ()
         header = frame.header
         if header.system != 0:  # 0 means all systems: no sender has this id
             address = (header.system, header.component)
             if received_at.pop(address, None) is None:
-                if len(received_at) >= MAX_ADDRESSES_PER_PORT:
-                    # A sender that invents addresses displaces only those behind its own port.
-                    del received_at[next(iter(received_at))]
-                self._forget_decisions()
+                self._learn(source, address)
             received_at[address] = now
         if now >= self.refresh_at:
             self.refresh(now)
@@ -175,7 +183,14 @@ class Router(Generic[P]):
         return False
 
     def note_own(self, raw: bytes, now: float) -> None:
-        """The daemon itself sent these bytes to local clients: if a client returns them, they are a duplicate."""
+        """The daemon itself sent these bytes to local clients: if a client returns them, they are a duplicate.
+
+        Until the client sends other frames with that header, this holds for the last :data:`MAX_OWN_FRAMES`, else
+        for the window of duplicates.
+        """
+        self._own[raw] = None
+        if len(self._own) > MAX_OWN_FRAMES:
+            del self._own[next(iter(self._own))]
         if now >= self._window_ends_at or len(self._seen) >= MAX_FRAMES_REMEMBERED:
             self._turn_window(now)
         self._seen[raw] = _OWN
@@ -197,6 +212,26 @@ class Router(Generic[P]):
         is_early = now < self._window_ends_at
         self._window_ends_at = (now if is_gap or is_early else self._window_ends_at) + DUPLICATE_WINDOW_S
 
+    def _learn(self, port: P, address: SystemComponent) -> None:
+        received_at = self._received_at[port]
+        if len(received_at) >= MAX_ADDRESSES_PER_PORT:
+            # A sender that invents addresses displaces only those behind its own port.
+            least_recent = next(iter(received_at))
+            del received_at[least_recent]
+            self._unlink(port, least_recent)
+        system, component = address
+        self._ports_of.setdefault(system, {}).setdefault(component, set()).add(port)
+        self._forget_decisions()
+
+    def _unlink(self, port: P, address: SystemComponent) -> None:
+        system, component = address
+        components = self._ports_of[system]
+        components[component].discard(port)
+        if not components[component]:
+            del components[component]
+        if not components:
+            del self._ports_of[system]
+
     def _forget_decisions(self) -> None:
         self._decisions.clear()
         self.edition += 1
@@ -211,11 +246,9 @@ class Router(Generic[P]):
         if target_system == 0:
             ports = [port for port in others if port not in self._silent or self._is_peer[source]]
             return tuple(ports) or Unrouted.NO_OTHER_PORT
-        behind = self._received_at.items()
+        components = self._ports_of.get(target_system, {})
         # Component 0 is not an id of its own, even if a sender uses it: it means the whole system.
-        target = (target_system, target_component) if target_component != 0 else None
-        matches = {port for port, addresses in behind if target in addresses}
-        if not matches:
-            matches = {port for port, addresses in behind if any(system == target_system for system, _ in addresses)}
+        of_component = components.get(target_component) if target_component != 0 else None
+        matches = of_component or set().union(*components.values())
         ports = [port for port in others if port in matches] if matches - {source} else others
         return tuple(ports) or (Unrouted.NO_OTHER_PORT if matches else Unrouted.UNKNOWN_TARGET)

@@ -165,7 +165,8 @@ def _link_problems(drones: list[Drone]) -> Counter[str]:
         assert drone.node is not None
         for peer in drone.node.peers.values():
             result["missing"] += peer.missing(drone.local_now)
-            for name in set(DISTURBS.values()) - {"missing"}:
+            result["paths_unproven"] += peer.paths.unproven
+            for name in set(DISTURBS.values()) - {"missing", "paths_unproven"}:
                 result[name] += getattr(peer.traffic, name)
     return result
 
