@@ -107,7 +107,7 @@ def _module_leaves_no_trace(_opened_once: None) -> Iterator[None]:
 @pytest.fixture(autouse=True)
 def _leaves_no_trace(request: pytest.FixtureRequest) -> Iterator[None]:
     """Fail a test that leaves something in its process: see tests/traces.py."""
-    with no_trace("this test", has_resources=not _shares_a_fixture(request)):
+    with no_trace("this test", has_resources=not (_shares_a_fixture(request) or _shares_its_loop(request))):
         yield
 
 
@@ -115,7 +115,7 @@ def _leaves_no_trace(request: pytest.FixtureRequest) -> Iterator[None]:
 def _leaves_no_task(_leaves_no_trace: None, request: pytest.FixtureRequest) -> None:
     """Fail a test that leaves a running task in its event loop."""
     marker = request.node.get_closest_marker("asyncio")
-    if marker is not None and marker.kwargs.get("loop_scope", "function") == "function":
+    if marker is not None and not _shares_its_loop(request):
         request.getfixturevalue("_tasks_end")  # after all other fixtures of the test, before its loop is closed
 
 
@@ -125,6 +125,11 @@ async def _tasks_end() -> AsyncIterator[None]:
     tasks = asyncio.all_tasks() - {asyncio.current_task()}
     left = (await asyncio.wait(tasks, timeout=END_S))[1] if tasks else ()
     assert not left, "\n  ".join(["this test left in its event loop:", *map(str, left)])
+
+
+def _shares_its_loop(request: pytest.FixtureRequest) -> bool:
+    marker = request.node.get_closest_marker("asyncio")
+    return marker is not None and "loop_scope" in marker.kwargs
 
 
 def _shares_a_fixture(request: pytest.FixtureRequest) -> bool:

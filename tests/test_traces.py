@@ -21,7 +21,7 @@ DEEDS = {
     "del os.environ['PATH']": "environment variable PATH is gone: it was",
     "os.chdir('/')": "setting current folder is /: it was",
     "os.umask(0o123)": "setting umask is 0o123: it was",
-    "asyncio.set_event_loop(asyncio.SelectorEventLoop())": "setting event loop is",
+    "asyncio.set_event_loop(asyncio.SelectorEventLoop())": "event loop of this thread is",
     "sys.path.append('/some')": "setting sys.path is",
     "sys.excepthook = print": "setting hooks is",
     "gc.disable()": "setting garbage collector is",

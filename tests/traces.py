@@ -81,7 +81,6 @@ def _environment() -> dict[str, str]:
 def _settings() -> dict[str, Any]:
     umask = os.umask(0o077)
     os.umask(umask)
-    policy = asyncio.get_event_loop_policy()
     return {
         "current folder": os.getcwd(),
         "umask": oct(umask),
@@ -95,8 +94,12 @@ def _settings() -> dict[str, Any]:
         "hooks": (sys.excepthook, sys.displayhook, sys.unraisablehook, threading.excepthook, sys.getprofile()),
         "sys.path": list(sys.path),
         "sys.argv": list(sys.argv),
-        "event loop": (type(policy), getattr(getattr(policy, "_local", None), "_loop", None)),
     }
+
+
+def _event_loop() -> dict[str, Any]:
+    policy = asyncio.get_event_loop_policy()
+    return {"of this thread": (type(policy), getattr(getattr(policy, "_local", None), "_loop", None))}
 
 
 def _limits() -> dict[str, tuple[int, int]]:
@@ -148,6 +151,7 @@ _SETTINGS: Final[Mapping[str, Callable[[], Mapping[Any, Any]]]] = {
     "module": _modules,
 }
 _RESOURCES: Final[Mapping[str, Callable[[], Mapping[Any, Any]]]] = {
+    "event loop": _event_loop,
     "file descriptor": _files,
     "child process": _children,
     "thread": _threads,

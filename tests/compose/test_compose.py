@@ -71,7 +71,6 @@ ATTACKS = (
 """On the data of a link that is up: some lose genuine frames, none may add one."""
 
 
-@pytest.mark.asyncio(loop_scope="function")  # a fleet of its own
 async def test_man_in_the_middle_gets_nothing_accepted(image: str, tmp_path: Path) -> None:
     """Through a set of attacks between drone1 and the ground station, every frame arrives at most once and unaltered.
 

@@ -89,7 +89,8 @@ def load_control_socket(path: Path) -> Path | None:
     """
     table = _read_toml(path)
     problems = Problems(str(path))
-    top = problems.read(schema.FileSection, {key: table[key] for key in ("control_socket",) if key in table}, "")
+    sections = (*schema.SINGLE, *schema.REPEATED)
+    top = problems.read(schema.FileSection, {key: table[key] for key in table if key not in sections}, "")
     if "control_socket" in top.invalid:
         problems.raise_any()
     name = top.get("control_socket")

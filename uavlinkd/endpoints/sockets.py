@@ -166,11 +166,11 @@ def is_absent(sock: socket.socket) -> bool:
 
 def is_here(family: int, sockaddr: tuple[Any, ...]) -> bool:
     """Whether an interface of this machine has this address. Its port is 0."""
-    with socket.socket(family, socket.SOCK_DGRAM) as probe:
-        try:
+    try:
+        with socket.socket(family, socket.SOCK_DGRAM) as probe:
             probe.bind(sockaddr)
-        except OSError:
-            return False
+    except OSError:  # also a kernel without IPv6
+        return False
     return True
 
 

@@ -22,7 +22,7 @@ from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.resolver import resolve
 from uavlinkd.system.stall import Backlog
-from uavlinkd.system.tasks import keep_running
+from uavlinkd.system.tasks import Threads, keep_running
 
 FIRST_WAIT_S = 0.25
 LONGEST_WAIT_S = 5.0
@@ -175,6 +175,8 @@ class TcpClient(StreamEndpoint):
     def __init__(self, name: str, address: Address, handler: PortHandler) -> None:
         super().__init__(name, handler)
         self._address = address
+        # Not those of the peers, all of which may wait for a silent name server.
+        self._threads = Threads(1, f"look-up-{name}")
 
     def start(self) -> None:
         self._task = keep_running(self._keep_connected(), f"the endpoint {self.name}")
@@ -196,7 +198,7 @@ class TcpClient(StreamEndpoint):
 
     async def _connect(self) -> socket.socket | None:
         """Connect a socket to the first address that answers. Returns None if no address does."""
-        resolved = await resolve(self._address)
+        resolved = await resolve(self._address, self._threads)
         if not resolved:
             self.could_not_open("not_resolved")
         for family, sockaddr in resolved[:MAX_ADDRESSES]:

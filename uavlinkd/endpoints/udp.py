@@ -226,9 +226,9 @@ class UdpEndpoint(Endpoint):
 class UdpServer(UdpEndpoint):
     """``udpin``: each address that recently sent a genuine frame is a client, up to a limit.
 
-    A client whose port refuses a datagram is forgotten at once. Otherwise each restart of a client, with a new port,
-    would add work for every frame. An attacker that forges the ICMP message can have a client forgotten until its
-    next frame. Such an attacker could forge the client's frames too.
+    A client whose port refuses a datagram is forgotten at once, or within a second if many do. Otherwise each restart
+    of a client, with a new port, would add work for every frame. An attacker that forges the ICMP message can have a
+    client forgotten until its next frame. Such an attacker could forge the client's frames too.
     """
 
     def share_socket(self) -> socket.socket:

@@ -7,7 +7,10 @@ An operation that raises FleetError changed nothing.
 
 from __future__ import annotations
 
+import errno
 import shlex
+import shutil
+import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -62,12 +65,11 @@ def init(
     if drones + ground_stations + observers > 255:
         raise FleetError("a fleet has at most 255 members: MAVLink has no more system ids")
     try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
         is_taken = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
     except OSError as error:
-        raise FleetFileError(f"{folder} cannot be created: {error.strerror}") from None
+        raise _cannot_create(folder, error) from None
     if is_taken:
-        raise FleetError(f"{folder} exists already: choose the name of a new folder, or use `uavlinkd fleet add`")
+        raise _exists(folder)
     fleet = Fleet(settings)
     private_keys: dict[str, str] = {}
     for kind, places in (
@@ -83,12 +85,34 @@ def init(
             private_keys[name] = keys.generate_private_key()
             public = keys.public_key_text(private_keys[name])
             fleet = fleet.with_member(fleet.new_member(name, kind, public, address=address))
-    changes = FileChanges(folder, fleet)
-    for member in fleet.members:
-        _write(changes, member, private_keys[member.name])
-    _add_psks(changes, (pair for pair in combinations(fleet.members, 2) if pair[0].section_of(pair[1])))
-    apply(changes, fleet.members)
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        building = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    except OSError as error:
+        raise _cannot_create(folder, error) from None
+    try:
+        changes = FileChanges(building, fleet)
+        for member in fleet.members:
+            _write(changes, member, private_keys[member.name])
+        _add_psks(changes, (pair for pair in combinations(fleet.members, 2) if pair[0].section_of(pair[1])))
+        apply(changes, fleet.members)
+        building.chmod(0o755)
+        building.rename(folder)
+    except OSError as error:
+        if error.errno in (errno.EEXIST, errno.ENOTEMPTY):  # another command created it meanwhile
+            raise _exists(folder) from None
+        raise _cannot_create(folder, error) from None
+    finally:
+        shutil.rmtree(building, ignore_errors=True)
     return Result(fleet, tuple(member.name for member in fleet.members))
+
+
+def _exists(folder: Path) -> FleetError:
+    return FleetError(f"{folder} exists already: choose the name of a new folder, or use `uavlinkd fleet add`")
+
+
+def _cannot_create(folder: Path, error: OSError) -> FleetFileError:
+    return FleetFileError(f"{folder} cannot be created: {error.strerror}")
 
 
 def add(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import shutil
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -47,18 +46,13 @@ def apply(changes: FileChanges, checked: Iterable[Member] = ()) -> None:
     rollback, folder = Rollback(), changes.folder
     texts = {**changes.texts, folder / FILE_NAME: write_manifest(changes.fleet)}
     try:
-        rollback.make_folder(folder, 0o755)
         # The steps that need disk space come first.
         prepared = {path: rollback.prepare(path, text) for path, text in texts.items()}
         for path in changes.deleted:
             rollback.keep(path)
             path.unlink(missing_ok=True)
         for path, to in changes.moved.items():
-            if to.exists():
-                raise FileExistsError(errno.EEXIST, "it exists: move it away", str(to))
-            rollback.keep(path)
-            rollback.keep(to)
-            path.replace(to)
+            rollback.move(path, to)
         for path, text in changes.secrets.items():
             rollback.make_folder(path.parent)
             keys.write_secret_file(path, text)
@@ -82,15 +76,30 @@ class Rollback:
     def __init__(self) -> None:
         self.steps: list[tuple[Path, Path | None]] = []
         """Each changed path with the file that has its old content; None if the path is new."""
+        self._kept: list[Path] = []
 
-    def make_folder(self, folder: Path, mode: int = 0o700) -> None:
+    def make_folder(self, folder: Path) -> None:
         """Create a folder unless it exists."""
         if not folder.exists():
-            folder.mkdir(mode=mode)
+            folder.mkdir(mode=0o700)
             self.steps.append((folder, None))
 
+    def move(self, path: Path, to: Path) -> None:
+        """Rename a file.
+
+        Raises:
+            FileExistsError: a file has that name already.
+        """
+        if to.exists():
+            raise FileExistsError(errno.EEXIST, "it exists: move it away", str(to))
+        path.rename(to)
+        self.steps.append((path, to))
+
     def keep(self, path: Path) -> None:
-        """Keep the content of a file, if it exists, under another name. :meth:`finish` deletes it."""
+        """Keep the content of a file, if there is one, under another name; its own may be gone.
+
+        :meth:`finish` deletes it.
+        """
         aside = None
         if path.exists():
             aside = path.with_name(f".{path.name}.old")
@@ -98,7 +107,8 @@ class Rollback:
             try:
                 aside.hardlink_to(path)
             except OSError:  # a file system without hard links
-                shutil.copy2(path, aside)
+                path.rename(aside)
+            self._kept.append(aside)
         self.steps.append((path, aside))
 
     def prepare(self, path: Path, text: str) -> Path:
@@ -120,7 +130,7 @@ class Rollback:
     def finish(self) -> list[str]:
         """Delete the old contents. Return a sentence about each that cannot be deleted."""
         notes: list[str] = []
-        for aside in (aside for _, aside in self.steps if aside is not None):
+        for aside in self._kept:
             try:
                 aside.unlink()
             except OSError as error:

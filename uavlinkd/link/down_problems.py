@@ -192,7 +192,8 @@ def _unknown_keys(peer: PeerFacts, sighting: Sighting) -> Iterator[Found]:
             "wrong_key_here",
             f"a sender at {at(sighting)} uses {which} {', '.join(others)}, which this file does not have",
             f"run `uavlinkd pubkey` at {peer.name}, and write into this file what that prints: a key that arrives"
-            " proves nothing. After a change of keys, restart it with its new files",
+            " proves nothing. After a change of keys, restart it with its new files; if the former key was stolen,"
+            " this may be the thief",
         )
 
 
