@@ -178,7 +178,8 @@ def test_status_needs_only_the_control_socket_of_a_configuration(
     assert capsys.readouterr().err.startswith(f"no daemon answers at {tmp_path / 'control.sock'}")
     path.write_text(_SERVICE.replace('"control.sock"', "7"))
     assert main(["status", "--config", str(path)]) == WRONG
-    assert "control_socket" in capsys.readouterr().err
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "control_socket" in line
 
 
 @pytest.mark.parametrize("command", ["demo", "sim", "evaluate timing", "evaluate --help"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import socket
 from collections.abc import Callable
 from functools import partial
@@ -11,7 +12,7 @@ from structlog.testing import capture_logs
 
 from tests.needs import need
 from tests.waiting import PATIENCE_S
-from uavlinkd.endpoints.sockets import BindError, send_from_new_port, udp_socket
+from uavlinkd.endpoints.sockets import BindError, is_here, send_from_new_port, udp_socket
 from uavlinkd.endpoints.tcp import tcp_listener
 from uavlinkd.lab.sim.loopback_ports import free_port, has_ipv6
 from uavlinkd.system.addresses import Address
@@ -23,6 +24,16 @@ def test_the_wildcard_of_ipv6_takes_no_ipv4() -> None:
     port = free_port()
     with udp_socket(Address("::", port)), udp_socket(Address("0.0.0.0", port)):
         pass
+
+
+def test_address_is_not_here_on_a_kernel_without_its_family(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No error: `check` asks about every address of a file."""
+
+    def refuse(*_: object) -> None:
+        raise OSError(errno.EAFNOSUPPORT, "Address family not supported by protocol")
+
+    monkeypatch.setattr(socket, "socket", refuse)
+    assert not is_here(socket.AF_INET6, ("fd00::1", 0, 0, 0))
 
 
 @pytest.mark.parametrize("host", ["127.0.0.2", "::1"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
+import threading
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from time import monotonic
@@ -12,9 +13,10 @@ import pytest
 from structlog.testing import capture_logs
 
 from tests.endpoints.clients import Recorder, address_of, frame, recorder, unused_address, write
-from tests.waiting import Stopwatch, until
+from tests.waiting import PATIENCE_S, Stopwatch, until
 from uavlinkd.endpoints import tcp
 from uavlinkd.endpoints.tcp import TcpClient, TcpServer, tcp_listener
+from uavlinkd.system import resolver
 from uavlinkd.system.addresses import Address
 
 ANY_PORT = Address("127.0.0.1", 0)
@@ -117,6 +119,29 @@ async def test_name_is_looked_up_at_each_attempt(server: TcpServer, monkeypatch:
         assert asked == [("autopilot.test", 5760)] * 3
         assert tcp_client.failures == {"not_resolved": 1, "ECONNREFUSED": 1}
         assert tcp_client.ports[0].name == "autopilot.test:5760"
+
+
+async def test_silent_name_server_of_the_peers_delays_no_endpoint(
+    server: TcpServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Their look-ups may use all threads of theirs."""
+    server.start()
+    is_over, waiting = threading.Event(), 0
+
+    def look_up(host: str, port: int, **_: object) -> list[tuple[object, ...]]:
+        nonlocal waiting
+        if host == "peer.test":
+            waiting += 1
+            is_over.wait(PATIENCE_S)
+        return [(socket.AF_INET, socket.SOCK_STREAM, 6, "", address_of(server))]
+
+    monkeypatch.setattr(socket, "getaddrinfo", look_up)
+    peers = [asyncio.create_task(resolver.resolve(Address("peer.test", 1))) for _ in range(resolver.MAX_THREADS)]
+    await until(lambda: waiting == resolver.MAX_THREADS)
+    with client_of(Address("autopilot.test", 5760)) as tcp_client:
+        await until(lambda: len(tcp_client.ports) == 1)
+    is_over.set()
+    await asyncio.gather(*peers)
 
 
 async def test_connection_to_oneself_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -122,12 +122,23 @@ def test_damaged_manifest_is_refused(tmp_path: Path, damage: bytes) -> None:
         read_manifest(tmp_path)
 
 
-def test_fleet_is_made_whole_or_not_at_all(tmp_path: Path) -> None:
-    """If the configurations are not valid, no folder is created. An existing fleet is not changed."""
+def test_fleet_is_made_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It appears at once, whole, and not if a configuration is not valid. An existing fleet is not changed."""
     with pytest.raises(FleetError, match="not valid"):
         operations.init(tmp_path / "a" / "b", FleetSettings(drone_url="udpin:127.0.0.1:5790"), 2, 0, 0)
     assert list((tmp_path / "a").iterdir()) == []
-    operations.init(tmp_path / "fleet", FleetSettings(), 2, 0, 0)
+    rename, appeared = Path.rename, []
+
+    def watch(path: Path, target: Path) -> Path:
+        if target == tmp_path / "fleet":
+            appeared.append(sorted(file.name for file in path.iterdir()))
+        assert bool(appeared) or not (tmp_path / "fleet").exists()
+        return rename(path, target)
+
+    with monkeypatch.context() as watched:
+        watched.setattr(Path, "rename", watch)
+        operations.init(tmp_path / "fleet", FleetSettings(), 2, 0, 0)
+    assert appeared == [["drone1", "drone2", "fleet.toml"]]
     with refused(tmp_path, "exists already"):
         operations.init(tmp_path / "fleet", FleetSettings(), 2, 0, 0)
 
