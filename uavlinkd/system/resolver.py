@@ -45,12 +45,12 @@ def _share() -> int:
     return max(1, min(MAX_QUERIES, MAX_THREADS // max(1, len(_active))))
 
 
-async def resolve(address: Address, threads: Threads = _THREADS) -> Resolved:
+async def resolve(address: Address, threads: Threads | None = None) -> Resolved:
     """Every numeric address of ``address``, each once; empty if it does not resolve now."""
     if address.ip is not None:
         return numeric(address)
     try:
-        return await threads.run(_look_up, address, 0)
+        return await (threads or _THREADS).run(_look_up, address, 0)
     except (OSError, UnicodeError):
         return []
 
