@@ -107,15 +107,15 @@ def _module_leaves_no_trace(_opened_once: None) -> Iterator[None]:
 @pytest.fixture(autouse=True)
 def _leaves_no_trace(request: pytest.FixtureRequest) -> Iterator[None]:
     """Fail a test that leaves something in its process: see tests/traces.py."""
-    with no_trace("this test", has_resources=not (_shares_a_fixture(request) or _shares_its_loop(request))):
+    shares_its_loop = _loop_scope(request) not in (None, "function")
+    with no_trace("this test", has_resources=not (shares_its_loop or _shares_a_fixture(request))):
         yield
 
 
 @pytest.fixture(autouse=True)
 def _leaves_no_task(_leaves_no_trace: None, request: pytest.FixtureRequest) -> None:
     """Fail a test that leaves a running task in its event loop."""
-    marker = request.node.get_closest_marker("asyncio")
-    if marker is not None and not _shares_its_loop(request):
+    if _loop_scope(request) == "function":
         request.getfixturevalue("_tasks_end")  # after all other fixtures of the test, before its loop is closed
 
 
@@ -127,9 +127,10 @@ async def _tasks_end() -> AsyncIterator[None]:
     assert not left, "\n  ".join(["this test left in its event loop:", *map(str, left)])
 
 
-def _shares_its_loop(request: pytest.FixtureRequest) -> bool:
+def _loop_scope(request: pytest.FixtureRequest) -> str | None:
+    """Which tests share the event loop of an asynchronous one."""
     marker = request.node.get_closest_marker("asyncio")
-    return marker is not None and "loop_scope" in marker.kwargs
+    return None if marker is None else marker.kwargs.get("loop_scope", "function")
 
 
 def _shares_a_fixture(request: pytest.FixtureRequest) -> bool:

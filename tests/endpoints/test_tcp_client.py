@@ -126,18 +126,17 @@ async def test_silent_name_server_of_the_peers_delays_no_endpoint(
 ) -> None:
     """Their look-ups may use all threads of theirs."""
     server.start()
-    is_over, waiting = threading.Event(), 0
+    is_over, waiting = threading.Event(), list[str]()
 
     def look_up(host: str, port: int, **_: object) -> list[tuple[object, ...]]:
-        nonlocal waiting
         if host == "peer.test":
-            waiting += 1
+            waiting.append(host)
             is_over.wait(PATIENCE_S)
         return [(socket.AF_INET, socket.SOCK_STREAM, 6, "", address_of(server))]
 
     monkeypatch.setattr(socket, "getaddrinfo", look_up)
     peers = [asyncio.create_task(resolver.resolve(Address("peer.test", 1))) for _ in range(resolver.MAX_THREADS)]
-    await until(lambda: waiting == resolver.MAX_THREADS)
+    await until(lambda: len(waiting) == resolver.MAX_THREADS)
     with client_of(Address("autopilot.test", 5760)) as tcp_client:
         await until(lambda: len(tcp_client.ports) == 1)
     is_over.set()

@@ -34,15 +34,14 @@ def handle_timeout(peer: Peer, now: float) -> list[Output]:
 
 
 def _expire(peer: Peer, now: float) -> list[Output]:
+    out: list[Output] = []
     peer.initiator.expire(now)
-    if now < peer.sessions.next_expiry():
-        peer.set_expiry()
-        return []
-    out = freshness.end(peer, peer.sessions.expire(now))
+    if now >= peer.sessions.next_expiry():
+        out += freshness.end(peer, peer.sessions.expire(now))
+        if peer.is_up and peer.sessions.current is None:
+            out += peer.note_lost(now)
+        peer.set_initiate()
     peer.set_expiry()
-    if peer.is_up and peer.sessions.current is None:
-        out += peer.note_lost(now)
-    peer.set_initiate()
     return out
 
 

@@ -112,13 +112,12 @@ def _answers(sockets: Sequence[Path], request: str) -> Iterator[dict[str, Any] |
             yield error
 
 
-def _for_each(options: argparse.Namespace, request: str, show: Callable[[dict[str, Any]], int]) -> int:
+def _for_each(sockets: Sequence[Path], request: str, show: Callable[[dict[str, Any]], int]) -> int:
     """Show the answer of each daemon, also after one that does not answer. The worst exit status counts.
 
     Raises:
-        CommandError: there is no daemon, or the only one does not answer.
+        CommandError: the only one does not answer.
     """
-    sockets = _control_sockets(options)
     worst = OK
     for answer in _answers(sockets, request):
         if not isinstance(answer, CommandError):
@@ -139,8 +138,9 @@ def _status(options: argparse.Namespace) -> int:
 
     from uavlinkd.ops.status_screen import render_status
 
+    sockets = _control_sockets(options)
     if options.watch:
-        return _watch(_control_sockets(options))
+        return _watch(sockets)
     console = Console()
 
     def show(status: dict[str, Any]) -> int:
@@ -150,7 +150,7 @@ def _status(options: argparse.Namespace) -> int:
             console.print(render_status(status, console.width))
         return OK if status["frames_pass"] else FAILED
 
-    return _for_each(options, "status", show)
+    return _for_each(sockets, "status", show)
 
 
 def _watch(sockets: Sequence[Path]) -> int:
@@ -209,7 +209,7 @@ def _netcheck(options: argparse.Namespace) -> int:
             print(printable(line))
         return OK if any(relay["state"] == "up" for relay in answer["relays"].values()) else FAILED
 
-    return _for_each(options, "netcheck", show)
+    return _for_each(_control_sockets(options), "netcheck", show)
 
 
 def _report(options: argparse.Namespace) -> int:
@@ -232,13 +232,12 @@ def _peer_list(options: argparse.Namespace) -> int:
 
     from uavlinkd.ops.status_screen import render_peers
 
-    console = Console()
-    is_one = len(_control_sockets(options)) == 1
+    console, sockets = Console(), _control_sockets(options)
 
     def show(status: dict[str, Any]) -> int:
-        if not is_one:
+        if len(sockets) > 1:
             console.print(f"{status['name']}:", style="bold", markup=False, highlight=False)
         console.print(render_peers(status))
         return OK
 
-    return _for_each(options, "status", show)
+    return _for_each(sockets, "status", show)
