@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 
@@ -11,7 +12,7 @@ from tests.link.two_radios import End, Network, Radio
 from tests.mavlink.egress.links import CLASS_OF
 from tests.samples import attitude, command, manual_control, read_by_name, value
 from uavlinkd.core.path_state import PathCondition
-from uavlinkd.link.peer_output import PeerOutput
+from uavlinkd.link.peer_output import STICKS_COPIED_S, PeerOutput
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.mavlink.frames import Frame
 
@@ -41,6 +42,36 @@ def test_answer_to_a_parameter_request_is_critical_and_a_list_is_not() -> None:
     answer, other = value(b"RTL_ALT", 7), value(b"WP_RADIUS", 8)
     pair.bravo.send(answer, other)
     assert radios_of(pair.bravo, answer, other) == {answer.raw: {0: 1, 1: 1}, other.raw: {0: 1}}
+
+
+STICKS_PER_S = 50
+
+
+def fly(pair: Network, seconds: float) -> Counter[int]:
+    """The pilot's stick moves, and the vehicle reports. Returns the pilot's datagrams by radio."""
+    pair.alpha.sent.clear()
+    for number in range(round(seconds * STICKS_PER_S)):
+        pair.alpha.send(manual_control(number))
+        pair.bravo.send(attitude(number))
+        pair.run(pair.now + 1 / STICKS_PER_S)
+    return Counter(sent.radio for sent in pair.alpha.sent)
+
+
+@pytest.mark.parametrize("phase_s", [0.0, 0.1, 0.2])
+def test_stick_positions_are_copied_rarely_while_the_best_path_is_healthy(phase_s: float) -> None:
+    """A path that dies costs two in a row. As soon as that is seen, or while it loses some, each one is copied."""
+    pair = network(FAST, SLOW)
+    fly(pair, 2.0 + phase_s)
+    assert fly(pair, 10.0)[1] < 10.0 * STICKS_PER_S / 2.5  # with probes
+    died = pair.now
+    pair.radios[0] = Radio(FAST.delay_s, loss=1.0)
+    fly(pair, 0.5)
+    assert fly(pair, 1.0)[1] >= STICKS_PER_S
+    gaps = [later - earlier for earlier, later in pairwise(at for at in pair.bravo.delivered_at if at >= died - 0.2)]
+    assert max(gaps) < STICKS_COPIED_S + 1 / STICKS_PER_S + SLOW.delay_s - FAST.delay_s
+    pair.radios[0] = Radio(FAST.delay_s, loss=0.1)
+    fly(pair, 20.0)
+    assert fly(pair, 1.0)[1] >= STICKS_PER_S
 
 
 RADIO_BITS_S = 9600

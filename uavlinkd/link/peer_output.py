@@ -13,18 +13,24 @@ from operator import itemgetter
 from uavlinkd.core.constants import CRITICAL_ENVELOPE_LIMIT, NEVER
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Output, Transmit
+from uavlinkd.core.path_state import PathCondition
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.settings import Class, Redundancy
-from uavlinkd.link.copies import Copies, Repair
+from uavlinkd.link.copies import BEGIN_LOSS, Copies, Repair
 from uavlinkd.link.networks import COPIES_SHARE, NetworkBudget, carrier_bytes
+from uavlinkd.mavlink.dialect import Lane
 from uavlinkd.mavlink.egress.bucket import Bucket
 from uavlinkd.mavlink.egress.budgeted import EgressSettings, EnvelopeShape
 from uavlinkd.mavlink.egress.by_class import ClassOf, PeerEgress, split_by_class
+from uavlinkd.mavlink.flows import FlowKey, flow_key
 from uavlinkd.mavlink.frames import Frame
 
 RAW = itemgetter(0)
 """The bytes of a frame."""
-
+STICKS_COPIED_S = 0.05
+"""Between copies of MANUAL_CONTROL or RC_CHANNELS_OVERRIDE, at least, while the best path is healthy. At 50/s every
+third one is copied, so a path that dies costs at most two in a row."""
+_STICK_FLOWS = 64  # that are remembered
 
 OnSent = Callable[[list[bytes], list[Output], float], None]
 """Receives frames that were sent, and the outputs of the core for them, which are to be performed."""
@@ -57,6 +63,7 @@ class PeerOutput:
         self._critical_limit = CRITICAL_ENVELOPE_LIMIT  # of the payload; set for each session
         self._stream_bytes = 0
         self._measured_at = now
+        self._copied_at: dict[FlowKey, float] = {}  # of flows of stick positions
 
     def send(self, peer: Peer, frames: Sequence[Frame], now: float, waited_s: float) -> bool:
         """Send frames that arrived together: at once, or when budgets and the coalescing delay allow it.
@@ -201,6 +208,8 @@ class PeerOutput:
 
     def _send_part(self, peer: Peer, frames: Sequence[Frame], cls: Class, now: float) -> None:
         raws = list(map(RAW, frames))
+        if cls is Class.CRITICAL and peer.paths.is_multiple and self._is_spared(peer, frames, now):
+            cls = Class.STREAM
         outputs = self._node.send(peer, raws, now, cls)
         if cls is not Class.CRITICAL:
             self._stream_bytes += sum(map(len, raws))
@@ -211,6 +220,21 @@ class PeerOutput:
                 paths = [transmit.path for transmit in sent]
                 self.copies.repeat(datagram, paths, frames, self.repair.transmissions, now)
         self._on_sent(raws, outputs, now)
+
+    def _is_spared(self, peer: Peer, frames: Sequence[Frame], now: float) -> bool:
+        """Whether these frames go along the best path alone: stick positions, which newer ones replace soon."""
+        kinds = [frame.header.kind for frame in frames]
+        if self.repair.is_on or not all(kind.is_state and kind.lane is Lane.URGENT for kind in kinds):
+            return False
+        best = peer.paths.best
+        is_healthy = best is not None and best.condition is PathCondition.USABLE and best.loss_out < BEGIN_LOSS
+        flows = set(map(flow_key, frames))
+        if is_healthy and all(now < self._copied_at.get(flow, -NEVER) + STICKS_COPIED_S for flow in flows):
+            return True
+        if len(self._copied_at) > _STICK_FLOWS:
+            self._copied_at.clear()  # the next one of each is copied
+        self._copied_at |= dict.fromkeys(flows, now)
+        return False
 
     def _pick_copies(
         self, peer: Peer, outputs: Sequence[Output], frames: Sequence[Frame] | None, now: float
