@@ -85,7 +85,6 @@ class Scene:
                 on_event=lambda *_: None,
             ),
             events=SimpleNamespace(write=lambda *_: None),
-            history=SimpleNamespace(add_session=lambda *_: None),
             relay=None,
             drops=drops,
             evidence=SimpleNamespace(add_dropped=lambda *_: None),

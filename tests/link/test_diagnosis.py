@@ -22,10 +22,11 @@ from uavlinkd.core.drops import DropReason
 from uavlinkd.core.outputs import Dropped
 from uavlinkd.core.path import Path
 from uavlinkd.core.refusals import RefusalReport, Refused
+from uavlinkd.core.sessions import Twin
 from uavlinkd.link import diagnosis, down_problems
-from uavlinkd.link.evidence import MAX_SESSIONS, OWN_FRAMES_S, History, SessionBegin
+from uavlinkd.link.evidence import OWN_FRAMES_S, History
 from uavlinkd.link.peer_link import PeerLink
-from uavlinkd.link.traffic_problems import FLIPS_S, SECURITY_S, alternating
+from uavlinkd.link.traffic_problems import SECURITY_S
 from uavlinkd.mavlink.frames import split_payload
 from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.mavlink.routing import Router
@@ -377,39 +378,30 @@ def test_a_lying_peer_fills_one_line(daemon: Daemon) -> None:
     assert len(text) < 500
 
 
-# Sessions at two places.
-
-A, B, C = (("192.0.2.1", port) for port in (1, 2, 3))
-TWO = ["192.0.2.1:1", "192.0.2.1:2"]
+# A private key on two machines.
 
 
-@pytest.mark.parametrize(
-    ("begins", "now", "shown"),
-    [
-        ([], 0.0, []),
-        ([(0.0, A), (1.0, B), (2.0, A), (3.0, B)], 4.0, TWO),
-        ([(0.0, A), (1.0, B), (2.0, A), (3.0, B)], 3.0 + SECURITY_S, []),
-        ([(0.0, A), (1.0, B), (2.0, A)], 4.0, []),
-        ([(0.0, A), (1.0, B), (2.0, A), (3.0 + FLIPS_S, B)], 40.0, []),
-        ([(0.0, A), (1.0, B), (2.0, C), (3.0, ("192.0.2.1", 4))], 4.0, []),
-        ([(float(at), A) for at in range(8)], 8.0, []),
-        ([(0.0, A), *((SECURITY_S + at, (B, A)[at % 2]) for at in range(3))], SECURITY_S + 3, TWO),
-    ],
-    ids=["none", "two machines", "long ago", "a change and back", "slow", "roaming", "rekeys", "a long first stay"],
-)
-def test_alternating_sessions(begins: list[tuple[float, tuple[str, int]]], now: float, shown: list[str]) -> None:
-    """Sessions that return to an address again and again, within a short time."""
-    assert alternating([SessionBegin(*begin) for begin in begins], now) == shown
-
-
-def test_many_sessions_of_a_thief_hide_nothing(daemon: Daemon) -> None:
-    """It makes more sessions than are remembered between two of the machine that it copied."""
-    for second in range(3):
-        daemon.history.add_session("drone1", A, float(second))
-        for number in range(1, MAX_SESSIONS + 1):
-            daemon.history.add_session("drone1", B, second + number / 100)
-    finding = daemon.findings(3.0)["key_on_two_machines"]
-    assert all(address in finding.text for address in TWO)
+def test_key_on_two_machines_is_named_for_ten_minutes(daemon: Daemon) -> None:
+    """That of a peer, with its addresses, this daemon's own one, and at a relay those of its members."""
+    peer = daemon.set_up(role="all", system_ids="all").peer
+    for port in (1, 2):
+        peer.paths.prefer(Path(0, ("192.0.2.1", port)), NOW)
+    peer.sessions.twins[Twin.PEERS] = NOW
+    finding = daemon.findings()["key_on_two_machines"]
+    assert finding.text.startswith(
+        "two machines use drone1's private key: sessions came from 192.0.2.1:1, 192.0.2.1:2;"
+    )
+    assert "an attacker that holds handshakes back" in finding.remedy
+    assert "key_on_two_machines" not in daemon.findings(NOW + SECURITY_S)
+    peer.sessions.twins = {Twin.OURS: NOW}
+    text = daemon.findings()["key_on_two_machines"].text
+    assert text.startswith("two machines use this daemon's private key: another one has sessions with drone1;")
+    peer.sessions.twins = {Twin.PEERS: NOW}
+    member = SimpleNamespace(peer=peer, peers=[peer], is_own=True, settings=SimpleNamespace(name="member"))
+    daemon.parts.relay = SimpleNamespace(members={1: member, 2: SimpleNamespace(peer=peer, is_own=False)})
+    here, of_peer = [one for one in diagnosis.find(daemon.parts, NOW) if one.cause == "key_on_two_machines"]
+    assert "the private key of a member: member, from 192.0.2.1:1, 192.0.2.1:2;" in here.text
+    assert of_peer.name == "drone1"
 
 
 # Local endpoints.

@@ -73,7 +73,7 @@ LINK_ROWS = (
         "30",
         "one key on two machines",
         scenes.copied_card,
-        signs=(Sign("here", "key_on_two_machines", r"uavlinkd pubkey.*only if a second machine"),),
+        signs=_both("key_on_two_machines", r"uavlinkd pubkey.*only if a second machine"),
     ),
     Mistake("31", "clock of 1970", scenes.old_clock),
     Mistake(

@@ -159,11 +159,7 @@ async def tags(scene: Scene) -> None:
 async def copied_card(scene: Scene) -> None:
     """A third daemon has the key of `there`, and both call `here`."""
     scene.introduce()
-    copy = scene.stage.daemon(f"m{scene.row}-copy")
-    (copy.folder / "daemon.key").unlink()
-    keys.write_secret_file(copy.folder / "daemon.key", scene.there.private_key)
-    copy.config["peer"] = [dict(_peer(scene.there))]
-    await scene.start(scene.here, scene.there, copy)
+    await scene.start(scene.here, scene.there, scene.clone(scene.there))
 
 
 async def input_dropped(scene: Scene) -> None:

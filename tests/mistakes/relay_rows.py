@@ -13,6 +13,12 @@ _RELAY_KEY = (
 
 RELAY_ROWS = (
     Mistake(
+        "30b",
+        "one key on two machines at a relay",
+        scenes.copied_card,
+        signs=tuple(Sign(side, "key_on_two_machines", r"uavlinkd keygen. on one") for side in ("here", "there")),
+    ),
+    Mistake(
         "79",
         "member missing at the relay",
         scenes.member_missing,

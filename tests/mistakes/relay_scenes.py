@@ -45,6 +45,12 @@ async def member_missing(scene: Scene) -> None:
     await _checked_start(scene)
 
 
+async def copied_card(scene: Scene) -> None:
+    """A third daemon has the key of `there`, and both are at the relay `here`."""
+    _member(scene.there, scene.here)
+    await scene.start(scene.here, scene.there, scene.clone(scene.there))
+
+
 async def relay_key(scene: Scene) -> None:
     """`here` has a random key for the relay."""
     _member(scene.here, scene.there)

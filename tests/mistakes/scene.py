@@ -17,6 +17,7 @@ from tests.daemon.harness import Stage
 from tests.daemon.process import DaemonProcess
 from tests.daemon.udp import Sockaddr
 from uavlinkd.cli import main
+from uavlinkd.config.keys import write_secret_file
 
 SEND_S = 0.2
 WITHOUT_RIGHTS = ("setpriv", "--bounding-set=-dac_override,-dac_read_search", "--inh-caps=-all")
@@ -48,6 +49,14 @@ class Scene:
     def there(self) -> DaemonProcess:
         """Its peer."""
         return self.stage.daemon(f"m{self.row}-there")
+
+    def clone(self, original: DaemonProcess) -> DaemonProcess:
+        """A third daemon, with the key and the partners of another one."""
+        clone = self.stage.daemon(f"m{self.row}-clone")
+        (clone.folder / "daemon.key").unlink()
+        write_secret_file(clone.folder / "daemon.key", original.private_key)
+        clone.config |= {key: original.config[key] for key in ("peer", "relay", "link") if key in original.config}
+        return clone
 
     def introduce(self, here: dict[str, Any] | None = None, there: dict[str, Any] | None = None) -> None:
         """Make them peers. The settings are those of the [[peer]] in each file."""

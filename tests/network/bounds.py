@@ -33,6 +33,7 @@ LIMITS: dict[str, int] = {
     "paths that carried a response": c.COPIES_OF_A_RESPONSE,
     "cookies of a peer": c.COOKIES_PER_PEER,
     "addresses of proven paths of a peer": c.CONFIGURED_PATHS + c.LEARNED_PATHS,
+    "keys that seem to be on two machines": 0,  # each is on one, and no attacker has it
 }
 
 
@@ -74,6 +75,7 @@ def measure(node: Node) -> Sizes:
             "paths that carried a response": max((len(response.paths) for response in waiting), default=0),
             "cookies of a peer": max((len(peer.initiator._received_cookies) for peer in peers), default=0),
             "addresses of proven paths of a peer": max(proven, default=0),
+            "keys that seem to be on two machines": sum(len(peer.sessions.twins) for peer in peers),
         }
     )
 

@@ -59,6 +59,7 @@ def receive_response(peer: Peer, pending: Pending, response: wire.Response, path
     keys = peer.initiator.receive_response(pending, response)
     lifetimes = peer.durations.reject_after_s, peer.verify_interval_s
     session = Session(keys, response.receiver_index, now, *lifetimes, is_initiator=True)
+    peer.sessions.note_twin(peer.sessions.twin(keys.parameters.generation - 1), now)
     if path not in pending.paths:  # it was sent on from elsewhere, or our network changed
         path = pending.paths[0]
     events = adopt(peer, session, path, now) + peer.note_received(now)
@@ -100,7 +101,8 @@ def answer(peer: Peer, received: Received, initiation: bytes, path: Path, now: f
     session = Session(keys, index, now, *lifetimes, is_initiator=False)
     is_expected, expires_at = peer.paths.find(path) is not None, now + c.UNCONFIRMED_LIFETIME_S
     macs = mac1_of(initiation), mac1_of(datagram)
-    waiting = Unconfirmed(session, macs[0], len(initiation), response, [path], is_expected, macs[1], expires_at)
+    twin = peer.sessions.twin(received.parameters.generation)
+    waiting = Unconfirmed(session, macs[0], len(initiation), response, [path], is_expected, macs[1], expires_at, twin)
     peer.sessions.wait(waiting)
     peer.indices.owners[index] = peer, session
     peer.set_expiry()

@@ -11,6 +11,7 @@ the highest that they hold, so they settle on the same one without a word about 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from enum import Enum
 from typing import Generic, TypeVar
 
 from uavlinkd.core import constants as c
@@ -75,6 +76,13 @@ class Indices(Generic[Owner_co]):
             del self._quarantined_of[peer]
 
 
+class Twin(Enum):
+    """Which private key a second process uses: README.md, section 9. Nothing acts on it."""
+
+    PEERS = "peers"
+    OURS = "ours"
+
+
 @dataclass(slots=True)
 class Unconfirmed:
     """A session that answers an initiation; the first valid envelope on it confirms it."""
@@ -92,6 +100,8 @@ class Unconfirmed:
     mac1: bytes
     """Of the response; a cookie reply refers to it."""
     expires_at: float
+    twin: Twin | None = None
+    """What the initiation shows, once the session is confirmed: before that it may be an old recording."""
     cookied: set[Path] = field(default_factory=set)
     """Paths along which a cookie reply to it was accepted: a second one is not."""
 
@@ -103,10 +113,20 @@ class Sessions:
     quarantine, any other is free at once.
     """
 
-    __slots__ = ("_has_smaller_key", "_highest", "_indices", "_peer", "confirmed", "current", "unconfirmed")
+    __slots__ = (
+        "_has_smaller_key",
+        "_highest",
+        "_indices",
+        "_made",
+        "_peer",
+        "confirmed",
+        "current",
+        "twins",
+        "unconfirmed",
+    )
 
     def __init__(self, indices: Indices[object], peer: str, *, has_smaller_key: bool) -> None:
-        self._highest = 0
+        self._highest = self._made = 0
         self._indices = indices
         self._peer = peer
         self._has_smaller_key = has_smaller_key
@@ -116,23 +136,45 @@ class Sessions:
         """The highest rank first."""
         self.unconfirmed: dict[int, Unconfirmed] = {}
         """By our index, the oldest first."""
+        self.twins: dict[Twin, float] = {}
+        """When a handshake last proved that a second process uses a key."""
 
     @property
     def generation(self) -> int:
         """Of the current session; 0 without one."""
         return 0 if self.current is None else self.current.parameters.generation
 
+    def twin(self, stated: int) -> Twin | None:
+        """What the generation shows that the peer states in a handshake, if it completes that handshake.
+
+        An end completes no handshake that it began before its present session. So a peer that knows less than it used
+        here before is a second process with its key. One that knows a session that this end never made has it with a
+        second process that has our key. A restarted end states 0, and takes any number.
+        """
+        used = (session for session in self.confirmed if session.first_received_at != c.NEVER)
+        if 0 < stated < max((session.parameters.generation for session in used), default=0):
+            return Twin.PEERS
+        return Twin.OURS if self.current is not None and stated > self._made else None
+
+    def note_twin(self, twin: Twin | None, now: float) -> None:
+        """A handshake was completed that shows this."""
+        if twin is not None:
+            self.twins[twin] = now
+
     def wait(self, unconfirmed: Unconfirmed) -> None:
         """Keep a session until it is confirmed. Too many of its kind, expected or not: the oldest of them goes."""
-        is_expected = unconfirmed.is_expected
+        is_expected, session = unconfirmed.is_expected, unconfirmed.session
+        self._made = max(self._made, session.parameters.generation)
         alike = [index for index, other in self.unconfirmed.items() if other.is_expected == is_expected]
         if len(alike) >= c.UNCONFIRMED_PER_KIND:
             self._forget(alike[0])
-        self.unconfirmed[unconfirmed.session.local_index] = unconfirmed
+        self.unconfirmed[session.local_index] = unconfirmed
 
     def confirm(self, session: Session, now: float) -> list[Session]:
         """The peer proved that it has the session: give it the place of its rank. Returns what ends."""
-        self.unconfirmed.pop(session.local_index, None)
+        if (waiting := self.unconfirmed.pop(session.local_index, None)) is not None:
+            self.note_twin(waiting.twin, now)
+        self._made = max(self._made, session.parameters.generation)
         self.confirmed = sorted([session, *self.confirmed], key=self._rank, reverse=True)
         is_highest = self.confirmed[0] is session
         self._highest += 2 * is_highest  # one number is left for a session that ranks below

@@ -353,11 +353,8 @@ class FrameCarrier:
                 link.on_down(now)
         elif isinstance(event, o.PathChanged | o.PathStateChanged | o.SessionEstablished):
             link.follow_paths(now)
-            if isinstance(event, o.SessionEstablished):
-                if not event.path.is_relayed:
-                    parts.history.add_session(link.name, event.path.address, now)
-                if event.peer is link.peers[0]:
-                    self.peers.confirm_keys(link)
+            if isinstance(event, o.SessionEstablished) and event.peer is link.peers[0]:
+                self.peers.confirm_keys(link)
 
     # Time.
 

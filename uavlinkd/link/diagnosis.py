@@ -11,11 +11,14 @@ from typing import Final
 
 from uavlinkd.config.keys import encode_key
 from uavlinkd.core.drops import DropReason
+from uavlinkd.core.sessions import Twin
 from uavlinkd.link import traffic_problems as traffic
 from uavlinkd.link.down_problems import down_problems, silence, versions
 from uavlinkd.link.evidence import ELSEWHERE, EVIDENCE_S
 from uavlinkd.link.facts import EndpointFacts, Found, Moment, PeerFacts, fault, listed, security, warning
 from uavlinkd.link.parts import DaemonParts
+from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.link.relay_link import RelayLink
 from uavlinkd.link.serial_networks import RECENT_S
 from uavlinkd.ops.findings import Finding, Subject
 from uavlinkd.ops.log import shown
@@ -35,6 +38,9 @@ def daemon_problems(moment: Moment) -> Iterator[Found]:
             f"a sender at {at} uses this daemon's private key, or an attacker replays an old recording",
             "if a card was copied, run `uavlinkd keygen` on one machine; else the key may be stolen: replace it",
         )
+    partners: list[PeerLink | RelayLink] = [*daemon.links.values(), *daemon.relays.by_name.values()]
+    if names := {one.config.name: None for one in partners if traffic.has_twin(one.peers, Twin.OURS, now)}:
+        yield traffic.two_machines(f"this daemon's private key: another one has sessions with {listed(names)}")
     fault_if_down = fault if moment.down else warning
     if absent := daemon.peer_sockets.absent_addresses():
         yield fault_if_down(
@@ -86,6 +92,10 @@ def member_problems(moment: Moment) -> Iterator[Found]:
     daemon, now = moment.daemon, moment.now
     if daemon.relay is None:
         return
+    members = [one for one in daemon.relay.members.values() if one.is_own]
+    if twins := [one for one in members if traffic.has_twin(one.peers, Twin.PEERS, now)]:
+        facts = (f"{one.settings.name}, from {traffic.places(one.peers)}" for one in twins)
+        yield traffic.two_machines(f"the private key of a member: {listed(facts)}")
     unknown = daemon.evidence.seen_at(DropReason.UNKNOWN_PEER, ELSEWHERE, now)
     if unknown is not None and unknown.address is not None:
         keys = ", ".join(encode_key(key) for key in unknown.details if isinstance(key, bytes))

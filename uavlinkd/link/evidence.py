@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Final, Generic, NamedTuple, TypeVar
+from typing import Final, Generic, TypeVar
 
 from uavlinkd.core.drops import Detail, DropReason
 from uavlinkd.core.outputs import Dropped
@@ -189,8 +189,6 @@ def _addresses_of(peers: Sequence[Peer]) -> list[Place]:
 
 REMEMBERED_S: Final = 600.0
 """The growth of a counter is remembered for this time after it stopped."""
-MAX_SESSIONS: Final = 8
-"""Sessions of one peer at another address than the one before that are remembered."""
 OWN_FRAMES_S: Final = 10.0
 """A foreign system counts as mixed with a peer's own if own frames passed within this time."""
 
@@ -299,13 +297,6 @@ class PartHistory:
         return [direction for direction, gate in gates if gate.is_blocked(now)]
 
 
-class SessionBegin(NamedTuple):
-    """A session with a peer began."""
-
-    at: float
-    address: SocketAddress
-
-
 class History:
     """The recent past of every peer and endpoint. Times are monotonic seconds."""
 
@@ -314,7 +305,6 @@ class History:
         self.paused: tuple[float, float] | None = None
         """When the last pause of the process ended, and its duration in seconds."""
         self._parts: dict[tuple[str, str], PartHistory] = {}
-        self._sessions: dict[str, deque[SessionBegin]] = {}
 
     def part(self, kind: str, name: str) -> PartHistory:
         """The history of a ``peer`` or ``endpoint``; an empty one before the first sample."""
@@ -325,16 +315,6 @@ class History:
         return [
             (kind, name, direction) for (kind, name), part in self._parts.items() for direction in part.blocked(now)
         ]
-
-    def sessions(self, name: str) -> list[SessionBegin]:
-        """The latest sessions of a peer that began at another address than the one before, the oldest first."""
-        return list(self._sessions.get(name, ()))
-
-    def add_session(self, name: str, address: SocketAddress, now: float) -> None:
-        """A session with a peer began at this address. Further ones there must not displace other addresses."""
-        begins = self._sessions.setdefault(name, deque(maxlen=MAX_SESSIONS))
-        if not begins or begins[-1].address != address:
-            begins.append(SessionBegin(now, address))
 
     def sample(self, links: Iterable[PeerLink], endpoints: Iterable[tuple[Endpoint, Policy]], now: float) -> None:
         """Read the counters. Call it once a second. Peers and endpoints that are not named are forgotten."""
@@ -349,4 +329,3 @@ class History:
             part.update(endpoint.counters.frames, endpoint.frames_sent, policy, now)
             part.failures.update(endpoint.failures, now)
             part.garbage.update({"bytes": endpoint.counters.garbage_bytes}, now)
-        self._sessions = {name: begins for name, begins in self._sessions.items() if ("peer", name) in self._parts}

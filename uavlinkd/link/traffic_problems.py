@@ -1,7 +1,6 @@
 """What is wrong with traffic: attacks with a valid key, frames that policies refuse, local clients that are silent.
 
-All of it is authentic, or happens on this machine. Without a peer's key, an attacker on the path can cause two of
-these problems: it can forward handshakes from its own address (``key_on_two_machines``), and withhold answers
+All of it is authentic, or happens on this machine. Without a peer's key, an attacker on the path can withhold answers
 (``freshness_unverified``).
 """
 
@@ -9,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
-from itertools import pairwise
 from typing import Final
 
+from uavlinkd.core.peer import Peer
 from uavlinkd.core.refusals import Claim
+from uavlinkd.core.sessions import Twin
 from uavlinkd.endpoints.url import EndpointKind
-from uavlinkd.link.evidence import GateHistory, SessionBegin
+from uavlinkd.link.evidence import GateHistory
 from uavlinkd.link.facts import EndpointFacts, Found, PartFacts, PeerFacts, fault, listed, security, warning
 from uavlinkd.mavlink.dialect import GROUPS, IDS, command_name, name_of
 from uavlinkd.mavlink.policy.gate import ANY_OTHER, REFUSALS, Gate, Refusal
@@ -30,9 +30,6 @@ CLAIMS_S: Final = 60.0
 """A peer's claim whose count grew within this time is a present problem."""
 REFUSED_S: Final = 10.0
 """Other refusals stay for this time."""
-FLIPS: Final = 3
-"""Sessions of one peer that began at another address than the one before, within :data:`FLIPS_S`."""
-FLIPS_S: Final = 30.0
 SILENT_S: Final = 5.0
 """An endpoint without frames for this time is reported: MAVLink clients send a heartbeat every second. Its errors
 count for the same time. It is opened again more often."""
@@ -49,14 +46,8 @@ _NOT_LISTENING: Final = ("ECONNREFUSED", "connect_timeout", "EHOSTUNREACH", "ENE
 
 def peer_problems(peer: PeerFacts) -> Iterator[Found]:
     """Of any peer: signs that a key is in wrong hands, and what the peer claims."""
-    if addresses := alternating(peer.daemon.history.sessions(peer.name), peer.now):
-        yield security(
-            "key_on_two_machines",
-            f"its sessions alternate between {listed(addresses)}: two machines may have its private key, such as a"
-            " copied SD card or a stolen key",
-            "run `uavlinkd pubkey` on both machines; rotate the key only if a second machine has it: the network may"
-            " also switch addresses, or an attacker forward packets",
-        )
+    if has_twin(peer.link.peers, Twin.PEERS, peer.now):
+        yield two_machines(f"{peer.name}'s private key: sessions came from {places(peer.link.peers)}")
     yield from _hidden_frames(peer)
     mixed = peer.history.mixed
     is_mixed = len(mixed) == mixed.maxlen and peer.now - mixed[0] <= SECURITY_S
@@ -73,21 +64,26 @@ def peer_problems(peer: PeerFacts) -> Iterator[Found]:
         yield _refused_there(peer, claims)
 
 
-def alternating(begins: Sequence[SessionBegin], now: float) -> list[str]:
-    """The addresses between which the sessions of a peer alternate; none if they do not.
+def has_twin(peers: Iterable[Peer], twin: Twin, now: float) -> bool:
+    """Whether one of these pairs of keys showed a second process with a private key."""
+    return any(now - peer.sessions.twins.get(twin, -SECURITY_S) < SECURITY_S for peer in peers)
 
-    A peer that roams leaves an address. One whose sessions return to it again and again is in two places.
-    """
-    moves = [
-        (before, here)
-        for before, here in pairwise(begins)
-        if here.address != before.address and now - here.at <= SECURITY_S
-    ]
-    addresses = dict.fromkeys(shown(begin.address) for move in moves for begin in move)
-    for (_, first), (_, last) in zip(moves, moves[FLIPS - 1 :], strict=False):
-        if last.at - first.at <= FLIPS_S and len(addresses) < len(moves) + 1:
-            return list(addresses)
-    return []
+
+def places(peers: Iterable[Peer]) -> str:
+    """Where a peer answered."""
+    answered = (state for peer in peers for state in peer.paths.states if state.is_validated or state.is_known)
+    return listed(dict.fromkeys(shown(state.path.address) for state in answered)) or "an unknown address"
+
+
+def two_machines(facts: str) -> Found:
+    """A private key is in use twice. ``facts``: whose, and where."""
+    return security(
+        "key_on_two_machines",
+        f"two machines use {facts}; a card was copied, or the key is stolen",
+        "run `uavlinkd pubkey` on both machines. If both print one key, run `uavlinkd keygen` on one; rotate the key"
+        " only if a second machine has it: an attacker that holds handshakes back while both ends restart can also"
+        " cause this",
+    )
 
 
 def _hidden_frames(part: PartFacts) -> Iterator[Found]:

@@ -60,7 +60,8 @@ class LinkProblem(Reason):
     )
     PATHS_UNPROVEN = (
         "paths_unproven",
-        "the peer's envelopes came from an address that is not the peer's: an attacker forwards them",
+        "the peer's envelopes came from an address that is not the peer's: an attacker forwards them, or a second"
+        " machine has its key",
         "addresses without an answer",
     )
     ECHOES_UNANSWERED = (
