@@ -214,12 +214,17 @@ class PathSet(PathSlots):
     def update(self, peer: LinkedPeer, now: float) -> list[PathEvent]:
         """Judge every path, elect the best one, and set the routes and the next deadline. Returns what changed."""
         self.revised_at = c.NEVER
-        changes: list[PathEvent] = []
+        usable = [state for state in self.states if state.condition is PathCondition.USABLE]
         for state in self.states:
-            was_usable = state.condition is PathCondition.USABLE
             state.check(now)
-            if was_usable and state.path.is_relayed and state.condition is not PathCondition.USABLE:
-                changes.append(PathSuspected(peer, state.path))
+        failed = [state.path for state in usable if state.condition is not PathCondition.USABLE]
+        # A NAT that forgot a direct path has forgotten the relay too, which is probed rarely.
+        sockets = {path.socket for path in failed if not path.is_relayed}
+        changes: list[PathEvent] = [
+            PathSuspected(peer, state.path)
+            for state in usable
+            if state.path.is_relayed and (state.path in failed or state.path.socket in sockets)
+        ]
         if not any(state.works for state in self.by_path.values()):
             for state in self.by_path.values():
                 if state.is_recovering:  # the only one to answer: it need not prove itself for longer

@@ -103,6 +103,8 @@ class Peer:
         """The same in addition, where it proves to be at its own address."""
         self.remembered: deque[bytes] = deque()
         """Ephemerals of its initiations, the oldest first."""
+        self.recent: deque[tuple[float, bytes]] = deque(maxlen=c.RESENT_ENVELOPES)
+        """Critical envelopes, and when they were sent, if a path leads through a relay: a new path may carry them."""
         self.paths = PathSet(settings.link.redundancy, settings.link.idle_probe_s, shared.known, shared.facts)
         """Where the peer is, or may be."""
         self.paths.reports_single = bool(settings.link.features & c.FEATURE_RECORDS)

@@ -10,7 +10,7 @@ from uavlinkd.core.path import Path
 from uavlinkd.core.path_state import PathCondition, PathState
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.probe import ANSWER_BYTES, QUESTION_BYTES, Probe
-from uavlinkd.core.send import seal
+from uavlinkd.core.send import resend, seal
 from uavlinkd.core.session import Session
 from uavlinkd.core.sessions import Unconfirmed
 from uavlinkd.core.wire import MACS_BYTES
@@ -109,11 +109,14 @@ def receive_probe(
         lost, age_s = state.receive_report(probe, now), now - session.created_at
         peer.losses.note_report(lost, now, age_s, asks=probe.question != 0)
     if probe.answer:
+        is_first = not state.is_validated
         round_trip_s = state.receive_answer(probe.answer, probe.received if counts else None, now)
         if round_trip_s is not None:
             if peer.round_trip_s is None or not peer.paths.has_several:
                 peer.round_trip_s = round_trip_s
             peer.paths.note_answer(state, now)
+            if is_first and state.path.is_relayed:
+                out += resend(peer, state, now)
         elif not is_copy:
             out.append(peer.drop_datagram(DropReason.UNEXPECTED_ANSWER, state.path))
     if probe.question and not (is_copy and probe.question == state.copied_question):

@@ -56,6 +56,26 @@ def send_frames(peer: Peer, frames: Sequence[bytes], now: float, cls: Class) -> 
         if now >= asks_at:
             payload = _ask_too(peer, session, route[0], payload, limit, now)
         out += seal(peer, session, payload, route, now)
+    if cls is Class.CRITICAL and paths.has_relayed:
+        sent = (output.datagram for output in out if isinstance(output, Transmit))
+        peer.recent.extend((now, datagram) for datagram in dict.fromkeys(sent))
+    return out
+
+
+def resend(peer: Peer, state: PathState, now: float) -> list[Output]:
+    """Send the recent critical envelopes of the current session along a path that is new. Frames crossed none before.
+
+    The receiver drops those that have arrived.
+    """
+    recent, session = list(peer.recent), peer.sessions.current
+    peer.recent.clear()
+    out: list[Output] = []
+    for sent_at, datagram in recent:
+        is_current = session is not None and wire.claimed_receiver_index(datagram) == session.remote_index
+        if now <= sent_at + c.RESENT_S and is_current and peer.paths.carries(state, len(datagram)):
+            state.sent += 1
+            peer.count_sent(state, 1, len(datagram))
+            out.append(Transmit(datagram, state.path, is_copy=True))
     return out
 
 
