@@ -12,6 +12,7 @@ from uavlinkd.core import probing, wire
 from uavlinkd.core.limits import prefix_of
 from uavlinkd.core.outputs import Output, PathChanged, PathSuspected, Transmit
 from uavlinkd.core.path import Path, relay_name, relayed
+from uavlinkd.core.probe import Probe
 from uavlinkd.core.settings import Class, Link
 
 LTE, MESH = Path(0, ("192.0.2.1", 5790)), Path(1, ("198.51.100.1", 5790))
@@ -131,6 +132,31 @@ def test_relayed_path_that_becomes_suspect_is_reported(pair: Pair) -> None:
     assert [suspected(probing.update(pair.a.peer, now)) for now in (3.0, 3.1)] == [[LTE_A], []]
     pair.a.send(4.0)
     assert LTE_A in suspected(pair.a.timeout(4.0 + pair.a.peer.echo_after_s))
+
+
+def test_relays_are_asked_when_a_direct_path_from_their_socket_fails(pair: Pair) -> None:
+    """The NAT has perhaps forgotten both, and relayed paths are probed rarely."""
+    paths = pair.a.peer.paths
+    paths.configure([LTE, LTE_A, MESH_A], 1.0)
+    for path in (LTE, LTE_A, MESH_A):
+        answer(paths, path, 1.0)
+    paths.by_path[LTE].make_probe(3, 0, 1.0)
+    assert [suspected(probing.update(pair.a.peer, now)) for now in (3.0, 3.1)] == [[LTE_A], []]
+
+
+def test_new_relayed_path_carries_the_critical_envelopes_of_the_last_second(pair: Pair) -> None:
+    """Once, and of the current session: the path that they went along may have failed."""
+    sent = [pair.a.node.send(pair.a.peer, [b"\xfd" + bytes(20)], now, Class.CRITICAL) for now in (3.0, 4.0, 4.5)]
+    pair.a.node.send(pair.a.peer, [b"\xfd" + bytes(20)], 4.6, Class.STREAM)
+    resent = []
+    for path, number in ((LTE_A2, 5), (LTE_B, 6)):
+        paths, session = pair.a.peer.paths, pair.a.peer.sessions.current
+        assert session is not None
+        paths.configure([LTE_A, path], 4.6)
+        paths.by_path[path].make_probe(number, 0, 4.6)
+        out = probing.receive_probe(pair.a.peer, session, Probe(0, number, 0, 0), paths.by_path[path], 4.7)
+        resent.append([output.datagram for output in outputs_of(out, Transmit) if output.path == path])
+    assert resent == [[outputs_of(outputs, Transmit)[0].datagram for outputs in sent[1:]], []]
 
 
 def test_path_ends_with_its_handle(pair: Pair) -> None:

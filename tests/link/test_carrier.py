@@ -148,7 +148,10 @@ async def test_data_along_a_relay_is_unwrapped_or_dropped() -> None:
     assert scene.received == [(datagram, AT_A) for datagram in data]
     scene.received.clear()
     scene.relays.by_name = {"vps": None}
+    unknown: list[Path] = []
+    scene.relays.on_unknown_handle = lambda path, _: unknown.append(path)
     scene.read(*data)
+    assert unknown == [AT_A]
     assert scene.received == [(ENVELOPE + b"rest", relayed(AT_A.socket, "vps", 7)), (ENVELOPE, AT_A)]
     assert [reason for reason, *_ in scene.dropped] == [
         DropReason.RELAY_UNKNOWN_HANDLE,

@@ -94,6 +94,22 @@ def test_bind_that_is_answered_is_repeated_rarely(scene: Scene) -> None:
     assert scene.link.next_at == T + 1 + c.BIND_INTERVAL_S
 
 
+def test_data_with_an_unknown_handle_causes_a_bind(scene: Scene) -> None:
+    """A bound record was lost. An attacker that sends such data causes a few binds a second, and only at a relay."""
+    assert scene.binds(T)
+    scene.bound(T, (ONE, 5), (TWO, 6))
+    scene.link.on_unknown_handle(ELSEWHERE, T + 1)
+    assert not scene.binds(T + 1)
+    binds = 0
+    for number in range(1000):
+        now = T + 1 + number / 1000
+        scene.link.on_unknown_handle(AT_B, now)
+        if scene.binds(now):
+            binds += 1
+            scene.bound(now, (ONE, 5), (TWO, 6))
+    assert binds == 4
+
+
 def test_handles_are_paths_until_the_relay_ends_them(scene: Scene) -> None:
     """A record replaces the handles of the keys that it names, and of no others."""
     assert scene.binds(T)

@@ -139,10 +139,10 @@ class Drone:
             return nat.admits(destination, source, self._world.now)
         return socket not in self.nat_sockets or (destination, source) in self.contacted
 
-    def forget_mappings(self, socket: int) -> None:
+    def forget_mappings(self, socket: int, *, keeps_ports: bool = False) -> None:
         self._world.air.disturb(Endpoint(self.name, socket), self._world.now)
         self._world.note(f"{self.name}: the NAT of socket {socket} forgets")
-        self.nats[socket].forget()
+        self.nats[socket].forget(keeps_ports=keeps_ports)
 
     def datagram_for(self, datagram: bytes, path: Path) -> tuple[bytes, Address] | None:
         """What is sent along a path of the node, and where."""

@@ -298,6 +298,8 @@ class Member(Drone):
             taken = self.relays.handles.unwrap(path.socket, datagram, path.address)
             if isinstance(taken, DropReason):
                 self.drops[taken] += 1
+                if taken is DropReason.RELAY_UNKNOWN_HANDLE:
+                    self.relays.on_unknown_handle(path, self.local_now)
                 return
             datagram, path = taken
         super().receive(datagram, path)

@@ -50,6 +50,10 @@ class Nat:
             for mapping in self._mappings.values()
         )
 
-    def forget(self) -> None:
-        """Forget all mappings, as after a restart of the device."""
-        self._mappings.clear()
+    def forget(self, *, keeps_ports: bool = False) -> None:
+        """Forget all mappings, as after a restart of the device. ``keeps_ports``: new ones get the same ports."""
+        if keeps_ports:
+            for mapping in self._mappings.values():
+                mapping.contacted.clear()
+        else:
+            self._mappings.clear()

@@ -65,9 +65,11 @@ def ask(peer: Peer, session: Session, state: PathState, now: float) -> list[Outp
 def wants_question(state: PathState, now: float, least_s: float = 0.0) -> bool:
     """Whether to ask along a path because an envelope came along it: it does not work here, and may now.
 
-    ``least_s``: between questions that are datagrams of their own, if the network has a budget.
+    ``least_s``: between questions that are datagrams of their own, if the network has a budget. The first question
+    to a learned path may have been longer than what had come from there. It is sent when more comes.
     """
-    return not state.works and now >= state.questioned_at + max(c.PROBE_FAST_S, least_s)
+    is_due = not state.datagrams_sent or now >= state.questioned_at + max(c.PROBE_FAST_S, least_s)
+    return is_due and not state.works
 
 
 def ask_candidates(peer: Peer, now: float) -> list[Output]:

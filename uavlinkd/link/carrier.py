@@ -175,6 +175,9 @@ class FrameCarrier:
                 return None
             if inside is not None:
                 self._drop_datagram(inside, path=path)
+                if inside is DropReason.RELAY_UNKNOWN_HANDLE:
+                    relays.on_unknown_handle(path, monotonic())
+                    self.arm()
                 return None
         elif relays.by_name:
             if not relays.filter_tests.take_token(data, path):

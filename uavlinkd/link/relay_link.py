@@ -285,6 +285,16 @@ class RelayLink:
             self._failed.add(path)
         self._schedule()
 
+    def on_unknown_handle(self, at: Path, now: float) -> None:
+        """Data came with a handle that this daemon does not know: a bound record may be lost, so bind again.
+
+        An attacker can send such data too. It causes a bind each :data:`ASK_S` at most, and none before an answer.
+        """
+        binding = self._bindings.get(at)
+        if binding is not None and not binding.unanswered and now >= binding.bound_at + ASK_S:
+            self._hurry(binding)
+            self._schedule()
+
     def do_due(self, now: float) -> list[o.Output]:
         """Ask and bind. Call it at :attr:`next_at`."""
         out = self.forget_previous_key(now) if self._is_confirmed else []
@@ -293,9 +303,10 @@ class RelayLink:
         sockets = {socket for socket in asks if now >= self._asked_at.get(socket, -NEVER) + ASK_S}
         self._asked_at |= dict.fromkeys(sockets, now)
         for path in [state.path for state in self._states() if state.path.socket in sockets]:
-            out += self._node.ask(self.peer, path, now)
+            # The bind is longer than a question: the relay may ask a new address of this daemon at once.
             if keys := self._keys_of(failed, path)[: c.KEYS_PER_BIND]:
                 out += self._node.send_record(self.peer, path, Bind(keys), now)
+            out += self._node.ask(self.peer, path, now)
         for binding in self._working():
             if now >= binding.due_at and self.keys:
                 binding.note_sent(self.keys, now)

@@ -282,6 +282,11 @@ class Relays:
         elif (relay := self._relay_of(event.path)) is not None:  # ask it on the same socket, bind the peer again
             relay.ask(event.path)
 
+    def on_unknown_handle(self, path: Path, now: float) -> None:
+        """Data with a handle that is not known here came along a path, perhaps that of a relay."""
+        for relay in self.by_name.values():
+            relay.on_unknown_handle(path, now)
+
     def _write(self, name: str, event: o.Event, now: float) -> None:
         """Log that a relay is reached or lost."""
         if not isinstance(event, o.PeerUp | o.PeerLost | o.PeerClosed):
