@@ -28,7 +28,7 @@ class OutgoingFrames:
 
     def __init__(self, dropped: Counter[str], delivered: DeliveredStream) -> None:
         self._dropped = dropped
-        self._admit = delivered.admit
+        self._delivered = delivered
         self.queue = FairQueue(self._on_drop)  # the frames that are not committed
         self._committed = b""
         self._ends: deque[int] = deque()  # sizes of the committed frames; for the first, of its unwritten rest
@@ -44,7 +44,7 @@ class OutgoingFrames:
 
     def commit(self, frames: Sequence[Frame], source: Source, now: float) -> None:
         """Commit these frames without queueing. Call it only while the queue is empty."""
-        admit = self._admit
+        admit = self._delivered.admit
         parts = [data for frame in frames if (data := admit(frame, source, now))]
         self._ends.extend(map(len, parts))
         self._committed += b"".join(parts)
@@ -57,7 +57,10 @@ class OutgoingFrames:
         held += len(self._committed)
         parts = []
         while (popped := self.queue.pop(limit - held if held else inf, now)) is not None:
-            if data := self._admit(*popped, now):
+            opened_by = self._delivered.opened_by
+            if data := self._delivered.admit(*popped, now):
+                if opened_by is not None and (added := len(data) - len(popped[0].raw)):
+                    self.queue.charge(opened_by, added)
                 parts.append(data)
                 self._ends.append(len(data))
                 held += len(data)

@@ -1,7 +1,7 @@
 """The common part of TCP and serial endpoints: frames in byte streams, and a bounded wait for slow clients.
 
-Frames that the kernel does not accept at once wait in a queue of their connection (:mod:`.outgoing`): urgent frames
-first, a fair share for each source, only the newest state. The kernel holds few bytes, because frames there can be
+Frames that the kernel does not accept at once wait in a queue of their connection (:mod:`.outgoing`): a fair
+share for each source, urgent frames first, only the newest state. The kernel holds few bytes, because frames there can be
 neither dropped nor overtaken.
 """
 

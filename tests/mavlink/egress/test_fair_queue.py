@@ -10,14 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.policies import TRUSTED
-from tests.samples import attitude, battery, command, file_part, heartbeat, parameter
+from tests.samples import attitude, battery, command, file_part, heartbeat, manual_control, parameter
 from uavlinkd.mavlink.egress.fair_queue import (
     LANE_BYTES,
     MAX_SOURCES,
     QUEUE_BYTES,
     SUPERSEDED_S,
-    URGENT_LEAD_BYTES,
-    URGENT_PART,
     FairQueue,
 )
 from uavlinkd.mavlink.egress.lanes import EgressDrop
@@ -67,10 +65,18 @@ def test_frame_that_does_not_fit_stays() -> None:
 
 
 @pytest.mark.parametrize(
-    "flood", [lambda n: attitude(n, n % 200 + 1), lambda n: battery(n, n % 250), parameter, file_part]
+    "flood",
+    [
+        lambda n: attitude(n, n % 200 + 1),
+        lambda n: battery(n, n % 250),
+        parameter,
+        file_part,
+        lambda n: heartbeat(n, 2, n % 250 + 1),
+        lambda n: (heartbeat, attitude)[n % 2](n, n % 12 + 1),
+    ],
 )
 def test_sources_share_by_bytes(flood: Callable[[int], Frame]) -> None:
-    """Half of the bytes each, however large the frames are, and however many flows one of the sources invents."""
+    """Half of the bytes each, however large or urgent the frames are, and however many flows one source invents."""
     queue, _ = make()
     queue.put([flood(number) for number in range(400)], CAPTURED, 0.0)
     queue.put([parameter(number) for number in range(400)], HONEST, 0.0)
@@ -87,22 +93,13 @@ def test_flood_of_urgent_frames_shares_with_urgent_frames() -> None:
     assert abs(sums[HONEST] - sums[CAPTURED]) <= 100
 
 
-def test_flood_of_urgent_frames_leaves_a_part_to_the_rest() -> None:
-    """A mission upload or a position of another source goes on during a flood of heartbeats."""
+def test_urgent_frames_have_half_of_the_line_beside_many_sources() -> None:
+    """A joystick is not reduced to the share of one of fifty members that send positions."""
     queue, _ = make()
-    queue.put([heartbeat(number, 2, number % 250 + 1) for number in range(2000)], CAPTURED, 0.0)
-    queue.put([parameter(number) for number in range(100)], HONEST, 0.0)
-    sums = bytes_by_source(popped(queue, 8000))
-    assert sums[HONEST] == pytest.approx((8000 - URGENT_LEAD_BYTES) / (URGENT_PART + 1), abs=100)
-
-
-def test_burst_of_commands_is_not_interrupted() -> None:
-    """The rest gets its file_part only after the urgent frames' head start."""
-    queue, _ = make()
-    queue.put([parameter(number) for number in range(100)], HONEST, 0.0)
-    commands = [command(number) for number in range(URGENT_LEAD_BYTES // len(command(0).raw))]
-    queue.put(commands, CAPTURED, 0.0)
-    assert [item for item, _ in popped(queue)[: len(commands)]] == commands
+    for member in range(50):
+        queue.put([parameter(number) for number in range(20)], Source(f"member{member}", GATE), 0.0)
+    queue.put([manual_control(number) for number in range(300)], HONEST, 0.0)
+    assert bytes_by_source(popped(queue, 8000))[HONEST] == pytest.approx(4000, abs=300)
 
 
 def test_source_that_was_idle_has_saved_nothing_up() -> None:

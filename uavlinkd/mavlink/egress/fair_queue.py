@@ -1,13 +1,13 @@
-"""The frames that wait for one slow local client: urgent ones first, and for each source its fair share of the bytes.
+"""The frames that wait for one slow local client: for each source its fair share of the bytes, urgent ones first.
 
 A captured member may send everything that its policy allows, as fast as its link carries it. It can invent component
 ids and instances, so with fairness between flows alone it would get almost all bytes. Therefore a frame's turn
 depends on its *source* first, and on lane and flow within the source after that:
 
-* Urgent frames of all sources go first. While other frames wait too, urgent ones get three of
-  four bytes, so a flood of HEARTBEAT stops neither a mission upload nor positions.
-* In both classes the source that was sent the fewest bytes is next, counted from when it began to wait (start-time
-  fair queueing). A source that asks for less than its share waits for at most one frame of each other source.
+* The source that was sent the fewest bytes is next, counted from when it began to wait (start-time fair queueing). A
+  source that asks for less than its share waits for the frame that is on the line, and for no other.
+* An urgent frame goes before others, unless its source was sent more than theirs: then the two classes share equally.
+  So a flood of HEARTBEAT stops neither a mission upload nor positions, and many sources of positions no joystick.
 * Within a source the lanes and flows take turns (:mod:`.lanes`).
 * A newer state replaces an older one that has waited for ``SUPERSEDED_S``: counted as THINNED. Up to then both are
   delivered, since one envelope may carry several of a flow and the client may have room for all.
@@ -26,7 +26,7 @@ from typing import Final
 
 from uavlinkd.mavlink.dialect import Lane
 from uavlinkd.mavlink.egress.lanes import EgressDrop, Lanes, OnDrop, Waiting
-from uavlinkd.mavlink.frames import Frame
+from uavlinkd.mavlink.frames import MAX_FRAME_BYTES, Frame
 from uavlinkd.mavlink.policy.delivery import Source
 
 SUPERSEDED_S: Final = 0.1
@@ -41,30 +41,28 @@ MAX_FLOWS: Final = 256
 """Flows of one source that are remembered while none of their frames waits."""
 MAX_SOURCES: Final = 64
 """Sources that are remembered while none of their frames waits."""
-URGENT_PART: Final = 3
-"""Bytes of urgent frames for each byte of others, while both wait."""
-URGENT_LEAD_BYTES: Final = 1024
-"""So many bytes of urgent frames go first before that ratio holds: a burst of commands is not interrupted."""
+MOST_AHEAD: Final = MAX_FRAME_BYTES
+"""A source, or a class of frames, is ahead of others by so many bytes at most. What exceeds that is forgiven."""
 
 
 @dataclass(slots=True, eq=False)
 class _Place:
-    """Where one source is in the line of one class of frames."""
+    """The frames of one class of one source."""
 
     frames: _SourceFrames
     next_frame: Callable[[], Waiting | None]
     """The source's next frame of this class."""
-    paid: float = 0.0  # on the line's clock, in bytes
     is_in_line: bool = False
 
 
 class _SourceFrames:
     """What waits of one source."""
 
-    __slots__ = ("lanes", "rest", "source", "urgent")
+    __slots__ = ("lanes", "rest", "sent", "source", "urgent")
 
     def __init__(self, source: Source, on_drop: OnDrop) -> None:
         self.source = source
+        self.sent = 0  # bytes, on the clock of the queue
         self.lanes = Lanes(LANE_BYTES, MAX_FLOWS, _is_superseded, on_drop)
         self.urgent = _Place(self, self.lanes.next_urgent)
         self.rest = _Place(self, self.lanes.next_of_the_rest)
@@ -75,45 +73,34 @@ def _is_superseded(waiting: Waiting, newer: Frame, now: float) -> bool:
 
 
 class _Line:
-    """Whose turn it is in one class of frames. The clock counts the bytes that each waiting source was sent."""
+    """The sources with frames of one class, the one that was sent the fewest bytes first."""
 
-    __slots__ = ("_clock", "_heap", "_most_paid", "_number")
+    __slots__ = ("_heap", "_number")
 
     def __init__(self) -> None:
-        self._clock = 0.0
-        self._most_paid = 0.0
-        self._heap: list[tuple[float, int, _Place]] = []
+        self._heap: list[tuple[int, int, _Place]] = []
         self._number = 0
 
     def join(self, place: _Place) -> None:
-        """A frame of this source waits. A source that was idle has no credit, and owes the bytes that it was sent."""
+        """A frame of this source waits."""
         if not place.is_in_line:
             place.is_in_line = True
             self._number += 1
-            heappush(self._heap, (max(self._clock, place.paid), self._number, place))
+            heappush(self._heap, (place.frames.sent, -self._number, place))  # before others that were sent as much
 
-    def next(self) -> tuple[_Place, Waiting] | None:
+    def next(self) -> tuple[_SourceFrames, Waiting] | None:
         """The frame whose turn it is."""
         while self._heap:
-            place = self._heap[0][2]
-            if (waiting := place.next_frame()) is not None:
-                return place, waiting
-            heappop(self._heap)
-            place.is_in_line = False
-        self._clock = self._most_paid  # no source waits: no source owes anything
+            sent, _, place = self._heap[0]
+            if (waiting := place.next_frame()) is None:
+                heappop(self._heap)
+                place.is_in_line = False
+            elif sent == place.frames.sent:
+                return place.frames, waiting
+            else:
+                self._number += 1
+                heapreplace(self._heap, (place.frames.sent, self._number, place))
         return None
-
-    def charge(self, size: int) -> None:
-        """The frame that :meth:`next` returned is sent."""
-        self._clock, _, place = self._heap[0]
-        place.paid = self._clock + size
-        self._most_paid = max(self._most_paid, place.paid)
-        self._number += 1
-        heapreplace(self._heap, (place.paid, self._number, place))
-
-    def owes(self, place: _Place) -> bool:
-        """Whether the source is ahead of others, or waits."""
-        return place.is_in_line or place.paid > self._clock
 
 
 class FairQueue:
@@ -132,13 +119,16 @@ class FairQueue:
         self._sources_limit = MAX_SOURCES
         self._urgent = _Line()
         self._rest = _Line()
-        self._lead = 0  # bytes of urgent frames beyond their part, while others wait
+        self._clock = 0  # what the source that was sent the fewest bytes had been sent, at the last turn
+        self._lead = 0  # bytes of urgent frames beyond those of others, while both wait
 
     def put(self, frames: Sequence[Frame], source: Source, now: float) -> None:
         """Have frames of one source wait, in their order."""
         waiting = self._sources.get(source) or self._add(source)
         lanes = waiting.lanes
         lanes.drop_stale(now, MAX_AGE_S)
+        if not lanes.count:  # a source that was idle has no credit, and owes the bytes that it was sent
+            waiting.sent = max(waiting.sent, self._clock)
         for frame in frames:
             self.count += 1
             self.size += len(frame.raw)
@@ -159,22 +149,25 @@ class FairQueue:
         turn = self._turn(now)
         if turn is None:
             return None
-        place, waiting = turn
+        frames, waiting = turn
         frame = waiting.frame
         size = len(frame.raw)
         if size > room:
             return None
-        if waiting.flow.lane is Lane.URGENT:
-            self._lead = self._lead + size if self._rest.next() is not None else 0
-            self._urgent.charge(size)
-        else:
-            others_wait = self._urgent.next() is not None
-            self._lead = max(0, self._lead - URGENT_PART * size) if others_wait else 0
-            self._rest.charge(size)
-        place.frames.lanes.serve(waiting, now)
+        urgent, rest = self._urgent.next(), self._rest.next()
+        self._clock = min(waiters[0].sent for waiters in (urgent, rest) if waiters)
+        self.charge(frames.source, size)
+        lead = size if waiting.flow.lane is Lane.URGENT else -size
+        self._lead = max(-MOST_AHEAD, min(self._lead + lead, MOST_AHEAD)) if urgent and rest else 0
+        frames.lanes.serve(waiting, now)
         self.count -= 1
         self.size -= size
-        return frame, place.frames.source
+        return frame, frames.source
+
+    def charge(self, source: Source, size: int) -> None:
+        """Count bytes that are sent because of this source."""
+        if (frames := self._sources.get(source)) is not None:
+            frames.sent = min(frames.sent + size, self._clock + MOST_AHEAD)
 
     def drop_stale(self, now: float) -> None:
         """Drop the frames that have waited too long."""
@@ -186,14 +179,16 @@ class FairQueue:
         for source in self._sources.values():
             source.lanes.clear()
 
-    def _turn(self, now: float) -> tuple[_Place, Waiting] | None:
-        """The frame that goes next, and its source's place. It is not stale."""
+    def _turn(self, now: float) -> tuple[_SourceFrames, Waiting] | None:
+        """The frame that goes next, and what waits of its source. It is not stale."""
         while True:
-            turn = self._rest.next() if self._lead >= URGENT_LEAD_BYTES else None
-            turn = turn or self._urgent.next() or self._rest.next()
+            urgent, rest = self._urgent.next(), self._rest.next()
+            turn = urgent or rest
+            if urgent and rest and self._lead >= 0 and rest[0].sent < urgent[0].sent:
+                turn = rest
             if turn is None or now - turn[1].put_at <= MAX_AGE_S:
                 return turn
-            turn[0].frames.lanes.drop_stale(now, MAX_AGE_S)
+            turn[0].lanes.drop_stale(now, MAX_AGE_S)
 
     def _add(self, source: Source) -> _SourceFrames:
         if len(self._sources) >= self._sources_limit:
@@ -204,7 +199,7 @@ class FairQueue:
 
     def _is_needed(self, frames: _SourceFrames) -> bool:
         """Whether a source must be remembered."""
-        return bool(frames.lanes.count) or self._urgent.owes(frames.urgent) or self._rest.owes(frames.rest)
+        return bool(frames.lanes.count) or frames.sent > self._clock
 
     def _on_drop(self, waiting: Waiting, reason: EgressDrop) -> None:
         self.count -= 1

@@ -91,6 +91,11 @@ class DeliveredStream:
         self._due_at = 0  # the tail's length at which the first of them may be complete
         self._authors: list[tuple[int, Source | None]] = []  # up to where in it whose bytes go; None: a separator
 
+    @property
+    def opened_by(self) -> Source | None:
+        """The source of the first frame that may still be open: separator bytes are put there because of it."""
+        return self._authors[0][1] if self._authors else None
+
     def admit(self, frame: Frame, source: Source, now: float) -> bytes:
         """The bytes to deliver for a frame: itself, perhaps behind separator bytes. None of them: it is refused."""
         raw = frame.raw
