@@ -1,8 +1,8 @@
 """The common part of TCP and serial endpoints: frames in byte streams, and a bounded wait for slow clients.
 
-Frames that the kernel does not accept at once wait in a queue of their connection (:mod:`.outgoing`): a fair
-share for each source, urgent frames first, only the newest state. The kernel holds few bytes, because frames there can
-be neither dropped nor overtaken.
+Frames that the kernel does not accept at once wait in a queue of their connection (:mod:`.outgoing`): a fair share of
+bytes for each source, urgent frames first, only the newest state. The kernel holds few bytes, because frames there
+can be neither dropped nor overtaken.
 """
 
 from __future__ import annotations
