@@ -23,14 +23,15 @@ from uavlinkd.core.outputs import Dropped
 from uavlinkd.core.path import Path
 from uavlinkd.core.refusals import RefusalReport, Refused
 from uavlinkd.core.sessions import Twin
+from uavlinkd.endpoints.url import parse_url
 from uavlinkd.link import diagnosis, down_problems
 from uavlinkd.link.evidence import OWN_FRAMES_S, History
 from uavlinkd.link.peer_link import PeerLink
-from uavlinkd.link.traffic_problems import SECURITY_S
+from uavlinkd.link.traffic_problems import SECURITY_S, has_no_client
 from uavlinkd.mavlink.frames import split_payload
 from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.mavlink.routing import Router
-from uavlinkd.ops.findings import Finding, Severity
+from uavlinkd.ops.findings import Finding, Severity, Subject
 
 NOW = 1.0
 ARM = mavlink.MAV_CMD_COMPONENT_ARM_DISARM
@@ -405,3 +406,27 @@ def test_key_on_two_machines_is_named_for_ten_minutes(daemon: Daemon) -> None:
 
 
 # Local endpoints.
+
+
+@pytest.mark.parametrize(
+    ("url", "cause"),
+    [
+        ("udpin:127.0.0.1:14550", "no_client"),
+        ("serial:/dev/absent:57600", "device_unavailable"),
+        ("tcp:127.0.0.1:5760", "client_unreachable"),
+    ],
+)
+def test_frames_cannot_pass_without_any_client(daemon: Daemon, url: str, cause: str) -> None:
+    """From 5 s on, unless one endpoint has a client, also one that only listens. A hub has no endpoint."""
+    for name in ("autopilot", "companion"):
+        daemon.local.append(SimpleNamespace(name=name, ports=[]))
+        daemon.parts.config.endpoints.append(SimpleNamespace(name=name, url=parse_url(url), policy={}))
+    assert not has_no_client(diagnosis.find(daemon.parts, 4.9), 2)
+    found = diagnosis.find(daemon.parts, 5.0)
+    assert [one.cause for one in found if one.subject is Subject.ENDPOINT] == [cause, cause]
+    assert has_no_client(found, 2)
+    daemon.local[0].ports = [SimpleNamespace(name="127.0.0.1:40000")]
+    found = diagnosis.find(daemon.parts, 5.0)
+    assert "client_silent" in {one.cause for one in found}
+    assert not has_no_client(found, 2)
+    assert not has_no_client([], 0)

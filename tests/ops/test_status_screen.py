@@ -70,6 +70,7 @@ def status_of(peers: dict[str, dict[str, Any]], **facts: object) -> dict[str, An
         "name": "drone0",
         "frames_pass": all(peer["state"] == "up" for peer in peers.values()),
         **{key: [] for key in ("blocked", "findings")},
+        "has_no_client": False,
         "peers": peers,
         **{key: {} for key in ("endpoints", "networks", "relays", "drops", "send_failures", "stale")},
         "relay": None,
@@ -123,6 +124,7 @@ USED = {"state": "up", "peer": None, "round_trip_s": 0.0123, "peers": {"drone1":
             {},
             "rssi 200/190, noise 50/60, modem 10 % full",
         ),
+        ({"has_no_client": True}, {}, "1 of 1 peers up, no endpoint has a client"),
         ({"relays": {"vps": USED}}, {}, "relay vps: up, 12 ms; drone1 bound, drone2 waiting"),
     ],
 )

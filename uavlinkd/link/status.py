@@ -14,6 +14,7 @@ from uavlinkd.link.diagnosis import find
 from uavlinkd.link.parts import DaemonParts
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.relay_link import RelayLink
+from uavlinkd.link.traffic_problems import has_no_client
 from uavlinkd.mavlink.dialect import command_name, name_of
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import ANY_OTHER, REFUSALS, Refusal
@@ -29,10 +30,12 @@ WayOf = Callable[[Path], tuple[str | None, SocketAddress | None]]
 def daemon_status(daemon: DaemonParts, now: float) -> dict[str, object]:
     """The status of the whole daemon. Times are ages in seconds. A client computes rates from two of these.
 
-    ``frames_pass``: every peer is up, and within the last 10 s no traffic was wholly refused. ``blocked`` names it.
+    ``frames_pass``: every peer is up, within the last 10 s no traffic was wholly refused (``blocked`` names it), and
+    clients are not all absent (``has_no_client``).
     """
     node = daemon.node
-    blocked = daemon.history.blocked(now)
+    blocked, findings = daemon.history.blocked(now), find(daemon, now)
+    is_cut_off = has_no_client(findings, len(daemon.local.endpoints))
     all_up = (bool(daemon.links) or daemon.config.is_only_relay) and all(
         link.peer.is_up for link in daemon.links.values()
     )
@@ -41,9 +44,10 @@ def daemon_status(daemon: DaemonParts, now: float) -> dict[str, object]:
         "name": daemon.config.name,
         "public_key": encode_key(node.public_key),
         "monotonic_s": now,
-        "frames_pass": all_up and not blocked,
+        "frames_pass": all_up and not blocked and not is_cut_off,
         "blocked": [dict(zip(("subject", "name", "direction"), key, strict=True)) for key in blocked],
-        "findings": [finding.as_json() for finding in find(daemon, now)],
+        "has_no_client": is_cut_off,
+        "findings": [finding.as_json() for finding in findings],
         "peers": {name: peer_status(link, now, daemon.peer_sockets.way_of) for name, link in daemon.links.items()},
         "relays": {name: used_relay_status(relay, daemon, now) for name, relay in daemon.relays.by_name.items()},
         "networks": daemon.peer_sockets.network_status(now),

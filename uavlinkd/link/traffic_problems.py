@@ -19,6 +19,7 @@ from uavlinkd.link.facts import EndpointFacts, Found, PartFacts, PeerFacts, faul
 from uavlinkd.mavlink.dialect import GROUPS, IDS, command_name, name_of
 from uavlinkd.mavlink.policy.gate import ANY_OTHER, REFUSALS, Gate, Refusal
 from uavlinkd.mavlink.policy.roles import ROLES
+from uavlinkd.ops.findings import Finding
 from uavlinkd.ops.log import shown
 from uavlinkd.system.error_meanings import meaning_of
 
@@ -34,6 +35,8 @@ SILENT_S: Final = 5.0
 """An endpoint without frames for this time is reported: MAVLink clients send a heartbeat every second. Its errors
 count for the same time. It is opened again more often."""
 
+_WITHOUT_CLIENT: Final = frozenset({"garbage", "device_unavailable", "no_client", "client_unreachable"})
+"""Why no frame passes between an endpoint and a client. A silent client may listen."""
 _BY_RULE: Final = frozenset({Refusal.MESSAGE_NOT_ALLOWED, Refusal.COMMAND_NOT_ALLOWED, Refusal.RATE_LIMITED})
 _FLIGHT_COMMANDS: Final = frozenset(
     {"MAV_CMD_COMPONENT_ARM_DISARM", "MAV_CMD_NAV_TAKEOFF", "MAV_CMD_NAV_LAND", "MAV_CMD_NAV_RETURN_TO_LAUNCH"}
@@ -262,6 +265,11 @@ def endpoint_problems(endpoint: EndpointFacts) -> Iterator[Found]:
     yield from _commands(endpoint)
     if endpoint.now - endpoint.history.silent_since >= SILENT_S:
         yield _silent(endpoint)
+
+
+def has_no_client(findings: Iterable[Finding], endpoints: int) -> bool:
+    """Whether there are so many endpoints, and by the findings none of them has a client."""
+    return 0 < endpoints == sum(one.cause in _WITHOUT_CLIENT for one in findings)
 
 
 def _silent(endpoint: EndpointFacts) -> Found:

@@ -111,6 +111,8 @@ def _headline(status: Status) -> Text:
     for blocked in status["blocked"]:
         towards = "from" if blocked["direction"] == "in" else "to"
         text.append(f", all frames {towards} {blocked['name']} are refused", style="bold red")
+    if status["has_no_client"]:
+        text.append(", no endpoint has a client", style="bold red")
     return text
 
 
