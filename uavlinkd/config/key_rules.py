@@ -58,7 +58,9 @@ def _public_keys(file: Sections) -> Found:
             text = f"holds the public key of {section.at()}, not a private key: make this daemon's own with"
             yield "private_key_file", f"{text} `uavlinkd keygen`"
         elif key in (own, previous):
-            yield section.at("public_key"), f"is this daemon's own {'' if key == own else 'previous '}key: {there}"
+            which, file_key = ("", "private_key_file") if key == own else ("previous ", "previous_private_key_file")
+            or_else = f"; or {file_key} is that of the {section.kind}: carry each key file to its own machine"
+            yield section.at("public_key"), f"is this daemon's own {which}key: {there}{or_else}"
         elif half == own:
             remedy = f"move its file away, make a new one with `uavlinkd keygen`, and {there}"
             yield section.at("public_key"), f"is this daemon's private key, which must stay secret: {remedy}"

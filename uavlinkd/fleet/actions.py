@@ -10,6 +10,7 @@ from dataclasses import fields
 from uavlinkd.fleet import operations
 from uavlinkd.fleet.manifest import DEFAULT_PLAN, NO_PLAN, FleetError, FleetSettings, MemberKind
 from uavlinkd.fleet.operations import Result
+from uavlinkd.mavlink.dialect import SYSTEM_ID
 from uavlinkd.system.addresses import Address, AddressError, parse_address
 from uavlinkd.system.terminal import OK, printable
 
@@ -75,8 +76,8 @@ def _print_result(options: argparse.Namespace, result: Result) -> None:
     if result.changed:
         _print(f"\nChanged in {options.out}: {changed}. Carry each to its owner so that no other person can read it.")
         _print(
-            "Set SYSID_THISMAV, MAV_SYSID or MAV_SYS_ID of each autopilot, and the id of each ground control station,"
-            " to the id above: peers refuse frames with another id."
+            f"Set {SYSTEM_ID} of each autopilot, and the id of each ground control station, to the id above: peers"
+            " refuse frames with another id."
         )
         # The units make this folder.
         is_service = result.fleet.settings.control_socket.startswith("/run/uavlinkd/{name}/")

@@ -44,29 +44,29 @@ class Moment:
         self.has_sole_waiting = sum(not link.config.addresses for link in self.down) == 1
         """Whether one peer without addresses is not up: a sender at an unknown address may be this one."""
 
-    def owner(self, system: int, link: PeerLink) -> str | None:
-        """Another peer than this one, or an endpoint here, that has a MAVLink system id."""
-        return next((name for owner, name in self._owners.get(system, ()) if owner is not link), None)
+    def owner(self, system: int, other_than: str) -> str | None:
+        """A peer, or an endpoint here, that has a MAVLink system id, except the one of this name."""
+        return next((name for name in self._owners.get(system, ()) if name != other_than), None)
 
     @cached_property
-    def _owners(self) -> Mapping[int, list[tuple[PeerLink | None, str]]]:
+    def _owners(self) -> Mapping[int, list[str]]:
         """By the file, or because frames of the system were received. Looked up once for all peers."""
-        owners: dict[int, list[tuple[PeerLink | None, str]]] = {}
-        for system, link, name in self._systems():
-            owners.setdefault(system, []).append((link, name))
+        owners: dict[int, list[str]] = {}
+        for system, name in self._systems():
+            owners.setdefault(system, []).append(name)
         return owners
 
-    def _systems(self) -> Iterator[tuple[int, PeerLink | None, str]]:
+    def _systems(self) -> Iterator[tuple[int, str]]:
         links, router = self.daemon.links.values(), self.daemon.switch.router
         for link in links:
             for system in link.policy.incoming.systems or ():
-                yield system, link, link.name
+                yield system, link.name
         for endpoint in self.daemon.local.endpoints:
             for system in {system for port in endpoint.ports for system, _ in router.addresses(port)}:
-                yield system, None, f"endpoint {endpoint.name}"
+                yield system, f"endpoint {endpoint.name}"
         for link in links:
             for system in {system for system, _ in router.addresses(link)}:
-                yield system, link, link.name
+                yield system, link.name
 
 
 class PartFacts:
@@ -75,6 +75,8 @@ class PartFacts:
     def __init__(self, moment: Moment, kind: str, name: str, rules: Mapping[str, object]) -> None:
         self.moment, self.daemon, self.now = moment, moment.daemon, moment.now
         self.name = name
+        self.owner = name if kind == "peer" else f"{kind} {name}"
+        """Its name among those that have system ids."""
         self.history = moment.daemon.history.part(kind, name)
         self.rules = rules
         """Its policy, as the file has it,"""

@@ -16,7 +16,7 @@ from uavlinkd.core.sessions import Twin
 from uavlinkd.endpoints.url import EndpointKind
 from uavlinkd.link.evidence import GateHistory
 from uavlinkd.link.facts import EndpointFacts, Found, PartFacts, PeerFacts, fault, listed, security, warning
-from uavlinkd.mavlink.dialect import GROUPS, IDS, command_name, name_of
+from uavlinkd.mavlink.dialect import GROUPS, IDS, SYSTEM_ID, command_name, name_of
 from uavlinkd.mavlink.policy.gate import ANY_OTHER, REFUSALS, Gate, Refusal
 from uavlinkd.mavlink.policy.roles import ROLES
 from uavlinkd.ops.findings import Finding
@@ -108,42 +108,42 @@ def up_problems(peer: PeerFacts) -> Iterator[Found]:
             " control are held and dropped; reports pass and may be old",
             "fly by other means until answers return; look for a bad radio in the direction to it",
         )
-    blocked, incoming = peer.history.blocked(peer.now), peer.history.incoming
-    foreign = incoming.systems.within(REFUSED_S, peer.now)
-    only_foreign = {*incoming.reasons.within(REFUSED_S, peer.now)} == {Refusal.FOREIGN_SYSTEM}
-    if foreign and "in" not in blocked:
-        yield warning("other_system", *_about_systems(peer, foreign, "some of its frames are"))
-    elif foreign and only_foreign:
-        yield fault("foreign_system", *_about_systems(peer, foreign, "all its frames are"))
-    if exchanged := list(_roles_exchanged(peer, is_blocked=bool(blocked))):
-        yield from exchanged
-    else:
-        yield from _all_refused(peer, [one for one in blocked if one != "in" or not only_foreign])
+    exchanged = list(_roles_exchanged(peer, is_blocked=bool(peer.history.blocked(peer.now))))
+    yield from (one for one in _refused(peer) if not exchanged or one.cause != "all_refused")
+    yield from exchanged
     yield from _commands(peer)
 
 
-def _about_systems(peer: PeerFacts, systems: Mapping[int, int], which: str) -> tuple[str, str]:
+def _about_systems(part: PartFacts, systems: Mapping[int, int], which: str) -> tuple[str, str]:
     """The text and the remedy."""
-    allowed = peer.rules.get("system_ids")
+    allowed = part.rules.get("system_ids")
     ids = listed(map(str, allowed)) if isinstance(allowed, list | tuple) else str(allowed)
     text = f"{which} of system {listed(map(str, sorted(systems)), 8)}; its system_ids here are {ids}"
-    own = f"set SYSID_THISMAV or MAV_SYSID (ArduPilot), or MAV_SYS_ID (PX4), of its autopilot to {ids}"
-    if owned := _owned(peer, systems):  # never advise to trust one peer as another
+    own = f"set {SYSTEM_ID} of its autopilot to {ids}"
+    if owned := _owned(part, systems):  # never advise to trust one peer as another
         whose = listed(f"{system} is {owner}'s" for system, owner in owned.items())
         return text, f"{own}: {whose}"
-    return text, f"{own}; or, only if you know that {peer.name} has this id, write it into system_ids"
+    return text, f"{own}; or, only if you know that {part.owner} has this id, write it into its system_ids"
 
 
-def _owned(peer: PeerFacts, systems: Iterable[int]) -> dict[int, str]:
-    """Those of the systems that belong to another than this peer, with its name."""
-    owners = {system: peer.moment.owner(system, peer.link) for system in sorted(systems)}
+def _owned(part: PartFacts, systems: Iterable[int]) -> dict[int, str]:
+    """Those of the systems that belong to another than this peer or endpoint, with its name."""
+    owners = {system: part.moment.owner(system, part.owner) for system in sorted(systems)}
     return {system: owner for system, owner in owners.items() if owner is not None}
 
 
-def _all_refused(part: PartFacts, blocked: Sequence[str]) -> Iterator[Found]:
-    for direction, gate in (("in", part.history.incoming), ("out", part.history.outgoing)):
+def _refused(part: PartFacts) -> Iterator[Found]:
+    """Frames of other systems; and all frames in one direction, for another reason."""
+    blocked, incoming = part.history.blocked(part.now), part.history.incoming
+    foreign = incoming.systems.within(REFUSED_S, part.now)
+    only_foreign = {*incoming.reasons.within(REFUSED_S, part.now)} == {Refusal.FOREIGN_SYSTEM}
+    if foreign and "in" not in blocked:
+        yield warning("other_system", *_about_systems(part, foreign, "some of its frames are"))
+    elif foreign and only_foreign:
+        yield fault("foreign_system", *_about_systems(part, foreign, "all its frames are"))
+    for direction, gate in (("in", incoming), ("out", part.history.outgoing)):
         reasons = gate.reasons.within(REFUSED_S, part.now)
-        if reasons and direction in blocked:
+        if reasons and direction in blocked and not (direction == "in" and only_foreign):
             which = "from it" if direction == "in" else "to it"
             yield fault(
                 "all_refused",
@@ -236,8 +236,8 @@ def _refused_there(peer: PeerFacts, claims: list[Claim]) -> Found:
     foreign = {REFUSALS.get(claim.refused.reason) is Refusal.FOREIGN_SYSTEM for claim in claims}
     if True in foreign:
         remedies.append(
-            "set SYSID_THISMAV, MAV_SYSID or MAV_SYS_ID of the client here to an id in system_ids for"
-            f" {here} in {peer.name}'s file, or add the id there"
+            f"set {SYSTEM_ID} of the client here to an id in system_ids for {here} in {peer.name}'s file, or add the"
+            " id there"
         )
     if False in foreign:
         remedies.append(f"if these frames are needed, change the role or lists of {here} in {peer.name}'s file")
@@ -261,7 +261,7 @@ def _refused_kind(claim: Claim, now: float) -> str:
 def endpoint_problems(endpoint: EndpointFacts) -> Iterator[Found]:
     """What its policy refuses, and why its client is silent."""
     yield from _hidden_frames(endpoint)
-    yield from _all_refused(endpoint, endpoint.history.blocked(endpoint.now))
+    yield from _refused(endpoint)
     yield from _commands(endpoint)
     if endpoint.now - endpoint.history.silent_since >= SILENT_S:
         yield _silent(endpoint)

@@ -82,6 +82,10 @@ def command_name(number: int) -> str:
     return _COMMAND_NAMES.get(number, str(number))
 
 
+SYSTEM_ID: Final = "MAV_SYSID (ArduPilot; before 4.7 SYSID_THISMAV) or MAV_SYS_ID (PX4)"
+"""The parameter of an autopilot that has its system id."""
+
+
 def _names(text: str) -> tuple[str, ...]:
     return tuple(text.split())
 

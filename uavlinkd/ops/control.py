@@ -144,6 +144,11 @@ def ask(
         raise ControlError(
             f"no permission to connect to {path}: only root and the daemon's user have it; use sudo"
         ) from None
+    except (FileNotFoundError, ConnectionRefusedError):
+        raise ControlError(
+            f"no daemon answers at {path}: start it (`uavlinkd run --config FILE`, or `systemctl start uavlinkd`);"
+            " if it runs, restart it, or its file has another control_socket"
+        ) from None
     except OSError as error:
         raise ControlError(f"no daemon answers at {path}: {error.strerror or error}") from None
     except ValueError:
