@@ -32,6 +32,7 @@ from uavlinkd.mavlink.frames import split_payload
 from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.mavlink.routing import Router
 from uavlinkd.ops.findings import Finding, Severity, Subject
+from uavlinkd.system.addresses import Address
 
 NOW = 1.0
 ARM = mavlink.MAV_CMD_COMPONENT_ARM_DISARM
@@ -58,7 +59,11 @@ class Daemon(Scene):
         self.local: list[Any] = []
         self.parts: Any = SimpleNamespace(
             config=SimpleNamespace(
-                name="drone0", public_key=OWN_KEY, endpoints=[], routing=SimpleNamespace(relay=False)
+                name="drone0",
+                public_key=OWN_KEY,
+                listen=[Address("0.0.0.0", 5799)],
+                endpoints=[],
+                routing=SimpleNamespace(relay=False),
             ),
             links=self.links,
             peer_sockets=self.sockets,
@@ -150,10 +155,11 @@ def test_errors_of_this_machine(daemon: Daemon, error: str, cause: str, monkeypa
 def test_absent_own_address_explains_that_nothing_can_be_sent(daemon: Daemon) -> None:
     """It has a line of its own, so the peers have none about routes. It is a warning while all peers are up."""
     daemon.evidence.add_error("EINVAL", THERE, NOW)
-    daemon.sockets.absent_addresses = lambda: ["192.0.2.77:5790"]
+    daemon.sockets.absent_addresses = lambda: [Address("192.0.2.77", 5799)]
     daemon.sockets.absent_networks = lambda: {"lte (wwan0: no interface)": "plug the modem in"}
     assert set(daemon.findings()) == {"listen_address_missing", "network_absent"}
     assert {finding.severity for finding in daemon.findings().values()} == {Severity.FAULT}
+    assert '"0.0.0.0:5799"' in daemon.findings()["listen_address_missing"].remedy
     daemon.set_up(role="all", system_ids="all")
     assert {finding.severity for finding in daemon.findings().values()} == {Severity.WARNING}
 
@@ -175,7 +181,7 @@ def test_addresses_that_cannot_be_used(daemon: Daemon) -> None:
     daemon.link.set_paths([Path(0, ("fe80::1", 5790, 0, 0))], NOW)
     assert "[fe80::1%wlan0]:5790" in daemon.findings()["zone_missing"].remedy
     daemon.sockets.without_socket = {"drone1"}
-    assert "listen" in daemon.findings()["family_missing"].text
+    assert daemon.findings()["family_missing"].remedy == 'add "[::]:5799" to listen'
     daemon.sockets.networks.networks = [object()]
     assert "no network has" in daemon.findings()["family_missing"].text
 

@@ -156,10 +156,9 @@ def _reach(listen: Sequence[Address], peers: Sequence[PeerConfig]) -> Iterator[s
         if not listen or not numeric or len(numeric) < len(peer.addresses):
             continue
         if not any(own.family == address.family for own in listen for address in numeric):
-            family = "[::]" if numeric[0].ip is not None and numeric[0].ip.version == 6 else "0.0.0.0"
             yield (
                 f'peer "{peer.name}" has no address of an IP version that listen has:'
-                f' add "{family}:{listen[0].port}" to listen'
+                f" add {listen[0].wildcard(of_other_version=True)} to listen"
             )
         elif all(own.is_loopback for own in listen) and not any(address.is_loopback for address in numeric):
             yield f'peer "{peer.name}" is on the network, but listen names only loopback: neither reaches the other'

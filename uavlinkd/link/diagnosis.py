@@ -46,7 +46,8 @@ def daemon_problems(moment: Moment) -> Iterator[Found]:
         yield fault_if_down(
             "listen_address_missing",
             f"no interface has {listed(map(str, absent))}, which is in listen",
-            'write an address of this machine (`ip -brief address`) or "0.0.0.0:5790"; or wait for the network',
+            f"write an address of this machine (`ip -brief address`) or {absent[0].wildcard()}; or wait for the"
+            " network",
         )
     if gone := daemon.peer_sockets.absent_networks():
         text = f"no peer is reached along {'; '.join(gone)}"

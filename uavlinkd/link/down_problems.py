@@ -88,11 +88,12 @@ def _here(peer: PeerFacts, relays: Sequence[_RelayProblem]) -> Iterator[Found]:
                 f"{shown(path.address)} is valid on one interface only, and names none",
                 f'write it with its interface, as in "[{path.host}%wlan0]:{path.address[1]}"',
             )
-    if peer.name in sockets.without_socket and not sockets.networks.networks:
+    listen = peer.daemon.config.listen
+    if peer.name in sockets.without_socket and listen and not sockets.networks.networks:
         yield fault(
             "family_missing",
             f"no address in listen is of the family of {peer.addresses}",
-            'add "[::]:5790" to listen for IPv6, "0.0.0.0:5790" for IPv4',
+            f"add {listen[0].wildcard(of_other_version=True)} to listen",
         )
     elif peer.name in sockets.without_socket:
         yield fault(

@@ -52,6 +52,9 @@ def describe(config: Config, here: Surroundings | None) -> Group:
     if config.peers:
         titles = ("name", "key", "address", "suites", "mode, at least", "PSK")
         parts += [_heading("Peers"), _table(titles, map(_peer, config.peers))]
+        if not all(peer.is_called for peer in config.peers):
+            port = config.listen[0].port
+            parts.append(Text(f"(it connects): the peer's file needs an address of this machine, with port {port}"))
     if config.relays:
         relays = (
             (

@@ -68,6 +68,11 @@ class Address:
         """Whether it means every address of the machine."""
         return self.ip is not None and self.ip.is_unspecified
 
+    def wildcard(self, *, of_other_version: bool = False) -> str:
+        """The wildcard address with this port, of the same IP version or of the other one, as a file has it."""
+        is_ipv6 = (self.family == socket.AF_INET6) is not of_other_version
+        return f'"{"[::]" if is_ipv6 else "0.0.0.0"}:{self.port}"'
+
 
 def overlaps(a: Address, b: Address) -> bool:
     """Whether two sockets cannot listen on both: same port, and same host or a wildcard."""
