@@ -12,10 +12,11 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from tests.core.harness import PLAIN
 from tests.daemon.frames import command_long, heartbeat
 from tests.link.test_evidence import HOST, OWN_KEY, THERE, Scene
 from tests.test_readmes import ROOT
-from uavlinkd.config import PeerConfig
+from uavlinkd.config import EndpointConfig, PeerConfig
 from uavlinkd.config.keys import encode_key
 from uavlinkd.core import constants as c
 from uavlinkd.core.drops import DropReason
@@ -26,9 +27,10 @@ from uavlinkd.core.sessions import Twin
 from uavlinkd.endpoints.url import parse_url
 from uavlinkd.link import diagnosis, down_problems
 from uavlinkd.link.evidence import OWN_FRAMES_S, History
+from uavlinkd.link.facts import ICMP_S
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.traffic_problems import SECURITY_S, has_no_client
-from uavlinkd.mavlink.frames import split_payload
+from uavlinkd.mavlink.frames import SplitCounters, split_payload
 from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.mavlink.routing import Router
 from uavlinkd.ops.findings import Finding, Severity, Subject
@@ -60,6 +62,7 @@ class Daemon(Scene):
         self.parts: Any = SimpleNamespace(
             config=SimpleNamespace(
                 name="drone0",
+                path="drone0.toml",
                 public_key=OWN_KEY,
                 listen=[Address("0.0.0.0", 5799)],
                 endpoints=[],
@@ -166,9 +169,15 @@ def test_absent_own_address_explains_that_nothing_can_be_sent(daemon: Daemon) ->
 
 @pytest.mark.parametrize(("error", "cause"), [("ECONNREFUSED", "no_listener"), ("EHOSTUNREACH", "host_unreachable")])
 def test_reports_of_the_network(daemon: Daemon, error: str, cause: str) -> None:
-    """Each error of ICMP has its cause."""
+    """Each error of ICMP has its cause, after those that arrived, until two tries had no such message."""
     daemon.evidence.add_error(f"icmp_{error}", THERE, NOW)
+    daemon.link.peer.initiator.begin_try(NOW)
     assert set(daemon.findings()) == {cause}
+    daemon.dropped(DropReason.BAD_MAC1, THERE)
+    assert list(daemon.findings()) == ["wrong_key_there", cause]
+    assert list(daemon.findings(NOW + 2 * PLAIN.timers.retry_min_s * (1 + c.RETRY_JITTER) + ICMP_S + 0.1)) == [
+        "wrong_key_there"
+    ]
 
 
 def test_addresses_that_cannot_be_used(daemon: Daemon) -> None:
@@ -233,7 +242,8 @@ def test_keys_that_arrive_are_shown_and_never_advised(daemon: Daemon) -> None:
         daemon.dropped(DropReason.UNKNOWN_PEER, THERE, key)
     findings = daemon.findings()
     assert set(findings) == {"former_key", "wrong_key_here"}
-    assert "2 keys, so at least one is not drone1" in findings["wrong_key_here"].text
+    where = " at 192.0.2.2:5790, ".join(map(encode_key, keys[1:]))
+    assert f"2 keys, so at least one is not drone1: {where} at " in findings["wrong_key_here"].text
     assert "or an attacker replays an old recording" in findings["former_key"].text
     assert all(encode_key(key) not in findings["wrong_key_here"].remedy for key in keys)
 
@@ -275,21 +285,33 @@ def test_own_key_on_another_machine(daemon: Daemon) -> None:
 
 
 def test_problems_of_the_daemon(daemon: Daemon) -> None:
-    """Bare MAVLink, a flood of handshakes, a pause, and a recording that cannot be written."""
+    """Bare MAVLink, a flood of handshakes, a pause, a refused file, and a recording that cannot be written."""
     daemon.set_up(role="all", system_ids="all")
     daemon.dropped(DropReason.RAW_MAVLINK, STRANGER)
     for _ in range(diagnosis.LOAD // 2):
         daemon.dropped(DropReason.COOKIE_REQUIRED, STRANGER)
         daemon.dropped(DropReason.RATE_LIMITED, STRANGER)
     daemon.history.paused = NOW, 4.0
+    daemon.history.refused_file = ["drone0.toml: link.tag_bits: must be 64, 96, 128 or 256", "another"]
     daemon.parts.recorder = SimpleNamespace(is_recording=False, failures={"ENOSPC": 1})
-    findings = daemon.findings()
-    assert set(findings) == {"raw_mavlink", "under_load", "daemon_paused", "recording_stopped"}
+    findings, lasting = daemon.findings(), {"recording_stopped", "configuration_refused"}
+    assert set(findings) == {*lasting, "raw_mavlink", "under_load", "daemon_paused"}
     assert {finding.severity for finding in findings.values()} == {Severity.WARNING}
     assert "198.51.100.7:5790" in findings["raw_mavlink"].text
     assert "never block a peer's address" in findings["under_load"].remedy
     assert "ENOSPC" in findings["recording_stopped"].text
-    assert set(daemon.findings(NOW + 31)) == {"recording_stopped"}
+    assert "tag_bits: must be 64, 96, 128 or 256 and 1 more" in findings["configuration_refused"].text
+    assert set(daemon.findings(NOW + 31)) == lasting
+
+
+def test_senders_without_a_member_here_have_their_own_addresses(daemon: Daemon) -> None:
+    """At a relay, two keys from two places."""
+    daemon.parts.relay = SimpleNamespace(members={})
+    keys = {bytes([number]) * 32: (f"198.51.100.{number}", 5790) for number in (11, 12)}
+    for key, address in keys.items():
+        daemon.dropped(DropReason.UNKNOWN_PEER, address, key)
+    shown = ", ".join(f"{encode_key(key)} at {host}:{port}" for key, (host, port) in keys.items())
+    assert daemon.findings()["not_a_member"].text.endswith(shown)
 
 
 # A peer that is up.
@@ -312,6 +334,27 @@ def test_system_of_another(daemon: Daemon) -> None:
     assert "7 is endpoint autopilot's" in daemon.findings()["other_system"].remedy
     assert "write it into system_ids" not in daemon.findings()["other_system"].remedy
     assert next(iter(daemon.findings())) == "impersonation"
+
+
+@pytest.mark.parametrize(("owner", "remedy"), [(2, "only if you know that endpoint autopilot"), (1, "1 is drone1's")])
+def test_autopilot_with_another_system_id(daemon: Daemon, owner: int, remedy: str) -> None:
+    """The remedy names the parameters of both autopilots, and never a role."""
+    daemon.set_up(role="all", system_ids=[owner])
+    rules: Any = {"system_ids": [3]}
+    config = EndpointConfig("autopilot", parse_url("udpin:127.0.0.1:14550"), policy=rules)
+    local = SimpleNamespace(name="autopilot", ports=[], failures={}, frames_sent=0, counters=SplitCounters())
+    local.policy = config.make_policy()
+    daemon.parts.config.endpoints.append(config)
+    daemon.local.append(local)
+    for frame in split_payload(heartbeat(1), local.counters):
+        local.policy.incoming.check(frame, daemon.now)
+    daemon.sample()
+    findings = daemon.findings()
+    assert set(findings) == {"foreign_system"}
+    assert (
+        "set MAV_SYSID (ArduPilot; before 4.7 SYSID_THISMAV) or MAV_SYS_ID (PX4)" in findings["foreign_system"].remedy
+    )
+    assert remedy in findings["foreign_system"].remedy
 
 
 @pytest.mark.parametrize(("pause", "is_found"), [(1, True), (int(OWN_FRAMES_S) + 1, False)])

@@ -117,7 +117,12 @@ def _wg(text: str, folder: Path) -> str:
 
 
 _ROWS: tuple[tuple[str, str, str, Change], ...] = (
-    ("2", "own key as the peer's", r"this daemon's own key: write what `uavlinkd pubkey` prints", _own_key),
+    (
+        "2",
+        "own key as the peer's",
+        r"this daemon's own key: write what `uavlinkd pubkey` prints.* or private_key_file is that of",
+        _own_key,
+    ),
     ("5", "truncated key", r"is not a key: .*write what", _line("public_key", f'public_key = "{"A" * 40}"')),
     ("8", "`private_keyfile`", r"did you mean private_key_file", _replaced("private_key_file", "private_keyfile")),
     ("9", "`adresses`", r"did you mean addresses", _replaced("addresses", "adresses")),

@@ -62,8 +62,8 @@ LINK_ROWS = (
         "23",
         "peer on IPv6, `listen` on IPv4",
         scenes.families,
-        check=r'add "\[::\]:\d+" to listen',
-        signs=_both("family_missing", r'add "\[::\]:5790"'),
+        check=r'add "\[::\]:(?!5790)\d+" to listen',
+        signs=_both("family_missing", r'add "\[::\]:(?!5790)\d+"'),
     ),
     Mistake("25", "PSK at one end", scenes.psk, signs=_both("wrong_psk", r"same psk_file")),
     Mistake("26", "no common suite", scenes.suites, signs=_both("no_common_suite", r"write this end's suites")),
@@ -95,12 +95,24 @@ LINK_ROWS = (
         check=r"is not an address of this machine now.*0\.0\.0\.0",
         signs=(Sign("here", "listen_address_missing", r"ip -brief address"),),
     ),
-    Mistake("36", "addresses at neither end", scenes.no_addresses, signs=_both("not_connecting", r"address")),
+    Mistake(
+        "36",
+        "addresses at neither end",
+        scenes.no_addresses,
+        check=r"the peer's file needs an address of this machine",
+        signs=_both("not_connecting", r"address"),
+    ),
     Mistake(
         "38",
         "autopilot has another system id",
         scenes.wrong_system,
         signs=(Sign("there", "foreign_system", r"SYSID_THISMAV.*MAV_SYS_ID"),),
+    ),
+    Mistake(
+        "38b",
+        "the same, in the file of a fleet's member",
+        scenes.wrong_system_of_fleet,
+        signs=(Sign("here", "foreign_system", r"MAV_SYSID .*MAV_SYS_ID .* of its autopilot to 2"),),
     ),
     Mistake(
         "39", "roles exchanged", scenes.roles, signs=(Sign("here", "roles_exchanged", r'write role = "operator"'),)
@@ -123,7 +135,15 @@ LINK_ROWS = (
         scenes.recording,
         signs=(Sign("here", "recording_stopped", r"daemon's user"),),
     ),
-    Mistake("50", "reload of a mistake", scenes.reload, command=r"tag_bits: must be 64, 96, 128 or 256"),
+    Mistake(
+        "50",
+        "reload of a mistake",
+        scenes.reload,
+        command=r"tag_bits: must be 64, 96, 128 or 256",
+        signs=(
+            Sign("here", "configuration_refused", r"`uavlinkd check --config .*` prints, and run `uavlinkd reload`"),
+        ),
+    ),
     Mistake(
         "51",
         "reload of a fixed key",
@@ -137,7 +157,8 @@ LINK_ROWS = (
         signs=(Sign("here", "wrong_key_here", r"After a change of keys, restart it with its new files"),),
     ),
     Mistake("53", "`status` as another user", scenes.other_user, command=r"use sudo"),
-    Mistake("54", "socket left by a killed daemon", scenes.killed),
+    Mistake("53b", "no daemon at the control socket", scenes.not_started, command=r"start it \(`uavlinkd run"),
+    Mistake("54", "socket left by a killed daemon", scenes.killed, command=r"start it \(`uavlinkd run"),
     Mistake(
         "74",
         "command withheld by a role",

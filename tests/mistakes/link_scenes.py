@@ -208,6 +208,14 @@ async def wrong_system(scene: Scene) -> None:
     await scene.send(into, _vehicle(1))
 
 
+async def wrong_system_of_fleet(scene: Scene) -> None:
+    """The same, and its endpoint says so too, as in a fleet."""
+    scene.introduce(there={"role": "vehicle", "system_ids": [2]}, here={"role": "operator", "system_ids": [255]})
+    into = scene.here.add_endpoint("autopilot", system_ids=[2])
+    await _linked(scene)
+    await scene.send(into, _vehicle(1))
+
+
 async def roles(scene: Scene) -> None:
     """`here` is the vehicle, and says that the station is one."""
     scene.introduce(here={"role": "vehicle", "system_ids": [255]}, there={"role": "operator", "system_ids": [1]})
@@ -282,11 +290,17 @@ async def other_user(scene: Scene) -> None:
         scene.command = await said_by_process("status", "--socket", str(path), launcher=WITHOUT_RIGHTS)
 
 
+async def not_started(scene: Scene) -> None:
+    """It was never started."""
+    scene.command = await said_by_process("status", "--config", str(scene.here.write_config()))
+
+
 async def killed(scene: Scene) -> None:
     """It left its control socket."""
     scene.introduce()
     await scene.start(scene.here)
     await scene.here.stop(signal.SIGKILL)
+    scene.command = await said_by_process("status", "--config", str(scene.here.write_config()))
     await _linked(scene)
 
 

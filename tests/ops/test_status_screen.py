@@ -134,14 +134,15 @@ def test_what_is_wrong_is_in_plain_words(facts: dict[str, Any], of_peer: dict[st
 
 
 def test_problems_come_first_with_cause_and_remedy() -> None:
-    """Security is above the faults, in capitals and red; then the tables."""
-    findings = [finding("zulu", Severity.SECURITY), finding("drone1"), finding("autopilot", subject=Subject.ENDPOINT)]
+    """Security is above the faults, in capitals and red; then the tables. A problem of fifty peers is one line."""
+    findings = [finding("zulu", Severity.SECURITY), finding("autopilot", subject=Subject.ENDPOINT)]
+    findings[1:1] = [finding(f"drone{number}") for number in range(1, 51)]
     screen = render_status(status_of({"drone1": peer("waiting")}, findings=findings))
     text = words(screen)
-    for label in ("SECURITY zulu: ", "fault drone1: ", "fault endpoint autopilot: "):
+    for label in ("SECURITY zulu: ", "drone8 and 42 more: ", "fault endpoint autopilot: "):
         assert f"{label}the response from 10.13.0.0 does not authenticate" in text
     assert text.count("Remedy: give both the same psk_file") == 3
-    assert text.index("SECURITY") < text.index("fault drone1") < text.index("silent rtt")
+    assert text.index("SECURITY") < text.index("fault drone1, drone2") < text.index("silent rtt")
     file = io.StringIO()
     Console(file=file, width=80, force_terminal=True, color_system="standard").print(screen)
     assert "\x1b[1;31mSECURITY\x1b[0m" in file.getvalue()
@@ -151,7 +152,7 @@ def test_problems_come_first_with_cause_and_remedy() -> None:
 def test_everyday_problems_do_not_push_out_security() -> None:
     """All security lines are shown, and of the others as many as fit; the rest is counted."""
     security = [finding(f"s{n}", Severity.SECURITY, n=n) for n in range(30)]
-    findings = [*security, *(finding(f"f{n}") for n in range(25))]
+    findings = [*security, *(finding(f"f{n}", n=n) for n in range(25))]
     text = words(render_status(status_of({"drone1": peer("up")}, findings=findings)))
     assert text.count("SECURITY") == 30
     assert text.count("fault ") == 20

@@ -218,8 +218,10 @@ class Daemon:
             except BindError as error:
                 raise ConfigError((Problem(str(config.path), "", str(error)),)) from None
         except ConfigError as error:
-            self.log.error("configuration_refused", problems=[printable(line) for line in str(error).split("\n")])
+            self.parts.history.refused_file = problems = [printable(line) for line in str(error).split("\n")]
+            self.log.error("configuration_refused", problems=problems)
             raise
+        self.parts.history.refused_file = []
         self.carrier.peers.follow(config, changes)
         for name in changes.closed_endpoints:
             local.close_one(name)

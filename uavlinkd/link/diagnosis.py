@@ -15,7 +15,7 @@ from uavlinkd.core.sessions import Twin
 from uavlinkd.link import traffic_problems as traffic
 from uavlinkd.link.down_problems import down_problems, silence, versions
 from uavlinkd.link.evidence import ELSEWHERE, EVIDENCE_S
-from uavlinkd.link.facts import EndpointFacts, Found, Moment, PeerFacts, fault, listed, security, warning
+from uavlinkd.link.facts import EndpointFacts, Found, Moment, PeerFacts, fault, keys_at, listed, security, warning
 from uavlinkd.link.parts import DaemonParts
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.relay_link import RelayLink
@@ -80,6 +80,12 @@ def daemon_problems(moment: Moment) -> Iterator[Found]:
             f"the daemon was paused for {paused[1]:.1f} s, and dropped frames from that time",
             "give the daemon more CPU time (`uptime`), or do not suspend the machine",
         )
+    if problems := daemon.history.refused_file:
+        yield warning(
+            "configuration_refused",
+            f"the last reload was refused, and the configuration before is in force: {listed(problems, 1)}",
+            f"correct what `uavlinkd check --config {daemon.config.path}` prints, and run `uavlinkd reload`",
+        )
     if daemon.recorder is not None and not daemon.recorder.is_recording:
         yield warning(
             "recording_stopped",
@@ -98,11 +104,10 @@ def member_problems(moment: Moment) -> Iterator[Found]:
         facts = (f"{one.settings.name}, from {traffic.places(one.peers)}" for one in twins)
         yield traffic.two_machines(f"the private key of a member: {listed(facts)}")
     unknown = daemon.evidence.seen_at(DropReason.UNKNOWN_PEER, ELSEWHERE, now)
-    if unknown is not None and unknown.address is not None:
-        keys = ", ".join(encode_key(key) for key in unknown.details if isinstance(key, bytes))
+    if unknown is not None:
         yield warning(
             "not_a_member",
-            f"a sender at {shown(unknown.address)} has a key of no [[member]] here: {keys}",
+            f"a sender has a key of no [[member]] here: {keys_at(unknown)}",
             "if it is yours, run `uavlinkd pubkey` there, write into its [[member]] what that prints, and run"
             " `uavlinkd reload` here: a key that arrives proves nothing",
         )
@@ -140,7 +145,10 @@ def line_problems(moment: Moment) -> Iterator[Found]:
 
 
 def find(daemon: DaemonParts, now: float) -> list[Finding]:
-    """All present findings: security first, then faults, then warnings; by subject and name among equals."""
+    """All present findings: security first, then faults, then warnings; by subject and name among equals.
+
+    Those of a peer keep their order: what is certain, then what arrives from its address, then ICMP messages.
+    """
     moment = Moment(daemon, now)
     findings: list[Finding] = []
 
@@ -160,4 +168,4 @@ def find(daemon: DaemonParts, now: float) -> list[Finding]:
     for endpoint in daemon.local.endpoints:
         if (config := configs.get(endpoint.name)) is not None:
             add(Subject.ENDPOINT, endpoint.name, traffic.endpoint_problems(EndpointFacts(moment, endpoint, config)))
-    return sorted(findings, key=lambda one: (one.severity, one.subject, one.name, one.cause))
+    return sorted(findings, key=lambda one: (one.severity, one.subject, one.name))

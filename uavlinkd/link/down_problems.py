@@ -14,7 +14,7 @@ from uavlinkd.config.keys import encode_key
 from uavlinkd.core import constants as c
 from uavlinkd.core.drops import DropReason
 from uavlinkd.link.evidence import REPORTED, Sighting
-from uavlinkd.link.facts import Found, PeerFacts, at, fault, listed
+from uavlinkd.link.facts import Found, PeerFacts, at, fault, keys_at, listed, place
 from uavlinkd.link.relay_link import RelayLink
 from uavlinkd.ops.log import shown
 from uavlinkd.system.error_meanings import meaning_of
@@ -36,7 +36,7 @@ _RelayProblem = tuple[str, RelayLink]
 def down_problems(peer: PeerFacts) -> Iterator[Found]:
     """All that is known about a peer that is down, except its silence."""
     relays = list(_relays(peer))
-    found = [*_here(peer, relays), *_at_relays(peer, relays), *_hints(peer), *_handshakes(peer, relays)]
+    found = [*_here(peer, relays), *_at_relays(peer, relays), *_hints(peer), *_handshakes(peer, relays), *_icmp(peer)]
     yield from found
     is_explained = any(one.cause in _EXPLAIN_NO_ANSWER for one in found)
     if not is_explained and has_unconfirmed(peer) and peer.now - peer.link.silent_since >= CONFIRM_S:
@@ -144,20 +144,6 @@ def _at_relays(peer: PeerFacts, relays: Sequence[_RelayProblem]) -> Iterator[Fou
 
 
 def _hints(peer: PeerFacts) -> Iterator[Found]:
-    if (sighting := peer.seen(f"{REPORTED}ECONNREFUSED")) is not None:
-        yield fault(
-            "no_listener",
-            f"no process listens at {at(sighting)}, or a firewall there rejects (ICMP)",
-            f"start uavlinkd at {peer.name}, and compare its `listen` with `addresses` here",
-        )
-    for error in _UNREACHABLE:
-        if (sighting := peer.seen(REPORTED + error)) is not None:
-            yield fault(
-                "host_unreachable",
-                f"the network reports that {at(sighting)} is not reachable ({error})",
-                f"switch {peer.name} on, and compare its address with `addresses` here; see `ip route get ADDRESS`",
-            )
-            break
     if (sighting := peer.handshake_seen(DropReason.UNKNOWN_PEER)) is not None:
         yield from _unknown_keys(peer, sighting)
     config = peer.daemon.config
@@ -177,21 +163,38 @@ def _hints(peer: PeerFacts) -> Iterator[Found]:
             )
 
 
+def _icmp(peer: PeerFacts) -> Iterator[Found]:
+    """What the network reports. It comes last: it may be from before the peer started."""
+    if (sighting := peer.seen(f"{REPORTED}ECONNREFUSED")) is not None:
+        yield fault(
+            "no_listener",
+            f"no process listens at {at(sighting)}, or a firewall there rejects (ICMP)",
+            f"start uavlinkd at {peer.name}, and compare its `listen` with `addresses` here",
+        )
+    for error in _UNREACHABLE:
+        if (sighting := peer.seen(REPORTED + error)) is not None:
+            yield fault(
+                "host_unreachable",
+                f"the network reports that {at(sighting)} is not reachable ({error})",
+                f"switch {peer.name} on, and compare its address with `addresses` here; see `ip route get ADDRESS`",
+            )
+            break
+
+
 def _unknown_keys(peer: PeerFacts, sighting: Sighting) -> Iterator[Found]:
     before = peer.link.config.previous_public_key
-    keys = [key for key in sighting.details if isinstance(key, bytes) and key != peer.daemon.config.public_key]
-    if before is not None and before in keys:
+    if before is not None and before in sighting.details:
         yield fault(
             "former_key",
-            f"a sender at {at(sighting)} uses the former key {encode_key(before)}, or an attacker replays an old"
-            " recording",
+            f"a sender at {place(sighting.details[before])} uses the former key {encode_key(before)}, or an attacker"
+            " replays an old recording",
             f"carry the new files to {peer.name} and restart it; if the former key was stolen, this may be the thief",
         )
-    if others := [encode_key(key) for key in keys if key != before]:
-        which = "the key" if len(others) == 1 else f"{len(others)} keys, so at least one is not {peer.name}:"
+    if count := len(sighting.details) - (before in sighting.details):
+        which = "the key" if count == 1 else f"{count} keys, so at least one is not {peer.name}:"
         yield fault(
             "wrong_key_here",
-            f"a sender at {at(sighting)} uses {which} {', '.join(others)}, which this file does not have",
+            f"a sender uses {which} {keys_at(sighting, but=before)}, which this file does not have",
             f"run `uavlinkd pubkey` at {peer.name}, and write into this file what that prints: a key that arrives"
             " proves nothing. After a change of keys, restart it with its new files; if the former key was stolen,"
             " this may be the thief",

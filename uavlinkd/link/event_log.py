@@ -24,7 +24,7 @@ ENDPOINT_DELAY_S = 15.0
 FINDING_QUIET_S = 10.0
 """A finding has ended when it was absent for so long, see :data:`uavlinkd.link.conditions.QUIET_S`."""
 
-_OTHER_EVENTS = frozenset({"daemon_paused", "recording_stopped", "network_absent"})
+_OTHER_EVENTS = frozenset({"daemon_paused", "recording_stopped", "network_absent", "configuration_refused"})
 """Findings that are logged by events of their own."""
 _State = o.PeerUp | o.PeerLost | o.PeerClosed
 _FindingKey = tuple[str, Subject, str]

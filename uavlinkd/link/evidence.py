@@ -56,8 +56,8 @@ class Sighting:
         self.last_at = now
         self.address: SocketAddress | None = None
         """The latest source or destination."""
-        self.details: dict[Detail, None] = {}
-        """Different details, the latest last."""
+        self.details: dict[Detail, SocketAddress | None] = {}
+        """Different details with the latest address of each, the latest last."""
 
     def add(self, address: SocketAddress | None, detail: Detail, now: float) -> None:
         """The same was seen again."""
@@ -70,7 +70,7 @@ class Sighting:
             self.details.pop(detail, None)
             if len(self.details) >= MAX_DETAILS:
                 del self.details[next(iter(self.details))]
-            self.details[detail] = None
+            self.details[detail] = address
 
 
 class Evidence:
@@ -304,6 +304,8 @@ class History:
         self.began_at = now
         self.paused: tuple[float, float] | None = None
         """When the last pause of the process ended, and its duration in seconds."""
+        self.refused_file: list[str] = []
+        """The problems of the file at the last reload, if it was refused."""
         self._parts: dict[tuple[str, str], PartHistory] = {}
 
     def part(self, kind: str, name: str) -> PartHistory:

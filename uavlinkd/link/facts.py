@@ -7,9 +7,11 @@ from functools import cached_property, partial
 from typing import Final, NamedTuple
 
 from uavlinkd.config import EndpointConfig
+from uavlinkd.config.keys import encode_key
 from uavlinkd.core.drops import DropReason
+from uavlinkd.core.path import SocketAddress
 from uavlinkd.endpoints.ports import Endpoint
-from uavlinkd.link.evidence import ELSEWHERE, Sighting
+from uavlinkd.link.evidence import ELSEWHERE, REPORTED, Sighting
 from uavlinkd.link.parts import DaemonParts
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.relay_link import RelayLink
@@ -31,6 +33,10 @@ class Found(NamedTuple):
 security: Final = partial(Found, Severity.SECURITY)
 fault: Final = partial(Found, Severity.FAULT)
 warning: Final = partial(Found, Severity.WARNING)
+
+
+ICMP_S: Final = 1.0
+"""Hosts send an ICMP message about our datagrams at most once in this time."""
 
 
 class Moment:
@@ -95,7 +101,7 @@ class PeerFacts(PartFacts):
 
     def seen(self, kind: str) -> Sighting | None:
         """Evidence since the link went down."""
-        return _since(self.daemon.evidence.seen(kind, self.link, self.now), self.link.silent_since)
+        return self._current(self.daemon.evidence.seen(kind, self.link, self.now), kind, self.link)
 
     def handshake_seen(self, reason: DropReason) -> Sighting | None:
         """The same; of a peer without addresses, from any sender while it is the only such peer that is not up."""
@@ -103,11 +109,19 @@ class PeerFacts(PartFacts):
             return self.seen(reason)
         if not self.moment.has_sole_waiting:
             return None
-        return _since(self.daemon.evidence.seen_at(reason, ELSEWHERE, self.now), self.link.silent_since)
+        return self._current(self.daemon.evidence.seen_at(reason, ELSEWHERE, self.now), reason, self.link)
 
     def seen_at(self, relay: RelayLink, kind: str) -> Sighting | None:
         """Evidence at an address of a relay since that went silent."""
-        return _since(self.daemon.evidence.seen_at_relay(kind, relay, self.now), relay.silent_since)
+        return self._current(self.daemon.evidence.seen_at_relay(kind, relay, self.now), kind, relay)
+
+    def _current(self, sighting: Sighting | None, kind: str, link: PeerLink | RelayLink) -> Sighting | None:
+        """A sighting since the link went down. An ICMP message counts until two tries had none."""
+        if sighting is None or sighting.last_at < link.silent_since:
+            return None
+        tries = link.peer.initiator
+        is_over = self.now - sighting.last_at > 2 * (tries.retry_at - tries.initiated_at) + ICMP_S
+        return None if kind.startswith(REPORTED) and is_over else sighting
 
 
 class EndpointFacts(PartFacts):
@@ -119,13 +133,20 @@ class EndpointFacts(PartFacts):
         self.config = config
 
 
-def _since(sighting: Sighting | None, since: float) -> Sighting | None:
-    return None if sighting is None or sighting.last_at < since else sighting
-
-
 def at(sighting: Sighting) -> str:
     """Where it was seen."""
-    return "its address" if sighting.address is None else shown(sighting.address)
+    return place(sighting.address)
+
+
+def place(address: SocketAddress | None) -> str:
+    """An address, which may be unknown."""
+    return "its address" if address is None else shown(address)
+
+
+def keys_at(sighting: Sighting, but: bytes | None = None) -> str:
+    """The public keys of senders, each with the address where it was seen last."""
+    keys = ((key, address) for key, address in sighting.details.items() if isinstance(key, bytes) and key != but)
+    return ", ".join(f"{encode_key(key)} at {place(address)}" for key, address in keys)
 
 
 def listed(names: Iterable[str], most: int = 4) -> str:

@@ -6,7 +6,7 @@ All of it is authentic, or happens on this machine. Without a peer's key, an att
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from typing import Final
 

@@ -58,6 +58,7 @@ _NOT_USABLE: Final = {"unanswered": "no answer", "loss": "loss", "network": "no 
 """Why a path is not usable, in plain words."""
 _SHOWN_REASONS: Final = 3
 _SHOWN_FINDINGS: Final = 20
+_SHOWN_NAMES: Final = 8
 _SHOWN_MEMBERS: Final = 30
 _WIDE: Final = 100
 """From so many columns on, the table of paths has lag and bytes too."""
@@ -117,20 +118,27 @@ def _headline(status: Status) -> Text:
 
 
 def _findings(findings: list[dict[str, str]]) -> Table:
-    """A line per problem with its cause and remedy. Security is first, and all of it is shown."""
+    """A line per problem with its cause and remedy. Security is first, and all of it is shown.
+
+    A problem of several peers, such as a relay that does not answer, is shown once.
+    """
+    several: dict[tuple[str, ...], list[str]] = {}
+    for finding in findings:
+        key = tuple(finding[field] for field in ("severity", "subject", "text", "remedy"))
+        several.setdefault(key, []).append(finding["name"])
     table = Table.grid(padding=(0, 1, 0, 0))
     table.add_column(no_wrap=True)
     table.add_column(overflow="fold")
-    shown = sum(finding["severity"] == "security" for finding in findings) + _SHOWN_FINDINGS
-    for finding in findings[:shown]:
-        label = finding["severity"]
+    shown = sum(label == "security" for label, *_ in several) + _SHOWN_FINDINGS
+    for (label, subject, text, remedy), names in list(several.items())[:shown]:
         style, is_security = _STYLES[label], label == "security"
-        subject = {"peer": f"{finding['name']}: ", "endpoint": f"endpoint {finding['name']}: "}
-        line = Text(subject.get(finding["subject"], ""), style="bold")
-        line.append(finding["text"], style=style if is_security else "not bold")
-        line.append(f". Remedy: {finding['remedy']}", style="not bold")
+        listed = ", ".join(names[:_SHOWN_NAMES])
+        more = f" and {len(names) - _SHOWN_NAMES} more" if len(names) > _SHOWN_NAMES else ""
+        line = Text({"peer": f"{listed}{more}: ", "endpoint": f"endpoint {listed}: "}.get(subject, ""), style="bold")
+        line.append(text, style=style if is_security else "not bold")
+        line.append(f". Remedy: {remedy}", style="not bold")
         table.add_row(Text(label.upper() if is_security else label, style=style), line)
-    if (left := len(findings) - shown) > 0:
+    if (left := len(several) - shown) > 0:
         table.add_row("", Text(f"and {left} more: `uavlinkd status --json` has all of them"))
     return table
 
