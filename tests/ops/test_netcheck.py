@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from uavlinkd.ops.netcheck import INTERVAL_S, Filtered, Mapped, behaviours, ping
+from uavlinkd.ops.netcheck import INTERVAL_S, Filtered, Mapped, behaviours, folded, ping, report
 
 PRIVATE, PUBLIC, OTHER = "192.168.1.5:5790", "203.0.113.7:40001", "203.0.113.7:40002"
 
@@ -77,6 +77,19 @@ def test_filtering_follows_from_the_tokens(passes: tuple[bool | None, ...], filt
     assert list(behaviours(answer(view("one", "a:1", PRIVATE), filtering=results))) == [
         (None, Mapped.NO_NAT, filtered)
     ]
+
+
+@pytest.mark.parametrize("state", ["up", "down"])
+def test_report_fits_80_columns(state: str) -> None:
+    """Addresses stay whole, folded lines begin below the text, and a sentence without a label is not indented."""
+    place = "[2001:db8:1111:2222:3333:4444:5555:6666]:40001"
+    lines = list(report(answer(view("one", place, place, network="lte"), state=state)))
+    printed = [line for text in lines for line in folded(text).splitlines()]
+    assert max(map(len, printed)) <= 80
+    assert " ".join(" ".join(printed).split()) == " ".join(" ".join(lines).split())
+    assert any(line.startswith(" " * 13) and place in line for line in printed) is (state == "up")
+    rest = printed[printed.index("candidates   203.0.113.7:40001, 192.168.1.5:5790") + 1 :]
+    assert not [line for line in rest if line.startswith(" ")]
 
 
 DIRECT: dict[str, Any] = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import re
 from pathlib import Path
 
@@ -45,9 +46,10 @@ confidential = true
 """
 
 
-def _printed(config: Config) -> str:
+def _printed(config: Config, *, columns: int | None = None) -> str:
+    """What it prints into a pipe, or on a terminal of so many columns."""
     file = io.StringIO()
-    print_topology(config, console=Console(file=file))
+    print_topology(config, console=Console(file=file, width=columns, force_terminal=columns is not None))
     return file.getvalue()
 
 
@@ -84,12 +86,25 @@ def test_no_secret_is_printed(tmp_path: Path) -> None:
 def test_key_of_a_relay_or_member_is_printed_whole(tmp_path: Path, section: str, title: str) -> None:
     """The user compares it with what the other machine printed. What may be a private key is not printed."""
     public, private = keys.public_key_text(keys.generate_private_key()), keys.generate_private_key()
-    for key in (public, private):
-        printed = _printed(load(tmp_path, f'{_FILE}{section}\nname = "vps"\npublic_key = "{key}"\n'))
-        rows = printed.partition(title)[2]
+    for key, columns in itertools.product((public, private), (None, 40)):
+        config = load(tmp_path, f'{_FILE}{section}\nname = "vps"\npublic_key = "{key}"\n')
+        rows = _printed(config, columns=columns).partition(title)[2]
         assert (public in rows) is (key == public)
         assert ("(private?)" in rows) is (key == private)
-        assert private[:8] not in printed
+        assert private[:8] not in rows
+
+
+def test_a_url_is_never_broken_and_a_row_in_a_pipe_is_one_line(tmp_path: Path) -> None:
+    """Users copy it, and `grep` for an endpoint or a warning shows all of it. Only policies are folded."""
+    url = f"serial:/dev/serial/by-id/usb-{'Pixhawk_' * 20}if00:57600"
+    config = load(tmp_path, _FILE.replace("udpin:127.0.0.1:14550", url))
+    assert url in _printed(config, columns=80)
+
+    printed = _printed(config)
+    assert _line(printed, "autopilot").split() == ["autopilot", url, "no", "no", "wire"]
+    warnings = [line.removeprefix("warning: ") for line in printed.splitlines() if line.startswith("warning: ")]
+    assert warnings == list(config.warnings)
+    assert max(map(len, printed.partition("Policy of")[2].partition("warning:")[0].splitlines())) <= 80
 
 
 _POLICIES: dict[str, dict[str, object]] = {

@@ -202,11 +202,11 @@ def _ping(options: argparse.Namespace) -> int:
 
 
 def _netcheck(options: argparse.Namespace) -> int:
-    from uavlinkd.ops.netcheck import report
+    from uavlinkd.ops.netcheck import folded, report
 
     def show(answer: dict[str, Any]) -> int:
         for line in report(answer):
-            print(printable(line))
+            print(folded(printable(line)))
         return OK if any(relay["state"] == "up" for relay in answer["relays"].values()) else FAILED
 
     return _for_each(_control_sockets(options), "netcheck", show)

@@ -11,6 +11,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from enum import StrEnum
 from itertools import combinations
+from textwrap import fill
 from typing import Any, Final
 
 from uavlinkd.ops.status_screen import addresses
@@ -125,6 +126,12 @@ def report(answer: Answer) -> Iterator[str]:
             "No relay answers: compare addresses and public_key with the relay, write a [[member]] for this daemon"
             " there, and let UDP through the firewalls. `uavlinkd status` here and there names the cause"
         )
+
+
+def folded(line: str) -> str:
+    """Fold a line of the report to 80 columns, beside its label. Names and addresses stay whole."""
+    indent = " " * 13 if line[11:13] == "  " else ""
+    return fill(line, 80, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
 
 
 def _about(relay: Answer) -> str:

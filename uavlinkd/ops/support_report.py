@@ -31,8 +31,9 @@ _PACKAGES: Final = (
     *("rich", "serialx", "structlog", "uvloop"),
 )
 _INTRODUCTION: Final = """\
-uavlinkd report. Keys are replaced by key-1, …, the addresses of peers by peer-address-1, …, and other addresses by
-address-1, …. The names of peers and this machine's own addresses are readable. Read it before you send it."""
+uavlinkd report. Keys are replaced by key-1, …, the addresses of peers by
+peer-address-1, …, and other addresses by address-1, …. The names of peers and
+this machine's own addresses are readable. Read it before you send it."""
 
 
 def make_report(configs: Sequence[Path], sockets: Sequence[Path]) -> str:
@@ -108,7 +109,7 @@ def _run(*command: str) -> str:
             timeout=COMMAND_TIMEOUT_S,
             check=False,
             stdin=subprocess.DEVNULL,
-            env={**os.environ, "COLUMNS": "120", "NO_COLOR": "1"},
+            env={**os.environ, "COLUMNS": "80", "NO_COLOR": "1"},
         )
     except FileNotFoundError:
         return f"{command[0]} is not installed here\n"

@@ -6,7 +6,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Final
 
 from rich.box import SIMPLE_HEAD
-from rich.console import Console, Group, RenderableType
+from rich.console import Console, RenderableType
+from rich.measure import Measurement
 from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
@@ -23,26 +24,37 @@ from uavlinkd.mavlink.policy.compilation import Policy, PolicyRow
 from uavlinkd.mavlink.policy.roles import ROLES
 from uavlinkd.ops.surroundings import Surroundings
 
-_PLAIN_WIDTH: Final = 100
-"""Columns of the output if it is not a terminal: a pipe has no width."""
+_MOST_COLUMNS: Final = 100_000
+"""More than any line has."""
+_NEVER_BROKEN: Final = frozenset({"name", "key", "public key", "address", "URL"})
 
 
 def print_topology(config: Config, here: Surroundings | None = None, console: Console | None = None) -> None:
-    """Print the topology: with colours on a terminal, as plain text elsewhere. ``here``: what this machine has."""
+    """Print the topology: with colours on a terminal, as plain text elsewhere. ``here``: what this machine has.
+
+    Users compare and copy keys and URLs, so none is broken: a table may be wider than the terminal. In a pipe, each
+    row, error and warning is one line, for ``grep``; only policies are folded.
+    """
     if console is None:
         console = Console()
-    if console.is_terminal:
-        console.print(describe(config, here))
-        return
-    plain = Console(width=_PLAIN_WIDTH, no_color=True, force_terminal=False)
-    with plain.capture() as captured:
-        plain.print(describe(config, here))
-    # Tables pad their columns with spaces, which a file does not need.
-    console.file.writelines(line.rstrip() + "\n" for line in captured.get().splitlines())
+    facts, policies, verdict = _facts(config, here), _policies(config), _verdict(config.warnings, here)
+    columns, is_plain = console.width, not console.is_terminal
+    printer = Console(no_color=True, force_terminal=False) if is_plain else console
+    wide = printer.options.update(width=_MOST_COLUMNS)
+    for parts, folds in ((facts, False), (policies, True), ([verdict], False)):
+        for part in parts:
+            needed = Measurement.get(printer, wide, part)
+            printer.width = columns if folds else max(columns, needed.maximum if is_plain else needed.minimum)
+            with printer.capture() as captured:
+                printer.print(part, crop=False)
+            text = captured.get()
+            # Tables pad their columns with spaces, which a file does not need.
+            lines = [line.rstrip() + "\n" for line in text.splitlines()]
+            console.file.writelines(lines if is_plain else [text])
 
 
-def describe(config: Config, here: Surroundings | None) -> Group:
-    """All tables, the most important first. A few peers fit on one screen.
+def _facts(config: Config, here: Surroundings | None) -> list[RenderableType]:
+    """The tables of what is configured, the most important first. A few peers fit on one screen.
 
     Text from the file is always a :class:`rich.text.Text`, so that it cannot act as markup.
     """
@@ -83,9 +95,7 @@ def describe(config: Config, here: Surroundings | None) -> Group:
         )
         titles = ("name", "public key", "PSK", "members", "datagrams/s", "kbit/s")
         parts += [_heading("Members of this relay, and their limits"), _table(titles, members)]
-    parts += _policies(config)
-    parts.append(_verdict(config.warnings, here))
-    return Group(*parts)
+    return parts
 
 
 def _heading(text: str) -> Text:
@@ -93,9 +103,9 @@ def _heading(text: str) -> Text:
 
 
 def _table(columns: Sequence[str], rows: Iterable[Sequence[str | Text]]) -> Table:
-    table = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False)
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False, padding=(0, 1, 0, 0))
     for column in columns:
-        table.add_column(column, overflow="fold")
+        table.add_column(column, overflow="fold", no_wrap=column in _NEVER_BROKEN)
     for cells in rows:
         table.add_row(*(Text(cell) if isinstance(cell, str) else cell for cell in cells))
     return table
@@ -213,7 +223,7 @@ def _verdict(warnings: Sequence[str], here: Surroundings | None) -> RenderableTy
     table.add_column(overflow="fold")
     for label, line in lines:
         table.add_row(Text(label, style="bold red" if label == "error:" else "bold yellow"), Text(line))
-    return Padding(table, (1, 0, 0, 0))
+    return Padding(table, (1, 0, 0, 0), expand=False)
 
 
 # Policies, for a review.
