@@ -20,7 +20,7 @@ from uavlinkd.ops.commands import add_parsers as add_daemon_commands
 from uavlinkd.system.terminal import FAILED, OK, CommandError, UsageError, printable
 
 _LINE_LIMIT = 4096
-_OF_THE_LABORATORY = {
+OF_THE_LABORATORY = {
     "sim": "fly a simulated autopilot, or play a recorded flight",
     "demo": "run two daemons on this machine that exchange frames",
     "evaluate": "measure uavlinkd: beside the paper's method, under attack, and with radios that fail",
@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command and return its exit status."""
 
     def command() -> int:
-        options = _parser().parse_args(arguments)
+        options = make_parser().parse_args(arguments)
         return int(options.command(options))
 
     return _to_the_end(command)
@@ -119,7 +119,8 @@ class _Parser(argparse.ArgumentParser):
         return super().parse_known_args(args, namespace)
 
 
-def _parser() -> argparse.ArgumentParser:
+def make_parser() -> argparse.ArgumentParser:
+    """The parser of ``uavlinkd``. The commands of the laboratory have no arguments before ``fill_by_lab``."""
     parser = argparse.ArgumentParser(
         prog="uavlinkd",
         description="Carry MAVLink between drones over an authenticated link. An attacker on the network cannot "
@@ -161,13 +162,18 @@ def _parser() -> argparse.ArgumentParser:
     psk = add("psk", _psk, "make a pre-shared key for one pair of peers")
     psk.add_argument("--out", metavar="FILE", type=Path, help="write it to FILE (mode 0600) instead of stdout")
 
-    for name, text in _OF_THE_LABORATORY.items():
-        commands.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.", fill=_fill_by_lab)
+    for name, text in OF_THE_LABORATORY.items():
+        commands.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.", fill=fill_by_lab)
     add_fleet(commands)
     return parser
 
 
-def _fill_by_lab(parser: argparse.ArgumentParser) -> None:
+def fill_by_lab(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of a command of the laboratory.
+
+    Raises:
+        CommandError: it is not installed.
+    """
     _need_lab(parser.prog)
     from uavlinkd.lab.commands import add_arguments
 

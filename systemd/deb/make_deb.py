@@ -92,6 +92,10 @@ def build(release: Release, options: argparse.Namespace, folder: Path, epoch: in
         install(root)
         tree = work / "tree"
         lay_out(root, tree)
+        # Beside shtab, which the script imports from its own folder.
+        shutil.copytree(folder / "backend/shtab", work / "manuals/shtab")
+        shutil.copy(HERE / "manuals.py", work / "manuals")
+        inside(root, f"/{PLACE}/bin/python3", f"/{_WORK}/manuals/manuals.py", f"/{_WORK}/tree/usr")
         control = CONTROL.format(
             version=version,
             architecture=architecture,

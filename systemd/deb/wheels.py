@@ -18,7 +18,7 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 PROJECT = HERE.parents[1]
 BACKEND_LOCK = HERE / "backend.lock"
-"""What builds the wheel of uavlinkd."""
+"""What builds the wheel of uavlinkd, and its shell completions."""
 MACHINES = {"amd64": "x86_64", "arm64": "aarch64"}
 """Debian's names of architectures, and those in the names of wheels."""
 
@@ -89,11 +89,12 @@ def write_lock(path: Path, text: str, *folders: Path) -> None:
 
 def main() -> None:
     """Write all lock files."""
-    backend = tomllib.loads((PROJECT / "pyproject.toml").read_text())["build-system"]["requires"]
+    file = tomllib.loads((PROJECT / "pyproject.toml").read_text())
+    backend = [*file["build-system"]["requires"], *file["project"]["optional-dependencies"]["completion"]]
     with tempfile.TemporaryDirectory(prefix="uavlinkd-wheels-") as name:
         folder = Path(name)
         pip("download", "--only-binary=:all:", f"--dest={folder / 'backend'}", *backend)
-        write_lock(BACKEND_LOCK, "What builds the wheel of uavlinkd.", folder / "backend")
+        write_lock(BACKEND_LOCK, "What builds the wheel of uavlinkd, and its shell completions.", folder / "backend")
         for release in RELEASES.values():
             folders = [folder / f"{release.number}-{machine}" for machine in MACHINES.values()]
             for machine, wheels in zip(MACHINES.values(), folders, strict=True):

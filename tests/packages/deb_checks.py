@@ -152,6 +152,8 @@ def test_package_holds_what_a_vehicle_needs(package: Package) -> None:
     assert not [name for name in names if "/uavlinkd/lab" in name]
     assert {fields[1] for fields in listing} == {"root/root"}
     assert {fields[0] for fields in listing} <= {"drwxr-xr-x", "drwx------", "-rw-r--r--", "-rwxr-xr-x", "lrwxrwxrwx"}
+    shares = ("man/man1/uavlinkd.1.gz", "bash-completion/completions/uavlinkd", "zsh/vendor-completions/_uavlinkd")
+    assert {f"./usr/share/{path}" for path in shares} <= names
     assert {"./usr/lib/systemd/system/uavlinkd.service", "./usr/bin/uavlinkd"} <= names
 
 

@@ -23,7 +23,8 @@ from uavlinkd.ops.log import set_up_logging
 from uavlinkd.system import core_dumps
 
 
-def _parser() -> argparse.ArgumentParser:
+def make_parser() -> argparse.ArgumentParser:
+    """The parser of ``uavlink-mitm relay``."""
     parser = argparse.ArgumentParser(
         prog="uavlink-mitm relay",
         description="A relay that attacks its members. It has a relay's key, and no key of a member.",
@@ -36,7 +37,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def relay_main(arguments: Sequence[str]) -> int:
     """Run the command and return its exit status."""
-    options = _parser().parse_args(arguments)
+    options = make_parser().parse_args(arguments)
     if options.list:
         return print_list(list_attacks(ALL_ATTACKS))
     if options.config is None:

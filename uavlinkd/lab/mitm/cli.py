@@ -34,7 +34,8 @@ _EPILOG = (
 )
 
 
-def _parser() -> argparse.ArgumentParser:
+def make_parser() -> argparse.ArgumentParser:
+    """The parser of ``uavlink-mitm`` without a command."""
     parser = argparse.ArgumentParser(
         prog="uavlink-mitm",
         description="A proxy between uavlinkd daemons, without their keys. It attacks the link, or emulates a radio.",
@@ -52,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = sys.argv[1:] if arguments is None else arguments
     if words[:1] == ["modem"]:
         return _modem(words[1:])
-    options = _parser().parse_args(words)
+    options = make_parser().parse_args(words)
     if options.list:
         return print_list(list_attacks())
     if options.config is None and options.ask is None:
@@ -81,7 +82,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return OK
 
 
-def _modem_parser() -> argparse.ArgumentParser:
+def make_modem_parser() -> argparse.ArgumentParser:
+    """The parser of ``uavlink-mitm modem``."""
     defaults = ModemSettings()
     names = ", ".join(f"{name}={getattr(defaults, name)}" for name in ModemSettings.__slots__)
     parser = argparse.ArgumentParser(
@@ -104,7 +106,7 @@ def _modem_parser() -> argparse.ArgumentParser:
 
 def _modem(arguments: Sequence[str]) -> int:
     """Run the command and return its exit status."""
-    options = _modem_parser().parse_args(arguments)
+    options = make_modem_parser().parse_args(arguments)
     if options.list:
         return print_list(list_line_attacks())
     if options.ask is not None:
