@@ -92,8 +92,8 @@ def _arrivals(patched: pytest.MonkeyPatch, honest: Honest, floods: Sequence[Make
         return len(data)
 
     patched.setattr(asyncio, "get_running_loop", lambda: clock)
-    patched.setattr(serial, "monotonic", lambda: clock.now)
-    patched.setattr(stream_endpoint, "monotonic", lambda: clock.now)
+    for module in (serial, stream_endpoint):
+        patched.setattr(module, "monotonic", lambda: clock.now)
     patched.setattr(os, "write", write)
     device = cast(BaseSerial, SimpleNamespace(fileno=lambda: -1, num_unwritten_bytes=lambda: 0))
     endpoint = SerialEndpoint("serial", SerialUrl("line", BAUD), Recorder())

@@ -84,15 +84,6 @@ def test_sources_share_by_bytes(flood: Callable[[int], Frame]) -> None:
     assert abs(sums[HONEST] - sums[CAPTURED]) <= 300
 
 
-def test_flood_of_urgent_frames_shares_with_urgent_frames() -> None:
-    """Heartbeats of invented components take turns with the commands of another source."""
-    queue, _ = make()
-    queue.put([heartbeat(number, 2, number % 250 + 1) for number in range(500)], CAPTURED, 0.0)
-    queue.put([command(number) for number in range(50)], HONEST, 0.0)
-    sums = bytes_by_source(popped(queue, 2000))
-    assert abs(sums[HONEST] - sums[CAPTURED]) <= 100
-
-
 def test_urgent_frames_have_half_of_the_line_beside_many_sources() -> None:
     """A joystick is not reduced to the share of one of fifty members that send positions."""
     queue, _ = make()
