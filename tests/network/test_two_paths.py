@@ -65,6 +65,26 @@ def _both(vehicle: Drone, station: Drone) -> list[tuple[Drone, Drone]]:
     return [(vehicle, station), (station, vehicle)]
 
 
+@pytest.mark.parametrize("since_s", [0.5, 1.2, 2.0])
+def test_path_that_dies_while_the_other_one_returns_is_left_soon(since_s: float) -> None:
+    """The other one answers, but has not proved itself yet. The best one is asked as often as beside a usable one."""
+    for seed in range(2):
+        with Network(f"returns {seed}") as network:
+            vehicle, station = linked_vehicle(network, (FAST, FAST), Link())
+            flow = network.traffic(vehicle, station, 0.02)
+            network.run(4 + network.rng.random())
+            best = vehicle.peer(station).path
+            assert best is not None
+            network.cut_path(hop(vehicle, station, 1 - best.socket))
+            network.run(4 + network.rng.random())
+            network.heal_path(hop(vehicle, station, 1 - best.socket))
+            network.run(since_s)
+            died = network.now
+            network.cut_path(hop(vehicle, station, best.socket))
+            network.run(5)
+            assert flow.longest_gap(died - 1, network.now) < 0.5
+
+
 MESH, LTE = 0, 1
 RADIOS = RadioSettings(delay_s=0.02), RadioSettings(delay_s=0.05)
 UP_WITHIN_S = 3.0

@@ -379,7 +379,7 @@ class PathSet(PathSlots):
             return (self._idle_probe_s if others else 0) or c.NEVER  # echo requests ask along a path without others
         if state.answers < c.SETTLING_ANSWERS:
             return c.PROBE_FAST_S
-        if not any(other.condition is PathCondition.USABLE for other in others):
+        if not any(other.works or other.is_recovering for other in others):
             return c.PROBE_INTERVAL_S
         carries_stream = state is self.best and now < self.stream_at + c.STREAM_ENDS_AFTER_S
         return c.PROBE_FAST_S if carries_stream else c.PROBE_STANDBY_S
