@@ -63,14 +63,11 @@ def send_frames(peer: Peer, frames: Sequence[bytes], now: float, cls: Class) -> 
 
 
 def resend(peer: Peer, state: PathState, now: float) -> list[Output]:
-    """Send the recent critical envelopes of the current session along a path that is new. Frames crossed none before.
-
-    The receiver drops those that have arrived.
-    """
-    recent, session = list(peer.recent), peer.sessions.current
-    peer.recent.clear()
+    """Send the recent critical envelopes of the current session along a new path too. Each is sent again once."""
+    session = peer.sessions.current
     out: list[Output] = []
-    for sent_at, datagram in recent:
+    while peer.recent:
+        sent_at, datagram = peer.recent.popleft()
         is_current = session is not None and wire.claimed_receiver_index(datagram) == session.remote_index
         if now <= sent_at + c.RESENT_S and is_current and peer.paths.carries(state, len(datagram)):
             state.sent += 1

@@ -30,7 +30,6 @@ RAW = itemgetter(0)
 STICKS_COPIED_S = 0.05
 """Between copies of MANUAL_CONTROL or RC_CHANNELS_OVERRIDE, at least, while the best path is healthy. At 50/s every
 third one is copied, so a path that dies costs at most two in a row."""
-_STICK_FLOWS = 64  # that are remembered
 
 OnSent = Callable[[list[bytes], list[Output], float], None]
 """Receives frames that were sent, and the outputs of the core for them, which are to be performed."""
@@ -229,10 +228,9 @@ class PeerOutput:
         best = peer.paths.best
         is_healthy = best is not None and best.condition is PathCondition.USABLE and best.loss_out < BEGIN_LOSS
         flows = set(map(flow_key, frames))
-        if is_healthy and all(now < self._copied_at.get(flow, -NEVER) + STICKS_COPIED_S for flow in flows):
+        self._copied_at = {flow: at for flow, at in self._copied_at.items() if now < at + STICKS_COPIED_S}
+        if is_healthy and flows <= self._copied_at.keys():
             return True
-        if len(self._copied_at) > _STICK_FLOWS:
-            self._copied_at.clear()  # the next one of each is copied
         self._copied_at |= dict.fromkeys(flows, now)
         return False
 
