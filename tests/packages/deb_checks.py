@@ -152,9 +152,9 @@ def test_package_holds_what_a_vehicle_needs(package: Package) -> None:
     assert not [name for name in names if "/uavlinkd/lab" in name]
     assert {fields[1] for fields in listing} == {"root/root"}
     assert {fields[0] for fields in listing} <= {"drwxr-xr-x", "drwx------", "-rw-r--r--", "-rwxr-xr-x", "lrwxrwxrwx"}
-    shares = ("man/man1/uavlinkd.1.gz", "bash-completion/completions/uavlinkd", "zsh/vendor-completions/_uavlinkd")
-    assert {f"./usr/share/{path}" for path in shares} <= names
-    assert {"./usr/lib/systemd/system/uavlinkd.service", "./usr/bin/uavlinkd"} <= names
+    shared = ("man/man1/uavlinkd.1.gz", "bash-completion/completions/uavlinkd", "zsh/vendor-completions/_uavlinkd")
+    installed = ("lib/systemd/system/uavlinkd.service", "bin/uavlinkd", *(f"share/{path}" for path in shared))
+    assert {f"./usr/{path}" for path in installed} <= names
 
 
 def test_installation_by_hand_is_refused(package: Package, machine: Machine) -> None:
