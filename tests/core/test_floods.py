@@ -240,6 +240,16 @@ def test_senders_are_distinguished() -> None:
     assert node.claimed_sender(flooding(1), AT_A) is None
 
 
+def test_newer_initiation_supersedes_one_for_the_same_key_along_the_same_path_only() -> None:
+    """A forgery without the public key, another path, a response and an empty datagram supersede nothing."""
+    node = established().b.node
+    first, newer = (node.handshake_source(flooding(number), AT_A) for number in (1, 2))
+    assert [first] == [newer] == node.initiations_from(AT_A)
+    forged = flooding(1)[: -wire.MACS_BYTES] + bytes(wire.MACS_BYTES)
+    others = [(forged, AT_A), (flooding(1), ELSEWHERE), (b"\1", AT_A), (b"\2", AT_A), (b"", AT_A)]
+    assert len({first, *(node.handshake_source(*other) for other in others)}) == 1 + len(others)
+
+
 # A daemon with many peers, such as a relay, starts again: all of them initiate at once.
 
 

@@ -65,6 +65,8 @@ class Scene:
             receive=self.receive,
             refuse=lambda datagram, path: Dropped(DropReason.OVER_SHARE, None, path),
             claimed_sender=lambda *_: 0,
+            handshake_source=lambda datagram, path: (path, datagram[:2] if datagram[:1] == b"\1" else datagram),
+            initiations_from=lambda path: [(path, HANDSHAKES[4])],
             next_deadline=lambda: NEVER,
             drops=dict.fromkeys(DropReason, 0),
         )
@@ -170,16 +172,31 @@ async def handled(*datagrams: bytes) -> tuple[list[bytes], int]:
 
 
 async def test_handshakes_do_not_keep_the_first_sessions_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
-    """They come before the envelopes while there is time, then the newest first: their senders still wait for them.
+    """They come before the envelopes while there is time. Of each source the newest waits, in the place of the first.
 
-    Too many are dropped and counted, the oldest first.
+    One that is superseded, and the oldest of too many, are dropped and counted.
     """
     assert await handled(ENVELOPE, *HANDSHAKES) == ([*HANDSHAKES, ENVELOPE], 0)
     monkeypatch.setattr(module, "HANDSHAKES_S", 0.0)
     first, *others = HANDSHAKES
-    assert await handled(*HANDSHAKES, ENVELOPE) == ([first, ENVELOPE, *others[::-1]], 0)
+    assert await handled(*HANDSHAKES, ENVELOPE) == ([first, ENVELOPE, *others], 0)
+    newer = others[0] + b"newer"
+    assert await handled(*HANDSHAKES, newer) == ([first, newer, *others[1:]], 1)
     monkeypatch.setattr(module, "WAITING_HANDSHAKES", 2)
-    assert await handled(*HANDSHAKES) == ([HANDSHAKES[0], HANDSHAKES[4], HANDSHAKES[3]], 2)
+    assert await handled(*HANDSHAKES) == ([HANDSHAKES[3], HANDSHAKES[4]], 3)
+
+
+async def test_initiation_of_a_sender_that_has_a_session_now_is_not_answered(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It was repeated before the first answer arrived."""
+    monkeypatch.setattr(module, "HANDSHAKES_S", 0.0)
+    scene = Scene()
+    scene.read(*HANDSHAKES)
+    established = SessionEstablished(scene.peer, AT_A, 1, "x25519", False, 16, initiator=False, rekey=False)
+    scene.carrier.perform([established])
+    for _ in HANDSHAKES:
+        await asyncio.sleep(0)
+    assert [datagram for datagram, _ in scene.received] == HANDSHAKES[:4]
+    assert len(scene.refused) == 1
 
 
 async def test_timer_follows_what_a_confirmed_key_makes_due(monkeypatch: pytest.MonkeyPatch) -> None:

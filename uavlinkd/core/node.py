@@ -287,6 +287,18 @@ class Node:
             return peer, state is not None and state.is_proven
         return path.sender if self._is_known(path.place) else None
 
+    def handshake_source(self, datagram: bytes, path: Path) -> Hashable:
+        """What tells handshake messages apart that wait in a busy shell: a newer one supersedes one that is equal.
+
+        Initiations along one path for one of our keys are equal. Others, and forgeries without that key, are not.
+        """
+        is_initiation = bool(datagram) and datagram[0] == wire.INITIATION
+        return path, self._handshakes.addressed_key(datagram) if is_initiation else datagram
+
+    def initiations_from(self, path: Path) -> list[Hashable]:
+        """All that :meth:`handshake_source` returns for initiations along a path that are for us."""
+        return [(path, key) for key in self._handshakes.public_keys]
+
     def refuse(self, datagram: bytes, path: Path) -> Dropped:
         """Count a datagram that a busy shell does not hand over: more wait than their share."""
         return self._count(datagram, Drop(DropReason.OVER_SHARE), path)

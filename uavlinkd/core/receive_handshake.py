@@ -81,6 +81,13 @@ class HandshakeReceiver:
             return self._receive_cookie(datagram, path, now)
         raise Drop(DropReason.RAW_MAVLINK if kind in _MAVLINK_STARTS else DropReason.MALFORMED)
 
+    def addressed_key(self, datagram: bytes) -> bytes:
+        """Which of our keys a handshake message is for; the datagram itself if it is for none of them."""
+        try:
+            return self._addressed(datagram).identity.public
+        except Drop:
+            return datagram
+
     def remember(self, peer: Peer, ephemeral: bytes) -> None:
         """An authentic initiation of this peer came, with this ephemeral."""
         # A memory for each peer: no peer can make us forget what another sent.

@@ -33,8 +33,8 @@ from uavlinkd.system.clock import monotonic
 
 HANDSHAKES_S: Final = 0.01
 """CPU time for handshake messages before the envelopes have their turn: about twenty of them."""
-WAITING_HANDSHAKES: Final = 256
-"""Handshake messages that wait, at most: what is handled in a tenth of a second."""
+WAITING_HANDSHAKES: Final = 1024
+"""Handshake messages that wait, at most: what is handled in half a second, one of each member of a large relay."""
 MAX_PATHS: Final = 1024
 """Paths of received datagrams that are remembered: a frame on one of them costs no new object."""
 LOOP_TICK_S: Final = 0.001
@@ -127,7 +127,7 @@ class FrameCarrier:
         carriage = Carriage(parts.node, self.perform, self.settle, self._sockets.budgets, self._waiting)
         self.peers = Peers(parts, carriage)
         self._turns = Turns()
-        self._handshakes: deque[WaitingDatagram] = deque()
+        self._handshakes: dict[Hashable, WaitingDatagram] = {}  # that wait, the newest of each source
         self._paths: dict[tuple[int, SocketAddress], Path] = {}
         self._read_at, self._epoch = 0.0, 0  # of the datagrams that are received now
         self._frames: dict[PeerLink, list[Frame]] = {}  # delivered, but not forwarded yet
@@ -153,7 +153,7 @@ class FrameCarrier:
                     paths.clear()
                 path = paths[socket, address] = Path(socket, address)
             arrived.append((datagram, path))
-        if len(arrived) == 1 and not self._turns.queues:  # a turn of one datagram needs no clock
+        if len(arrived) == 1 and not (self._turns.queues or self._handshakes):  # one datagram needs no clock
             self._read_at, self._epoch = now, epoch
             self.perform(self._node.receive(*arrived[0], now))
             if epoch != self._stall.epoch:
@@ -212,19 +212,31 @@ class FrameCarrier:
         they must not keep the envelopes of the first sessions waiting either, or these sessions would be lost again.
         """
         envelopes: list[WaitingDatagram] = []
-        handshakes: list[WaitingDatagram] = []
-        for waiting in arrived:
-            (envelopes if waiting[0][:1] in ENVELOPE_STARTS else handshakes).append(waiting)
-        self._read_at, self._epoch = now, epoch
-        ends_at = thread_time() + HANDSHAKES_S if len(handshakes) > 1 else 0.0
-        for number, (datagram, path) in enumerate(handshakes, 1):
-            self.perform(self._node.receive(datagram, path, now))
-            if number < len(handshakes) and thread_time() >= ends_at:
-                self._handshakes += handshakes[number:]
-                break
-        while len(self._handshakes) > WAITING_HANDSHAKES:  # the oldest: their senders send new ones
-            self.perform((self._node.refuse(*self._handshakes.popleft()),))
+        was_waiting, waiting = bool(self._handshakes), self._handshakes
+        for datagram, path in arrived:
+            if datagram[:1] in ENVELOPE_STARTS:
+                envelopes.append((datagram, path))
+                continue
+            # A sender repeats its initiation with other keys. The newest takes the place of the one before it.
+            key = self._node.handshake_source(datagram, path)
+            if (before := waiting.get(key)) is not None:
+                self.perform((self._node.refuse(*before),))
+            elif len(waiting) >= WAITING_HANDSHAKES:
+                self.perform((self._node.refuse(*waiting.pop(next(iter(waiting)))),))
+            waiting[key] = datagram, path
+        if not was_waiting:
+            self._read_at, self._epoch = now, epoch
+            self._do_handshakes()
         return envelopes
+
+    def _do_handshakes(self) -> None:
+        """Receive handshake messages that wait, the first source first, for at most :data:`HANDSHAKES_S`."""
+        ends_at = thread_time() + HANDSHAKES_S if len(self._handshakes) > 1 else 0.0
+        while self._handshakes:
+            datagram, path = self._handshakes.pop(next(iter(self._handshakes)))
+            self.perform(self._node.receive(datagram, path, self._read_at))
+            if self._handshakes and thread_time() >= ends_at:
+                break
 
     def _do_turns(self) -> None:
         """Do one turn of each sender. Then the sockets, the timer and the control socket have theirs."""
@@ -232,13 +244,8 @@ class FrameCarrier:
         try:
             for turn, epoch in self._turns.round():
                 self._do_turn(turn, monotonic(), epoch)
-            # The newest handshake message is most likely one that its sender still waits for.
             self._read_at, self._epoch = monotonic(), self._stall.epoch
-            ends_at = thread_time() + HANDSHAKES_S
-            while self._handshakes:
-                self.perform(self._node.receive(*self._handshakes.pop(), self._read_at))
-                if thread_time() >= ends_at:
-                    break
+            self._do_handshakes()
         finally:
             if self._is_busy:
                 self._loop.call_soon(self._do_turns)
@@ -340,6 +347,10 @@ class FrameCarrier:
 
     def _on_event(self, event: o.Event) -> None:
         now, parts = monotonic(), self._parts
+        if self._handshakes and isinstance(event, o.SessionEstablished):  # its peer waits for no other answer
+            for key in self._node.initiations_from(event.path):
+                if (waiting := self._handshakes.pop(key, None)) is not None:
+                    self.perform((self._node.refuse(*waiting),))
         if parts.relay is not None:
             parts.relay.on_event(event, now)
         parts.relays.on_event(event, now)
