@@ -26,7 +26,7 @@ USERS_OF_PYMAVLINK = ("lab/sim/",)
 CORE_WITHOUT_KEYS = {
     f"uavlinkd.core.{name}"
     for name in (
-        *("constants", "drops", "limits", "outputs", "path", "probe", "refusals", "relay_records"),
+        *("constants", "drops", "limits", "outputs", "path", "probe", "problem_reports", "refusals", "relay_records"),
         *("suites", "wire"),
     )
 }

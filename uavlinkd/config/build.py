@@ -199,7 +199,7 @@ def _relay(file: Sections, section: Values) -> RelayConfig:
             name=RELAY_HOST + section.valid["name"],
             public_key=section.valid["public_key"],
             psk=file.secret(section, "psk_file"),
-            link=Link(suites, timers=TIMERS, features=c.FEATURE_REFUSALS | c.FEATURE_RECORDS),
+            link=Link(suites, timers=TIMERS, features=c.KNOWN_FEATURES),
         ),
         addresses=tuple(dict.fromkeys((*([] if peer is None else over_ip(peer)), *over_ip(section)))),
         previous_public_key=section.get("previous_public_key"),

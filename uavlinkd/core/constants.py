@@ -48,9 +48,13 @@ FEATURE_REFUSALS = 1
 """Bit of the parameters' features: the sender understands refusal reports. Both ends must set it."""
 FEATURE_RECORDS = 2
 """The same for the records between a member and its relay."""
-KNOWN_FEATURES = FEATURE_REFUSALS | FEATURE_RECORDS
+FEATURE_PROBLEMS = 4
+"""The same for problem reports."""
+KNOWN_FEATURES = FEATURE_REFUSALS | FEATURE_RECORDS | FEATURE_PROBLEMS
 REFUSALS_PER_REPORT = 16
 """Entries of a refusal report at most: with 161 bytes it fits the smallest envelope."""
+PROBLEMS_PER_REPORT = 8
+"""Codes of a problem report at most."""
 
 LATE_AFTER_S = 2.0
 """What was sent longer ago than this is late: refused if the receiver can see it, else asked about. Both ends must
@@ -298,6 +302,10 @@ REFUSALS_SENDS = 2
 """A changed count is in so many reports: at 30 % loss at least one of them arrives in 91 % of cases."""
 REFUSALS_KEPT = 64
 """Kinds of refused frames that are counted for one peer, and claims of it that are kept."""
+PROBLEMS_INTERVAL_S = 60.0
+"""While a problem lasts, it is reported this often: at most 60 bytes with all headers, 8 bit/s."""
+PROBLEMS_LAST_S = 150.0
+"""A problem report is shown for this long: one of two repetitions may be lost."""
 ECHO_BUDGET_SHARE = 0.05
 """Periodic echo requests and their replies use at most this part of the budget of a network,"""
 HOLD_AIRTIMES = 8

@@ -10,6 +10,7 @@ from uavlinkd.core import wire
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.outputs import Deliver, FreshnessUnverified, FreshnessVerified, Output
 from uavlinkd.core.peer import Peer
+from uavlinkd.core.problem_reports import ProblemReport
 from uavlinkd.core.refusals import RefusalReport
 from uavlinkd.core.send import ask_for_echo
 from uavlinkd.core.session import Session
@@ -49,14 +50,15 @@ def question(peer: Peer, session: Session, now: float) -> list[Output]:
 
 
 def receive_report(
-    peer: Peer, session: Session, counter: int, report: RefusalReport, now: float, *, is_new: bool
+    peer: Peer, session: Session, counter: int, report: RefusalReport | ProblemReport, now: float, *, is_new: bool
 ) -> list[Output]:
-    """Note a report. After a silence it waits for proof: older totals must not replace newer ones, nor look new."""
+    """Note a report. After a silence it waits for proof: an older one must not replace a newer one, nor look new."""
     if is_new:
-        peer.refusal_claims.note(report, now)
+        peer.note_report(report, now)
         return []
-    if session.unverified_report is None or session.unverified_report[0] < counter:
-        session.unverified_report = counter, report
+    waiting = session.unverified_reports.get(type(report))
+    if waiting is None or waiting[0] < counter:
+        session.unverified_reports[type(report)] = counter, report
     return question(peer, session, now)
 
 
@@ -84,9 +86,10 @@ def receive_answer(peer: Peer, echo: wire.Echo, now: float) -> list[Output]:
     if peer.round_trip_s <= session.held.pace.hold_s:
         session.trusted_until = now + c.LATE_AFTER_S
         out += peer.note_received(now)
-        waiting, session.unverified_report = session.unverified_report, None
-        if waiting is not None and waiting[0] >= echo.fresh:
-            peer.refusal_claims.note(waiting[1], now)
+        for counter, report in session.unverified_reports.values():
+            if counter >= echo.fresh:
+                peer.note_report(report, now)
+        session.unverified_reports.clear()
         new, late = session.held.release(echo.fresh)
         out += [Deliver(peer, payload, session.order_of(counter)) for counter, payload in new]
         out += peer.drop(DropReason.DELAYED, late)

@@ -191,6 +191,14 @@ class Node:
             return []
         return seal(peer, session, report.encode(), route, now, is_answer=True)
 
+    def report_problems(self, peer: Peer, codes: Iterable[int], now: float) -> list[Output]:
+        """Report this end's own problems to the peer, if that is due and it understands such reports."""
+        session, route = peer.session_with(c.FEATURE_PROBLEMS, now), peer.paths.routes[Class.BULK]
+        if session is None or not route:
+            return []
+        report = peer.own_problems.take(codes, session.parameters.generation, now)
+        return [] if report is None else seal(peer, session, report.encode(), route, now, is_answer=True)
+
     def send_record(self, peer: Peer, path: Path, record: Record, now: float) -> list[Output]:
         """Send a record to a relay or to a member along one path, encrypted. It expects no answer from the session.
 

@@ -21,7 +21,8 @@ from uavlinkd.core.path import Path, SocketAddress, SocketFacts
 from uavlinkd.core.path_measures import MissingEnvelopes
 from uavlinkd.core.path_state import PathState
 from uavlinkd.core.paths import PathSet
-from uavlinkd.core.refusals import OwnRefusals, RefusalClaims
+from uavlinkd.core.problem_reports import OwnProblems, ProblemClaim, ProblemReport
+from uavlinkd.core.refusals import OwnRefusals, RefusalClaims, RefusalReport
 from uavlinkd.core.session import Session
 from uavlinkd.core.sessions import EchoRequests, Indices, Sessions
 from uavlinkd.core.settings import PeerSettings, Screen
@@ -130,6 +131,9 @@ class Peer:
         self.own_refusals = OwnRefusals()
         self.refusal_claims = RefusalClaims()
         """What the peer says that it refuses of our frames. Nothing acts on it."""
+        self.own_problems = OwnProblems()
+        self.problem_claim = ProblemClaim((), -c.NEVER)
+        """What the peer says about its own problems. Nothing acts on it."""
 
     @property
     def path(self) -> Path | None:
@@ -209,6 +213,13 @@ class Peer:
         self.is_up = True
         self.set_paths_timer()
         return [PeerUp(self)]
+
+    def note_report(self, report: RefusalReport | ProblemReport, now: float) -> None:
+        """A report that is known to be new."""
+        if isinstance(report, RefusalReport):
+            self.refusal_claims.note(report, now)
+        else:
+            self.problem_claim = ProblemClaim(report.codes, now)
 
     def note_lost(self, now: float) -> list[Output]:
         """The peer is silent, or has no session any more."""

@@ -15,6 +15,7 @@ from uavlinkd.core.path_state import PathCondition, PathState
 from uavlinkd.core.paths import Route
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.probe import ANSWER_BYTES, PROBE, QUESTION_BYTES
+from uavlinkd.core.problem_reports import ProblemReport
 from uavlinkd.core.refusals import RefusalReport
 from uavlinkd.core.relay_records import parse_record
 from uavlinkd.core.send import may_echo, send_echo
@@ -174,8 +175,9 @@ def _receive_control(arrived: Arrived, payload: bytes) -> tuple[list[Output], by
             return receive_close(peer, session, now), b""
         case wire.SealedRecord(sealed):
             return _receive_record(arrived, sealed), b""
-        case RefusalReport():  # pragma: no branch  # the last kind there is
-            if not session.parameters.features & c.FEATURE_REFUSALS:
+        case RefusalReport() | ProblemReport():  # pragma: no branch  # the last kinds there are
+            feature = c.FEATURE_REFUSALS if isinstance(control, RefusalReport) else c.FEATURE_PROBLEMS
+            if not session.parameters.features & feature:
                 return [peer.drop_datagram(DropReason.BAD_CONTROL, state.path)], b""
             if arrived.is_superseded:
                 return [], b""

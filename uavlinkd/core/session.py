@@ -9,6 +9,7 @@ from uavlinkd.core.crypto import AeadKey, MacKey, equal, hkdf_expand
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.handshake import Keys
 from uavlinkd.core.path import Pace
+from uavlinkd.core.problem_reports import ProblemReport
 from uavlinkd.core.refusals import RefusalReport
 from uavlinkd.core.verification import HeldFrames, Verification
 
@@ -73,7 +74,7 @@ class Session:
         self.first_received_at = c.NEVER
         """When the peer's first envelope came: from then on it sends on this session, or on one of higher rank."""
         self.held = HeldFrames()
-        self.unverified_report: tuple[int, RefusalReport] | None = None
+        self.unverified_reports: dict[type, tuple[int, RefusalReport | ProblemReport]] = {}
         """The newest report after a silence, with its counter: kept until the peer shows whether it is new."""
         self.verification = Verification(now, verify_interval_s)
         self.order_base = 0

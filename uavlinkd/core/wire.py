@@ -13,6 +13,7 @@ from typing import NamedTuple
 from uavlinkd.core import constants as c
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.probe import PROBE, Probe, parse_probe
+from uavlinkd.core.problem_reports import PROBLEM_REPORT, ProblemReport, parse_problem_report
 from uavlinkd.core.refusals import REFUSAL_REPORT, RefusalReport, parse_report
 from uavlinkd.core.suites import SUITES, Suite
 
@@ -46,7 +47,7 @@ class Parameters:
 
         offset size field
         0      4    generation     of the session on which the sender sends to the peer, or 0
-        4      2    features       bits of protocol extensions: 1 refusal reports, 2 records; others are ignored
+        4      2    features       bits of protocol extensions: 1 refusal reports, 2 records, 4 problem reports
         6      1    flags          bit 0: confidential
         7      1    tag length     bytes: 8, 12, 16 or 32
         8      2    MAC key bits   256, 512, 1024 or 2048
@@ -340,7 +341,7 @@ class SealedRecord(NamedTuple):
         return bytes((SEALED_RECORD,)) + self.sealed
 
 
-Control = Echo | ProbeAndFrames | Close | RefusalReport | SealedRecord
+Control = Echo | ProbeAndFrames | Close | RefusalReport | SealedRecord | ProblemReport
 
 
 def parse_control(payload: bytes) -> Control:
@@ -364,6 +365,8 @@ def parse_control(payload: bytes) -> Control:
         return report
     if kind == SEALED_RECORD and size > 1 + c.AEAD_TAG_BYTES:
         return SealedRecord(payload[1:])
+    if kind == PROBLEM_REPORT and (problems := parse_problem_report(payload)) is not None:
+        return problems
     raise Drop(DropReason.BAD_CONTROL)
 
 

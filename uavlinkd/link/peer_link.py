@@ -14,6 +14,7 @@ from uavlinkd.core.outputs import LinkedPeer, Output, Transmit
 from uavlinkd.core.path import Path
 from uavlinkd.core.path_state import PathState
 from uavlinkd.core.peer import Peer
+from uavlinkd.core.problem_reports import LARGEST_PROBLEM_REPORT
 from uavlinkd.core.refusals import LARGEST_REPORT
 from uavlinkd.core.settings import PeerSettings, link_name
 from uavlinkd.core.timers import Deadline, Schedule
@@ -230,6 +231,12 @@ class PeerLink:
             return  # totals lose nothing until the next call
         self._perform(self._node.report_refusals(self.peer, self.policy.incoming.changed_totals(), now))
         self.output.charge(self.peers, now)
+
+    def report_problems(self, codes: Iterable[int], now: float) -> None:
+        """Report this daemon's own problems to the peer. Call it about once a second."""
+        if self.peer.is_up and self.output.has_room(LARGEST_PROBLEM_REPORT, now):
+            self._perform(self._node.report_problems(self.peer, codes, now))
+            self.output.charge(self.peers, now)
 
     def pick_newest(self, peer: LinkedPeer, frames: list[Frame], order: int, now: float) -> list[Frame]:
         """The frames of an envelope without the states that are superseded. Call it if the peer has several paths.
