@@ -40,8 +40,10 @@ local RECORDS = {
     [3] = { "Probe" }, -- 22 bytes with a question, else 20; frames or padding may follow
     [5] = { "Close", 1 },
     [6] = { "Refusal Report" }, -- 1 byte, and 10 for each of 1 to 16 entries
+    [8] = { "Problem Report" }, -- 1 byte, and 1 for each of 0 to 8 codes
 }
 local REFUSAL_REPORT, ENTRY_BYTES, MOST_ENTRIES = 6, 10, 16
+local PROBLEM_REPORT, MOST_CODES = 8, 8
 local PROBE, ANSWER_BYTES, QUESTION_BYTES = 3, 20, 22
 local ALONE, FRAMES_FOLLOW, PADDING_FOLLOWS = 0, 1, 2
 local PROBE_FLAGS = { [ALONE] = "alone", [FRAMES_FOLLOW] = "frames follow", [PADDING_FOLLOWS] = "padding follows" }
@@ -166,6 +168,9 @@ end
 local function is_record(kind, size)
     if kind == REFUSAL_REPORT then
         return (size - 1) % ENTRY_BYTES == 0 and size > 1 and size <= 1 + MOST_ENTRIES * ENTRY_BYTES
+    end
+    if kind == PROBLEM_REPORT then
+        return size >= 1 and size <= 1 + MOST_CODES
     end
     return RECORDS[kind] ~= nil and RECORDS[kind][2] == size
 end

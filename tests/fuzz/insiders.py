@@ -20,6 +20,7 @@ from uavlinkd.core.cookie import MacKeys
 from uavlinkd.core.outputs import Deliver, Dropped, Output, Transmit
 from uavlinkd.core.path import Path
 from uavlinkd.core.probe import ANSWER_BYTES, PROBE, QUESTION_BYTES, Probe
+from uavlinkd.core.problem_reports import ProblemReport
 from uavlinkd.core.refusals import RefusalReport, Refused
 from uavlinkd.core.session import Session
 from uavlinkd.core.settings import Link, PeerSettings, Timers
@@ -120,6 +121,9 @@ class Insider:
                 return self.probe(script, script.long())
             case 6:
                 return wire.Close().encode()
+            case 7 if which & 24 == 24:
+                codes = sorted({script.byte() for _ in range(script.byte() & 7)})
+                return ProblemReport(tuple(codes)).encode()
             case 7 if which & 8:
                 entries = tuple(
                     Refused(script.word() << 8 | script.byte(), script.word(), script.byte(), script.long())
@@ -239,6 +243,7 @@ class Insider:
         assert len(peer.remembered) == len(self.node._handshakes.remembered) <= c.REMEMBERED_INITIATIONS
         assert len(peer.echo_requests) <= 64, "too many echo requests"
         assert len(peer.refusal_claims.recent()) <= c.REFUSALS_KEPT, "too many claims"
+        assert len(peer.problem_claim.codes) <= c.PROBLEMS_PER_REPORT, "too many problems"
         assert len(peer.own_refusals._totals) <= c.REFUSALS_KEPT, "too many refusals"
         for session in sessions.confirmed:
             held = session.held

@@ -36,7 +36,7 @@ from uavlinkd.system import addresses
 
 HOUSEKEEPING_S: Final = 1.0
 MOST_PEERS: Final = 8
-FEATURES: Final = c.FEATURE_REFUSALS | c.FEATURE_RECORDS
+FEATURES: Final = c.KNOWN_FEATURES
 LINK: Final = Link(features=FEATURES)
 _LIMITS: Final = RelayLimits(datagrams_s=20_000, bits_s=100_000_000)
 _FIRST_NEW_PORT: Final = 32_768

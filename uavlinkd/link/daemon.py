@@ -17,9 +17,11 @@ from uavlinkd.endpoints.sockets import BindError
 from uavlinkd.link.carrier import FrameCarrier
 from uavlinkd.link.diagnosis import find
 from uavlinkd.link.local_endpoints import PilotNotes
+from uavlinkd.link.own_problems import own_codes
 from uavlinkd.link.parts import DaemonParts
 from uavlinkd.link.peer_link import radio_figures
 from uavlinkd.link.status import daemon_status, paths_status, state_of
+from uavlinkd.link.traffic_problems import has_no_client
 from uavlinkd.mavlink.own_frames import INTERVAL_S
 from uavlinkd.ops import LOG_SCHEMA
 from uavlinkd.ops.control import ControlServer
@@ -258,7 +260,11 @@ class Daemon:
         parts.history.sample(links, ((one, parts.local.policies[one.name]) for one in parts.local.endpoints), now)
         parts.local.do_housekeeping(radio_figures(links), now)
         parts.local.write_note(self._notes.next(links, now), now)
-        parts.events.write_findings(find(parts, now), now)
+        findings = find(parts, now)
+        parts.events.write_findings(findings, now)
+        codes = own_codes(findings, is_cut_off=has_no_client(findings, len(parts.local.endpoints)))
+        for link in links:
+            link.report_problems(codes, now)
         parts.drops.check(now)
         parts.events.check(now)
         self.carrier.arm()

@@ -11,6 +11,7 @@ from uavlinkd.core.path_state import PathState
 from uavlinkd.core.peer import Peer
 from uavlinkd.endpoints.ports import Endpoint
 from uavlinkd.link.diagnosis import find
+from uavlinkd.link.own_problems import codes_there, name_of_problem
 from uavlinkd.link.parts import DaemonParts
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.relay_link import RelayLink
@@ -133,6 +134,7 @@ def peer_status(link: PeerLink, now: float, way_of: WayOf) -> dict[str, object]:
         "malformed": _counts(link.counters.faults),
         **_refusals(link.policy),
         "refused_there": _claims(link, now),
+        "problems_there": [name_of_problem(code) for code in codes_there(peer, now)],
         "waiting_dropped": {} if link.output.egress is None else _counts(link.output.egress.totals),
         "repair": {
             "is_on": link.output.repair.is_on,

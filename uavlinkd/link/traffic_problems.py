@@ -16,6 +16,7 @@ from uavlinkd.core.sessions import Twin
 from uavlinkd.endpoints.url import EndpointKind
 from uavlinkd.link.evidence import GateHistory
 from uavlinkd.link.facts import EndpointFacts, Found, PartFacts, PeerFacts, fault, listed, security, warning
+from uavlinkd.link.own_problems import codes_there, problems_there
 from uavlinkd.mavlink.dialect import GROUPS, IDS, SYSTEM_ID, command_name, name_of
 from uavlinkd.mavlink.policy.gate import ANY_OTHER, REFUSALS, Gate, Refusal
 from uavlinkd.mavlink.policy.roles import ROLES
@@ -65,6 +66,8 @@ def peer_problems(peer: PeerFacts) -> Iterator[Found]:
     claims = [claim for claim in peer.link.peer.refusal_claims.recent() if peer.now - claim.changed_at <= CLAIMS_S]
     if claims:
         yield _refused_there(peer, claims)
+    if codes := codes_there(peer.link.peer, peer.now):
+        yield problems_there(codes)
 
 
 def has_twin(peers: Iterable[Peer], twin: Twin, now: float) -> bool:

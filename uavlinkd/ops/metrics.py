@@ -109,6 +109,7 @@ def _peers(status: Status) -> Iterator[Part]:
             "info": {tuple(str(session[label]) for label in _SESSION): 1} if session else {},
             "loss": _loss(peer) if session else {},
             "refusals": _refusals(peer),
+            "said": dict.fromkeys(((problem,) for problem in peer["problems_there"]), 1),
         }
         yield (name,), peer | facts
 

@@ -14,7 +14,7 @@ from time import monotonic
 
 from uavlinkd.config.keys import decode_key
 from uavlinkd.core import wire
-from uavlinkd.core.constants import REFUSALS_PER_REPORT
+from uavlinkd.core.constants import KNOWN_FEATURES, PROBLEMS_PER_REPORT, REFUSALS_PER_REPORT
 from uavlinkd.core.cookie import CookieJar, MacKeys
 from uavlinkd.core.crypto import KeyPair, Secret
 from uavlinkd.core.drops import DropReason
@@ -22,6 +22,7 @@ from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Deliver, Output, SessionEstablished, Transmit
 from uavlinkd.core.path import Path
 from uavlinkd.core.peer import Peer
+from uavlinkd.core.problem_reports import ProblemReport
 from uavlinkd.core.refusals import RefusalReport, Refused
 from uavlinkd.core.send import seal
 from uavlinkd.core.session import Session
@@ -108,7 +109,7 @@ class Impostor(PassiveAttack):
     """Initiates to each victim with a false identity. With ``relays``, genuine datagrams do not pass.
 
     Args:
-        frames: the frames to send on a session, if it gets one. Then it also reports refusals that it invents.
+        frames: the frames to send on a session, if it gets one. Then it also reports refusals and problems that it invents.
     """
 
     def __init__(
@@ -128,7 +129,7 @@ class Impostor(PassiveAttack):
         self._speaks_at = now
         self._directions = {disguise.victim: Direction(disguise.pose, disguise.victim) for disguise in disguises}
         self._nodes: dict[str, Node] = {}
-        link = Link(suites=(X25519,), timers=Timers(retry_min_s=RETRY_S, retry_max_s=RETRY_S))
+        link = Link(suites=(X25519,), timers=Timers(retry_min_s=RETRY_S, retry_max_s=RETRY_S), features=KNOWN_FEATURES)
         for disguise in disguises:
             node = self._nodes[disguise.victim] = ThievingNode(disguise.identity, now)
             psk = None if disguise.psk is None else Secret(disguise.psk)
@@ -170,8 +171,9 @@ class Impostor(PassiveAttack):
         for _ in range(REPORTS_AT_ONCE):
             self._claimed += 1
             entries = (Refused(self._claimed % 2**24, 400, place, 2**32 - 1) for place in range(REFUSALS_PER_REPORT))
-            report = RefusalReport(tuple(entries)).encode()
-            out += seal(peer, session, report, peer.paths.routes[Class.BULK], now, is_answer=True)
+            problems = ProblemReport(tuple(range(self._claimed % 249, self._claimed % 249 + PROBLEMS_PER_REPORT)))
+            for report in (RefusalReport(tuple(entries)), problems):
+                out += seal(peer, session, report.encode(), peer.paths.routes[Class.BULK], now, is_answer=True)
         return out
 
     def next_deadline(self) -> float:
@@ -263,7 +265,7 @@ def key_attacks(stage: DaemonStage) -> list[KeyAttack]:
         KeyAttack(
             "captured drone, as itself",
             f"holds all keys of {c}, has a session as {c}, sends frames that only {b} may send, and reports invented "
-            "refusals",
+            "refusals and problems",
             [to_a(captured, with_c)],
             frames=of_b,
         ),

@@ -17,6 +17,7 @@ from uavlinkd.core import constants as c
 from uavlinkd.core import wire
 from uavlinkd.core.drops import Drop
 from uavlinkd.core.probe import ANSWER_BYTES, PROBE, QUESTION_BYTES, parse_probe
+from uavlinkd.core.problem_reports import PROBLEM_REPORT, parse_problem_report
 from uavlinkd.core.refusals import REFUSAL_REPORT, parse_report
 from uavlinkd.core.suites import Suite
 
