@@ -23,6 +23,7 @@ from uavlinkd.core.probe import (
     Probe,
     parse_probe,
 )
+from uavlinkd.core.problem_reports import ProblemReport
 from uavlinkd.core.refusals import RefusalReport, Refused
 from uavlinkd.core.suites import SUITES, Suite
 from uavlinkd.core.wire import Parameters
@@ -49,6 +50,7 @@ CONTROL: st.SearchStrategy[wire.Control] = st.one_of(
     st.builds(wire.ProbeAndFrames, PROBES, st.binary(max_size=30)),
     st.just(wire.Close()),
     st.builds(RefusalReport, st.lists(REFUSED, min_size=1, max_size=c.REFUSALS_PER_REPORT).map(tuple[Refused, ...])),
+    st.builds(ProblemReport, st.sets(st.integers(0, 255), max_size=8).map(lambda codes: tuple(sorted(codes)))),
 )
 
 
@@ -147,13 +149,13 @@ def test_counter_that_has_no_long_form(counter: int) -> None:
 # Parameters.
 
 
-@given(PARAMETERS, st.integers(0, 2**14 - 1), st.integers(0, 127))
+@given(PARAMETERS, st.integers(0, 2**13 - 1), st.integers(0, 127))
 def test_parameters_round_trip(parameters: Parameters, features: int, flags: int) -> None:
     """What a side asks for arrives as it was asked. Unknown features and flags are ignored."""
     encoded = parameters.encode()
     assert len(encoded) == Parameters.SIZE
     assert wire.parse_parameters(encoded) == parameters
-    features = parameters.features | features << 2
+    features = parameters.features | features << 3
     later = encoded[:4] + features.to_bytes(2) + bytes((encoded[6] | flags << 1,)) + encoded[7:]
     assert wire.parse_parameters(later) == parameters
 

@@ -271,6 +271,6 @@ class Insider:
 
 def make_sealed() -> Run:
     """Payloads and control records under genuine keys."""
-    links = [Link(timers=Timers()), *LINKS[1:]]
+    links = [Link(timers=Timers(), features=c.FEATURE_REFUSALS | c.FEATURE_PROBLEMS), *LINKS[1:]]
     pairs = [copier(pair_of(link).establish(NOW)) for link in links]
     return play([lambda n=n: Insider(pairs[n](), links[n]) for n in range(len(links))])  # type: ignore[misc]

@@ -22,12 +22,14 @@ from uavlinkd.core import constants as c
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.outputs import Dropped
 from uavlinkd.core.path import Path
+from uavlinkd.core.problem_reports import ProblemClaim
 from uavlinkd.core.refusals import RefusalReport, Refused
 from uavlinkd.core.sessions import Twin
 from uavlinkd.endpoints.url import parse_url
 from uavlinkd.link import diagnosis, down_problems
 from uavlinkd.link.evidence import OWN_FRAMES_S, History
 from uavlinkd.link.facts import ICMP_S
+from uavlinkd.link.own_problems import PROBLEMS, own_codes
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.traffic_problems import SECURITY_S, has_no_client
 from uavlinkd.mavlink.frames import SplitCounters, split_payload
@@ -479,3 +481,33 @@ def test_frames_cannot_pass_without_any_client(daemon: Daemon, url: str, cause: 
     assert "client_silent" in {one.cause for one in found}
     assert not has_no_client(found, 2)
     assert not has_no_client([], 0)
+
+
+# What a peer says about itself.
+
+
+def test_a_peer_says_what_its_problems_are(daemon: Daemon) -> None:
+    """As its word, while it is up and repeats it. Only what stops frames is a fault; unknown codes are numbers."""
+    peer = daemon.set_up(role="all", system_ids="all").peer
+    for codes, severity in (((2, 3), Severity.FAULT), ((3, 200), Severity.WARNING)):
+        peer.problem_claim = ProblemClaim(codes, NOW)
+        assert daemon.findings()["problems_there"].severity is severity
+    text = daemon.findings()["problems_there"].text
+    assert text == "it says about itself: an endpoint has no client; problem 200"
+    assert "problems_there" not in daemon.findings(NOW + c.PROBLEMS_LAST_S + 1)
+    peer.is_up = False
+    assert "problems_there" not in daemon.findings()
+
+
+def test_a_daemon_reports_its_own_problems_only(daemon: Daemon) -> None:
+    """Not what it finds about peers, nor what they say. Each code is in the specification, with its name."""
+    daemon.local.append(SimpleNamespace(name="autopilot", ports=[]))
+    url = parse_url("udpin:127.0.0.1:14550")
+    daemon.parts.config.endpoints.append(SimpleNamespace(name="autopilot", url=url, policy={}))
+    daemon.set_up(role="all", system_ids="all").peer.problem_claim = ProblemClaim((1,), 6.0)
+    found = diagnosis.find(daemon.parts, 6.0)
+    assert own_codes(found, is_cut_off=has_no_client(found, 1)) == [2, 3]
+    text = (ROOT / "uavlinkd/core/README.md").read_text().partition("### Problem reports")[2].partition("\n## ")[0]
+    assert {int(code): name for code, name in re.findall(r"\| (\d+) \| `(\w+)`", text)} == {
+        code: problem.name for code, problem in PROBLEMS.items()
+    }

@@ -55,6 +55,8 @@ class Drone:
         """Peers that were removed from the configuration, and can be added again."""
         self.reported: set[tuple[str, Refused]] = set()
         """The refusals that it has ever reported, and to whom."""
+        self.said: set[tuple[str, tuple[int, ...]]] = set()
+        """The same for its own problems."""
         self.largest: Sizes = Counter()
         """The maximum size of each table of its nodes."""
         self.node: Node | None = None
@@ -274,6 +276,9 @@ class Drone:
                 for claim in peer.refusal_claims.recent():
                     reported = self._world.drones[name].reported
                     assert (self.name, claim.refused) in reported, f"{name} never reported {claim} to {self.name}"
+                codes = peer.problem_claim.codes
+                said = self._world.drones[name].said
+                assert not codes or (self.name, codes) in said, f"{name} never said {codes} to {self.name}"
 
     def check_no_initiation(self, datagram: bytes) -> None:
         """A removed peer is a stranger: no handshake message has its key."""

@@ -19,7 +19,7 @@ from tests.network.drone import Drone, session_name, share_a_session
 from tests.network.flow import FRAME_BYTES, Flow, FlowKey, class_in, every_second_may_be_old, split_frames
 from tests.network.serial_line import SIK, SerialLine
 from uavlinkd.core import wire
-from uavlinkd.core.constants import REFUSALS_KEPT
+from uavlinkd.core.constants import PROBLEMS_PER_REPORT, REFUSALS_KEPT
 from uavlinkd.core.outputs import Deliver, Dropped, Output, RecordReceived, Transmit
 from uavlinkd.core.path import SERIAL_HOST, Path
 from uavlinkd.core.refusals import Refused
@@ -193,6 +193,9 @@ class Network:
                 reporter.reported.add((receiver.name, refused))
                 peer = reporter.peer(receiver)
                 self.perform(reporter, reporter.node.report_refusals(peer, [refused], reporter.local_now))
+                codes = tuple(sorted(rng.sample(range(256), rng.randint(0, PROBLEMS_PER_REPORT))))
+                reporter.said.add((receiver.name, codes))
+                self.perform(reporter, reporter.node.report_problems(peer, codes, reporter.local_now))
             self.at(self.now + interval_s, tick)
 
         self.at(self.now + rng.random() * interval_s, tick)

@@ -58,6 +58,7 @@ PEER: dict[str, Any] = {
     "waiting_dropped": numbered("stale"),
     "copies_dropped": numbered("copy_over_budget"),
     "drops": numbered("bad_tag"),
+    "problems_there": ["no_client", "problem_200"],
     "repair": {"is_on": True, "on_s": 3.0, **numbered("transmissions", "datagrams", "bytes")},
     "refused": {
         "in": {

@@ -112,7 +112,7 @@ def test_a_captured_drone_is_itself() -> None:
 
 
 def test_a_captured_drone_floods_only_its_own_claims() -> None:
-    """Invented refusals fill the bounded table of c; nothing is claimed for b, and no frame is refused by them."""
+    """Invented refusals and problems are claims of c; nothing is claimed for b, and no frame is refused by them."""
     victim = Victim()
     itself = [Disguise("a", A.public, "b", C, PSK_C)]
     attack = Impostor("impostor", itself, 0.0, frames=(FRAME,))
@@ -121,6 +121,8 @@ def test_a_captured_drone_floods_only_its_own_claims() -> None:
     assert len(claims) == c.REFUSALS_KEPT
     assert attack._claimed > c.REFUSALS_KEPT
     assert victim.node.peers["b"].refusal_claims.recent() == []
+    assert victim.node.peers["c"].problem_claim.codes
+    assert victim.node.peers["b"].problem_claim.codes == ()
     assert len(victim.delivered) >= achieved.frames_sent - 1  # the last one may still be underway
 
 

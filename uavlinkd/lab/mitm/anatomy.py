@@ -148,13 +148,16 @@ def envelope_of(datagram: bytes) -> Envelope | None:
         return None
 
 
-def is_refusal_report(datagram: bytes) -> bool:
-    """Whether an envelope seems to carry a refusal report. In a confidential session that is a guess."""
+def is_report(datagram: bytes) -> bool:
+    """Whether an envelope seems to carry a refusal or problem report. In a confidential session that is a guess."""
     envelope = envelope_of(datagram)
-    if envelope is None or datagram[envelope.header_bytes] != REFUSAL_REPORT:
+    if envelope is None:
         return False
     payload = datagram[envelope.header_bytes :]
-    return any(parse_report(payload[:-tag_bytes]) is not None for tag_bytes in wire.TAG_LENGTHS)
+    payloads = [payload[:-tag_bytes] for tag_bytes in wire.TAG_LENGTHS if len(payload) > tag_bytes]
+    if payload[0] == PROBLEM_REPORT:
+        return any(parse_problem_report(one) is not None for one in payloads)
+    return payload[0] == REFUSAL_REPORT and any(parse_report(one) is not None for one in payloads)
 
 
 _ECHO_BYTES = frozenset(
@@ -212,8 +215,8 @@ def _frame_at(data: bytes, at: int) -> tuple[int, int]:
 
 KindFilter = Literal["any", "handshake", "initiation", "response", "cookie", "envelope", "report", "probe", "frames"]
 KINDS: Final = (
-    "any, handshake, initiation, response, cookie, envelope, report (a refusal report in the clear), probe (by its"
-    " length, or in the clear before frames), or frames (envelopes that are neither probes nor echoes)"
+    "any, handshake, initiation, response, cookie, envelope, report (a refusal or problem report in the clear), probe"
+    " (by its length, or in the clear before frames), or frames (envelopes that are neither probes nor echoes)"
 )
 
 
@@ -226,7 +229,7 @@ def matches_kind(kinds: KindFilter, datagram: bytes) -> bool:
         case "handshake":
             return kind in HANDSHAKE
         case "report":
-            return is_refusal_report(datagram)
+            return is_report(datagram)
         case "probe":
             return is_probe(datagram)
         case "frames":
