@@ -14,7 +14,7 @@ from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Deliver, Transmit
 from uavlinkd.core.path import Path
 from uavlinkd.core.peer import Peer
-from uavlinkd.core.settings import PeerSettings
+from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.lab.evaluation.impostors import Achieved, Disguise, Impostor, SealedCookies, StolenIdentity
 from uavlinkd.lab.evaluation.ledger import numbered_frame
 from uavlinkd.lab.mitm.attack import Action, Direction, Send
@@ -34,7 +34,7 @@ class Victim:
     def __init__(self) -> None:
         self.node = Node(PRIVATE_A, os.urandom, 0.0)
         for name, key, psk in (("b", B.public, PSK), ("c", C.public, PSK_C)):
-            self.node.add_peer(PeerSettings(name, key, Secret(psk)), 0.0)
+            self.node.add_peer(PeerSettings(name, key, Secret(psk), Link(features=c.KNOWN_FEATURES)), 0.0)
         self.delivered: list[Deliver] = []
 
     def suffer(self, impostor: Impostor, seconds: float) -> Achieved:
