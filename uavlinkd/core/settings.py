@@ -66,7 +66,7 @@ class Link:
     mac_key_bits: int = 256
     max_envelope: int = c.DEFAULT_ENVELOPE_LIMIT
     timers: Timers = field(default_factory=Timers)
-    features: int = c.FEATURE_REFUSALS
+    features: int = c.FEATURE_REFUSALS | c.FEATURE_PROBLEMS
     """Bits of the protocol extensions that this side offers. A session has those that both offer."""
     redundancy: Redundancy = Redundancy.CRITICAL
     idle_probe_s: float = c.PROBE_IDLE_S
