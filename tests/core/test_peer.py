@@ -110,13 +110,14 @@ def test_unconfirmed_session_is_forgotten_after_ten_seconds(is_late: bool) -> No
 # Parameters.
 
 
-BOTH = c.FEATURE_REFUSALS | c.FEATURE_RECORDS
+USUAL = Link().features
+BOTH = USUAL | c.FEATURE_RECORDS
 
 
 def test_other_features_get_new_keys_without_losing_the_link(pair: Pair) -> None:
     """The end that offers them wants new keys at once, until it has them. A session has what both offer."""
     first = pair.a.session
-    pair.a.node.offer(pair.a.peer, c.FEATURE_REFUSALS, 5.0)
+    pair.a.node.offer(pair.a.peer, USUAL, 5.0)
     assert pair.a.peer.keys_wanted_at() > 5.0, "the same features"
     pair.a.node.offer(pair.a.peer, BOTH, 10.0)
     assert pair.a.node.next_deadline() <= 10.0
@@ -125,7 +126,7 @@ def test_other_features_get_new_keys_without_losing_the_link(pair: Pair) -> None
     assert pair.a.peer.initiator.retry_at < 10.0 + c.RETRY_MAX_S
     list(run(pair, 10.0, 15.0, lambda *_: True))
     assert pair.a.session is not first
-    assert pair.a.session.parameters.features == c.FEATURE_REFUSALS
+    assert pair.a.session.parameters.features == USUAL
     pair.b.node.offer(pair.b.peer, BOTH, 20.0)
     pair.b.configure_path(20.0)
     list(run(pair, 20.0, 60.0, lambda *_: True))

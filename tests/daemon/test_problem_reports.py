@@ -12,7 +12,7 @@ async def test_a_vehicle_says_that_it_has_no_client() -> None:
         vehicle.add_endpoint("autopilot")
         await stage.start(vehicle, station)
         status = await station.until(lambda status: bool(status["peers"][vehicle.name]["problems_there"]))
-        assert status["peers"][vehicle.name]["problems_there"] == ["cut_off", "no_client"]
+        assert status["peers"][vehicle.name]["problems_there"] == ["cut_off"]
         (finding,) = (one for one in status["findings"] if one["cause"] == "problems_there")
         assert (finding["severity"], finding["name"]) == ("fault", vehicle.name)
         assert (await vehicle.status())["peers"][station.name]["problems_there"] == []

@@ -21,11 +21,14 @@ class ReportedProblem(NamedTuple):
     """The findings about an endpoint or the daemon that mean it."""
 
 
-NO_CLIENT_AT_ALL: Final = 2
+CUT_OFF: Final = 2
+NO_CLIENT: Final = 3
 PROBLEMS: Final = {
     1: ReportedProblem("all_refused", "its policy refuses all frames of a client", frozenset({"all_refused"})),
-    NO_CLIENT_AT_ALL: ReportedProblem("cut_off", "no endpoint has a client"),
-    3: ReportedProblem("no_client", "an endpoint has no client", frozenset({"no_client", "client_unreachable"})),
+    CUT_OFF: ReportedProblem("cut_off", "no endpoint has a client"),
+    NO_CLIENT: ReportedProblem(
+        "no_client", "an endpoint has no client", frozenset({"no_client", "client_unreachable"})
+    ),
     4: ReportedProblem("client_silent", "a client sends no MAVLink", frozenset({"client_silent"})),
     5: ReportedProblem("device_unavailable", "a serial device cannot be opened", frozenset({"device_unavailable"})),
     6: ReportedProblem("garbage", "bytes that are not MAVLink arrive at an endpoint", frozenset({"garbage"})),
@@ -37,14 +40,15 @@ PROBLEMS: Final = {
     10: ReportedProblem("recording_stopped", "it does not record", frozenset({"recording_stopped"})),
 }
 """By code, the most important first. README.md of the core has the same table."""
-_STOPS_FRAMES: Final = frozenset({1, NO_CLIENT_AT_ALL})
+_STOPS_FRAMES: Final = frozenset({1, CUT_OFF})
 
 
 def own_codes(findings: Iterable[Finding], *, is_cut_off: bool) -> list[int]:
     """The codes for this daemon's own findings: not those about peers. ``is_cut_off``: no endpoint has a client."""
     causes = {finding.cause for finding in findings if finding.subject is not Subject.PEER}
-    codes = [code for code, problem in PROBLEMS.items() if problem.causes & causes]
-    return [NO_CLIENT_AT_ALL, *codes] if is_cut_off else codes
+    if is_cut_off:  # it says the same of every endpoint
+        causes -= PROBLEMS[NO_CLIENT].causes
+    return [code for code, problem in PROBLEMS.items() if problem.causes & causes or (is_cut_off and code == CUT_OFF)]
 
 
 def codes_there(peer: Peer, now: float) -> tuple[int, ...]:
