@@ -6,6 +6,7 @@ import pytest
 
 from tests.core.harness import (
     AT_A,
+    AT_B,
     ELSEWHERE,
     KEY_A,
     KEY_B,
@@ -241,13 +242,20 @@ def test_senders_are_distinguished() -> None:
 
 
 def test_newer_initiation_supersedes_one_for_the_same_key_along_the_same_path_only() -> None:
-    """A forgery without the public key, another path, a response and an empty datagram supersede nothing."""
-    node = established().b.node
-    first, newer = (node.handshake_source(flooding(number), AT_A) for number in (1, 2))
-    assert [first] == [newer] == node.initiations_from(AT_A)
+    """A forgery without the cookie, another path and a response supersede nothing. Garbage does not wait."""
+    pair = Pair()
+    node, initiation = pair.b.node, pair.initiation(0.0)
+    index = wire.parse_initiation(initiation).sender_index
+    pair.a.receive(node._handshakes.own.cookies.reply(initiation, index, AT_A, 0.0), 0.0)
+    proven = pair.initiation(pair.a.node.next_deadline())
+    first, newer, with_cookie = (node.handshake_source(one, AT_A, 0.0) for one in (flooding(1), flooding(2), proven))
+    assert first == newer != with_cookie
+    assert [first, with_cookie] == node.initiations_from(AT_A)
+    response = only(datagrams(node.receive(initiation, AT_A, 0.0), wire.RESPONSE))
+    assert pair.a.node.handshake_source(response, AT_B, 0.0) == (AT_B, response)
+    assert node.handshake_source(flooding(1), ELSEWHERE, 0.0) not in (None, first)
     forged = flooding(1)[: -wire.MACS_BYTES] + bytes(wire.MACS_BYTES)
-    others = [(forged, AT_A), (flooding(1), ELSEWHERE), (b"\1", AT_A), (b"\2", AT_A), (b"", AT_A)]
-    assert len({first, *(node.handshake_source(*other) for other in others)}) == 1 + len(others)
+    assert {node.handshake_source(one, AT_A, 0.0) for one in (forged, b"\1", b"\2", b"\3", b"")} == {None}
 
 
 # A daemon with many peers, such as a relay, starts again: all of them initiate at once.

@@ -65,7 +65,7 @@ class Scene:
             receive=self.receive,
             refuse=lambda datagram, path: Dropped(DropReason.OVER_SHARE, None, path),
             claimed_sender=lambda *_: 0,
-            handshake_source=lambda datagram, path: (path, datagram[:2] if datagram[:1] == b"\1" else datagram),
+            handshake_source=lambda datagram, path, now: (path, datagram[:2]) if datagram[:1] == b"\1" else None,
             initiations_from=lambda path: [(path, HANDSHAKES[4])],
             next_deadline=lambda: NEVER,
             drops=dict.fromkeys(DropReason, 0),
@@ -184,6 +184,8 @@ async def test_handshakes_do_not_keep_the_first_sessions_waiting(monkeypatch: py
     assert await handled(*HANDSHAKES, newer) == ([first, newer, *others[1:]], 1)
     monkeypatch.setattr(module, "WAITING_HANDSHAKES", 2)
     assert await handled(*HANDSHAKES) == ([HANDSHAKES[3], HANDSHAKES[4]], 3)
+    garbage = [bytes((3, number)) for number in range(5)]
+    assert await handled(*HANDSHAKES[:2], *garbage) == ([*garbage, *HANDSHAKES[:2]], 0), "it pushes out no initiation"
 
 
 async def test_initiation_of_a_sender_that_has_a_session_now_is_not_answered(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -295,17 +295,17 @@ class Node:
             return peer, state is not None and state.is_proven
         return path.sender if self._is_known(path.place) else None
 
-    def handshake_source(self, datagram: bytes, path: Path) -> Hashable:
+    def handshake_source(self, datagram: bytes, path: Path, now: float) -> Hashable | None:
         """What tells handshake messages apart that wait in a busy shell: a newer one supersedes one that is equal.
 
-        Initiations along one path for one of our keys are equal. Others, and forgeries without that key, are not.
+        Initiations along one path for one of our keys are equal, unless only one of them has a cookie: a forgery
+        without it does not supersede the other one. None: the message is not for us, and costs little.
         """
-        is_initiation = bool(datagram) and datagram[0] == wire.INITIATION
-        return path, self._handshakes.addressed_key(datagram) if is_initiation else datagram
+        return self._handshakes.source_of(datagram, path, now)
 
     def initiations_from(self, path: Path) -> list[Hashable]:
         """All that :meth:`handshake_source` returns for initiations along a path that are for us."""
-        return [(path, key) for key in self._handshakes.public_keys]
+        return [(path, key, has_cookie) for key in self._handshakes.public_keys for has_cookie in (False, True)]
 
     def refuse(self, datagram: bytes, path: Path) -> Dropped:
         """Count a datagram that a busy shell does not hand over: more wait than their share."""

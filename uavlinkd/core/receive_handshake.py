@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
+
 from uavlinkd.core import constants as c
 from uavlinkd.core import establish, handshake, wire
 from uavlinkd.core.admission import Admission, CookieRequired, Message
@@ -16,6 +18,7 @@ from uavlinkd.core.session import Session
 from uavlinkd.core.sessions import Indices
 from uavlinkd.core.timers import Schedule
 
+_WAITING_KINDS = frozenset((bytes((wire.INITIATION,)), bytes((wire.RESPONSE,))))
 _MAVLINK_STARTS = frozenset((0xFD, 0xFE))
 _NOT_OUR_VERSION = frozenset((DropReason.MALFORMED, DropReason.BAD_MAC1))
 
@@ -81,12 +84,18 @@ class HandshakeReceiver:
             return self._receive_cookie(datagram, path, now)
         raise Drop(DropReason.RAW_MAVLINK if kind in _MAVLINK_STARTS else DropReason.MALFORMED)
 
-    def addressed_key(self, datagram: bytes) -> bytes:
-        """Which of our keys a handshake message is for; the datagram itself if it is for none of them."""
+    def source_of(self, datagram: bytes, path: Path, now: float) -> Hashable | None:
+        """Equal for initiations along one path for one of our keys with a cookie, or without. None: not for us."""
+        kind = datagram[:1]
+        if kind not in _WAITING_KINDS:
+            return None
         try:
-            return self._addressed(datagram).identity.public
+            own = self._addressed(datagram)
         except Drop:
-            return datagram
+            return None
+        if kind[0] == wire.RESPONSE:
+            return path, datagram
+        return path, own.identity.public, own.cookies.has_valid_mac2(datagram, path, now)
 
     def remember(self, peer: Peer, ephemeral: bytes) -> None:
         """An authentic initiation of this peer came, with this ephemeral."""

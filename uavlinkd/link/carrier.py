@@ -218,7 +218,10 @@ class FrameCarrier:
                 envelopes.append((datagram, path))
                 continue
             # A sender repeats its initiation with other keys. The newest takes the place of the one before it.
-            key = self._node.handshake_source(datagram, path)
+            key = self._node.handshake_source(datagram, path, now)
+            if key is None:  # it must not push out others
+                self.perform(self._node.receive(datagram, path, now))
+                continue
             if (before := waiting.get(key)) is not None:
                 self.perform((self._node.refuse(*before),))
             elif len(waiting) >= WAITING_HANDSHAKES:
