@@ -108,6 +108,15 @@ def test_data_with_an_unknown_handle_causes_a_bind(scene: Scene) -> None:
             binds += 1
             scene.bound(now, (ONE, 5), (TWO, 6))
     assert binds == 4
+    many = [ONE, TWO, *(bytes((number,)) * 32 for number in range(100, 130))]
+    scene.link.follow(many)
+    assert len(scene.binds(T + 3)) == 2
+    for first in (0, 16):
+        scene.bound(T + 3, *((key, 50 + number) for number, key in enumerate(many[first : first + 16], first)))
+    scene.link.on_unknown_handle(AT_B, T + 3.4)
+    assert not scene.binds(T + 3.4), "two records cost twice as much"
+    scene.link.on_unknown_handle(AT_B, T + 3.5)
+    assert len(scene.binds(T + 3.5)) == 2
 
 
 def test_handles_are_paths_until_the_relay_ends_them(scene: Scene) -> None:

@@ -288,10 +288,10 @@ class RelayLink:
     def on_unknown_handle(self, at: Path, now: float) -> None:
         """Data came with a handle that this daemon does not know: a bound record may be lost, so bind again.
 
-        An attacker can send such data too. It causes a bind each :data:`ASK_S` at most, and none before an answer.
+        An attacker can send such data too. It causes one record each :data:`ASK_S`, and none before an answer.
         """
-        binding = self._bindings.get(at)
-        if binding is not None and not binding.unanswered and now >= binding.bound_at + ASK_S:
+        binding, records = self._bindings.get(at), -(-len(self.keys) // c.KEYS_PER_BIND)
+        if binding is not None and not binding.unanswered and now >= binding.bound_at + ASK_S * records:
             self._hurry(binding)
             self._schedule()
 
