@@ -1,5 +1,5 @@
-"""A private key in two processes is proved by what they state in handshakes. Nothing that an attacker without it does
-to the datagrams of one process looks like that.
+"""A private key in two processes is shown by what they state in handshakes: not by an attacker without the key that
+forwards, replays or withholds datagrams, nor by a restart with one late datagram.
 """
 
 from __future__ import annotations
@@ -44,26 +44,31 @@ def twins(*sides: Side) -> list[dict[Twin, float]]:
     return [side.peer.sessions.twins for side in sides]
 
 
-def test_the_second_handshake_of_the_first_machine_shows_the_other_one() -> None:
-    """To the peer and to itself, and the next one of the second machine shows it there: whichever one comes next."""
+def test_two_handshakes_of_the_first_machine_show_the_other_one() -> None:
+    """To the peer and to itself, and the second one of the other machine shows it there."""
     pair = Pair().establish()
     clone = another_alpha(pair)
     link(pair, clone, 1.0)
-    assert twins(pair.a, pair.b, clone) == [{}, {}, {}], "it may be a restart"
     link(pair, pair.a, 2.0)
-    assert twins(pair.a, pair.b, clone) == [{Twin.OURS: 2.0}, {Twin.PEERS: 2.0}, {}]
     link(pair, clone, 3.0)
-    assert twins(pair.b, clone) == [{Twin.PEERS: 3.0}, {Twin.OURS: 3.0}]
+    assert twins(pair.a, pair.b, clone) == [{}, {}, {}], "it may be a restart"
+    link(pair, pair.a, 4.0)
+    assert twins(pair.a, pair.b, clone) == [{Twin.OURS: 4.0}, {Twin.PEERS: 4.0}, {}]
+    link(pair, clone, 5.0)
+    assert twins(pair.b, clone) == [{Twin.PEERS: 5.0}, {Twin.OURS: 5.0}]
 
 
 def test_the_peers_own_initiation_shows_it_too() -> None:
     """Bravo initiates to the first machine, and states what it has with the clone."""
     pair = Pair().establish()
-    link(pair, another_alpha(pair), 1.0)
-    response = only(datagrams(pair.a.receive(initiation(pair.b, 2.0), 2.0), wire.RESPONSE))
-    assert twins(pair.a) == [{}], "it may be an old recording"
-    exchange(pair.a, pair.b, pair.b.receive(response, 2.0), 2.0)
-    assert twins(pair.a) == [{Twin.OURS: 2.0}]
+    clone = another_alpha(pair)
+    for now in (1.0, 4.0):
+        assert twins(pair.a) == [{}]
+        link(pair, clone, now)
+        response = only(datagrams(pair.a.receive(initiation(pair.b, now + 1), now + 1), wire.RESPONSE))
+        assert twins(pair.a) == [{}], "it may be an old recording"
+        exchange(pair.a, pair.b, pair.b.receive(response, now + 1), now + 1)
+    assert twins(pair.a) == [{Twin.OURS: 5.0}]
 
 
 def withholds_confirmation(pair: Pair) -> None:
@@ -99,8 +104,21 @@ def forwards(pair: Pair) -> None:
         link(pair, pair.a, float(second))
 
 
+def releases_after_a_restart(pair: Pair) -> None:
+    """A confirmation of the process before: one handshake looks like another machine's, the next one does not."""
+    for now in (1.0, 2.0):
+        response = only(datagrams(pair.b.receive(initiation(pair.a, now), now), wire.RESPONSE))
+        (confirmation,) = datagrams(pair.a.receive(response, now))
+    pair.a = another_alpha(pair, 8)
+    link(pair, pair.a, 3.0)
+    pair.b.receive(confirmation, 4.0)
+    link(pair, pair.a, 5.0)
+    link(pair, pair.a, 7.0)
+
+
 @pytest.mark.parametrize(
-    "attack", [withholds_confirmation, delivers_an_old_initiation, replays_after_a_restart, forwards]
+    "attack",
+    [withholds_confirmation, delivers_an_old_initiation, replays_after_a_restart, forwards, releases_after_a_restart],
 )
 def test_an_attacker_without_the_key_makes_no_twin(attack: Callable[[Pair], None]) -> None:
     """Nor does the change of keys or the restart that follows."""

@@ -103,6 +103,10 @@ PROBE_INTERVAL_S = 5.0
 CLOSE_HOLDOFF_S = 1.0
 """After a peer's close no initiation is sent to it for this long: its daemon is stopping."""
 
+TWIN_PROOFS_APART_S = 2.0
+"""Two handshakes show that a private key is in use twice if they are at least this far apart,"""
+TWIN_PROOFS_WITHIN_S = 60.0
+"""and at most this."""
 UNCONFIRMED_PER_KIND = 16
 """Sessions that answer an initiation and wait for their first envelope: so many to known addresses of the peer, so
 many to others."""

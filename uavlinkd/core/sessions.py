@@ -114,6 +114,7 @@ class Sessions:
     """
 
     __slots__ = (
+        "_first_proofs",
         "_has_smaller_key",
         "_highest",
         "_indices",
@@ -136,8 +137,9 @@ class Sessions:
         """The highest rank first."""
         self.unconfirmed: dict[int, Unconfirmed] = {}
         """By our index, the oldest first."""
+        self._first_proofs: dict[Twin, float] = {}
         self.twins: dict[Twin, float] = {}
-        """When a handshake last proved that a second process uses a key."""
+        """When a handshake last proved that a second process uses a key, and was not the first that did."""
 
     @property
     def generation(self) -> int:
@@ -157,8 +159,13 @@ class Sessions:
         return Twin.OURS if self.current is not None and stated > self._made else None
 
     def note_twin(self, twin: Twin | None, now: float) -> None:
-        """A handshake was completed that shows this."""
-        if twin is not None:
+        """A handshake was completed that shows this. A late one of a process that was restarted can too, once."""
+        if twin is None:
+            return
+        first = self._first_proofs.get(twin, -c.NEVER)
+        if now - first > c.TWIN_PROOFS_WITHIN_S:
+            self._first_proofs[twin] = now
+        elif now - first >= c.TWIN_PROOFS_APART_S:
             self.twins[twin] = now
 
     def wait(self, unconfirmed: Unconfirmed) -> None:

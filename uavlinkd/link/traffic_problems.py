@@ -1,7 +1,7 @@
 """What is wrong with traffic: attacks with a valid key, frames that policies refuse, local clients that are silent.
 
 All of it is authentic, or happens on this machine. Without a peer's key, an attacker on the path can withhold answers
-(``freshness_unverified``).
+(``freshness_unverified``), and release several handshakes after a restart (``key_on_two_machines``).
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def two_machines(facts: str) -> Found:
         "key_on_two_machines",
         f"two machines use {facts}; a card was copied, or the key is stolen",
         "run `uavlinkd pubkey` on both machines. If both print one key, run `uavlinkd keygen` on one; rotate the key"
-        " only if a second machine has it: an attacker that holds handshakes back while both ends restart can also"
+        " only if a second machine has it: an attacker that holds handshakes back until a restart can also"
         " cause this",
     )
 
