@@ -195,12 +195,14 @@ def test_after_a_silence_the_peer_is_asked_whether_a_report_is_new(arrives_after
     newer = ARM._replace(total=ARM.total + 1)
     first, second = (only(report(pair.b, later + after_s, entry)) for after_s, entry in ((0.0, ARM), (2.0, newer)))
     now = later + 2.0 + arrives_after_s
+    arrived = [second, first]
     if arrives_after_s:
         pair.b.timeout(now)
-        pair.a.receive(pair.b.envelope(now), now)  # an empty one comes before: all below it is old
-    questions = datagrams(pair.a.receive(second, now)) + datagrams(pair.a.receive(first, now))
+        arrived.insert(0, pair.b.envelope(now))  # an empty one comes before, and is asked about: all below it is old
+    questions = [question for datagram in arrived for question in datagrams(pair.a.receive(datagram, now))]
     assert claims(pair.a) == []
     answers = [answer for question in questions for answer in datagrams(pair.b.receive(question, now + 0.1))]
+    assert answers
     for answer in answers:
         pair.a.receive(answer, now + 0.2)
     assert claims(pair.a) == ([newer] if counts else [])
