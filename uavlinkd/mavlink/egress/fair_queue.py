@@ -68,6 +68,10 @@ class _SourceFrames:
         self.rest = _Place(self, self.lanes.next_of_the_rest)
 
 
+_Next = tuple[_SourceFrames, Waiting] | None
+"""A frame, and what waits of its source; None if no frame waits."""
+
+
 def _is_superseded(waiting: Waiting, newer: Frame, now: float) -> bool:
     return now - waiting.put_at > SUPERSEDED_S
 
@@ -88,7 +92,7 @@ class _Line:
             self._number += 1
             heappush(self._heap, (place.frames.sent, -self._number, place))  # before others that were sent as much
 
-    def next(self) -> tuple[_SourceFrames, Waiting] | None:
+    def next(self) -> _Next:
         """The frame whose turn it is."""
         while self._heap:
             sent, _, place = self._heap[0]
@@ -141,12 +145,12 @@ class FairQueue:
 
     def next_bytes(self, now: float) -> int:
         """How large the frame is whose turn it is; 0 if none waits."""
-        turn = self._turn(now)
+        turn, _, _ = self._turn(now)
         return len(turn[1].frame.raw) if turn is not None else 0
 
     def pop(self, room: float, now: float) -> tuple[Frame, Source] | None:
         """Take out the frame whose turn it is; None if none waits or it has more than ``room`` bytes."""
-        turn = self._turn(now)
+        turn, urgent, rest = self._turn(now)
         if turn is None:
             return None
         frames, waiting = turn
@@ -154,7 +158,6 @@ class FairQueue:
         size = len(frame.raw)
         if size > room:
             return None
-        urgent, rest = self._urgent.next(), self._rest.next()
         self._clock = min(waiters[0].sent for waiters in (urgent, rest) if waiters)
         self.charge(frames.source, size)
         lead = size if waiting.flow.lane is Lane.URGENT else -size
@@ -179,15 +182,15 @@ class FairQueue:
         for source in self._sources.values():
             source.lanes.clear()
 
-    def _turn(self, now: float) -> tuple[_SourceFrames, Waiting] | None:
-        """The frame that goes next, and what waits of its source. It is not stale."""
+    def _turn(self, now: float) -> tuple[_Next, _Next, _Next]:
+        """The frame that goes next, which is not stale; and the next urgent one, and the next of the others."""
         while True:
             urgent, rest = self._urgent.next(), self._rest.next()
             turn = urgent or rest
             if urgent and rest and self._lead >= 0 and rest[0].sent < urgent[0].sent:
                 turn = rest
             if turn is None or now - turn[1].put_at <= MAX_AGE_S:
-                return turn
+                return turn, urgent, rest
             turn[0].lanes.drop_stale(now, MAX_AGE_S)
 
     def _add(self, source: Source) -> _SourceFrames:
