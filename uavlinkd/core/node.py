@@ -305,7 +305,7 @@ class Node:
 
     def initiations_from(self, path: Path) -> list[Hashable]:
         """All that :meth:`handshake_source` returns for initiations along a path that are for us."""
-        return [(path, key, has_cookie) for key in self._handshakes.public_keys for has_cookie in (False, True)]
+        return self._handshakes.initiations_from(path)
 
     def refuse(self, datagram: bytes, path: Path) -> Dropped:
         """Count a datagram that a busy shell does not hand over: more wait than their share."""

@@ -97,6 +97,10 @@ class HandshakeReceiver:
             return path, datagram
         return path, own.identity.public, own.cookies.has_valid_mac2(datagram, path, now)
 
+    def initiations_from(self, path: Path) -> list[Hashable]:
+        """All that :meth:`source_of` returns for initiations along a path."""
+        return [(path, key, has_cookie) for key in self.public_keys for has_cookie in (False, True)]
+
     def remember(self, peer: Peer, ephemeral: bytes) -> None:
         """An authentic initiation of this peer came, with this ephemeral."""
         # A memory for each peer: no peer can make us forget what another sent.
