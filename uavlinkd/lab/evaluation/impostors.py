@@ -14,7 +14,7 @@ from time import monotonic
 
 from uavlinkd.config.keys import decode_key
 from uavlinkd.core import wire
-from uavlinkd.core.constants import FEATURE_PROBLEMS, FEATURE_REFUSALS, PROBLEMS_PER_REPORT, REFUSALS_PER_REPORT
+from uavlinkd.core.constants import PROBLEMS_PER_REPORT, REFUSALS_PER_REPORT
 from uavlinkd.core.cookie import CookieJar, MacKeys
 from uavlinkd.core.crypto import KeyPair, Secret
 from uavlinkd.core.drops import DropReason
@@ -129,11 +129,7 @@ class Impostor(PassiveAttack):
         self._speaks_at = now
         self._directions = {disguise.victim: Direction(disguise.pose, disguise.victim) for disguise in disguises}
         self._nodes: dict[str, Node] = {}
-        link = Link(
-            suites=(X25519,),
-            timers=Timers(retry_min_s=RETRY_S, retry_max_s=RETRY_S),
-            features=FEATURE_PROBLEMS | FEATURE_REFUSALS,
-        )
+        link = Link(suites=(X25519,), timers=Timers(retry_min_s=RETRY_S, retry_max_s=RETRY_S))
         for disguise in disguises:
             node = self._nodes[disguise.victim] = ThievingNode(disguise.identity, now)
             psk = None if disguise.psk is None else Secret(disguise.psk)
