@@ -40,6 +40,7 @@ COUNTS: Mapping[str, int] = {
 ALSO = {
     "peers.*.freshness_unverified_s": "number",
     "peers.*.role": "null",
+    "peers.*.problems_there[]": "string",
     "peers.*.paths[].lag_s": "number",
     "peers.*.paths[].network": "string",
     "peers.*.paths[].relay": "string",
