@@ -29,15 +29,27 @@ def test_encoding_is_the_documented_one() -> None:
 def test_changes_and_new_keys_are_reported_twice_and_what_lasts_each_minute() -> None:
     """However often they change, a peer gets one report per interval. The smallest codes are reported."""
     own, sent = OwnProblems(), list[float]()
-    for second in range(200):
-        codes = () if second < 10 else range(20, 0, -1)
+    for second in range(300):
+        codes = (200, *range(20, 0, -1)) if 10 <= second < 200 else ()
         if (taken := own.take(codes, 1, float(second))) is not None:
             sent.append(second)
-            assert taken.codes == (() if second < 10 else tuple(range(1, 9)))
-    assert sent == [0, 2, 10, 12, 72, 132, 192]
-    assert own.take(range(1, 9), 2, 200.0) is not None
-    flapping = [now for now in range(300, 320) if own.take([now % 256], 2, float(now)) is not None]
-    assert flapping == [*range(300, 320, 2)]
+            assert taken.codes == (tuple(range(1, 9)) if codes else ())
+    assert sent == [0, 2, 10, 12, 72, 132, 192, 200, 202]
+    assert own.take((200, 9), 2, 300.0) == ProblemReport((9, 200))
+    flapping = [now for now in range(302, 322) if own.take([now % 256], 2, float(now)) is not None]
+    assert flapping == [*range(302, 322, 2)]
+
+
+def test_a_peer_that_restarted_soon_is_told_again() -> None:
+    """Both ends have lost their sessions, so the generation of the next one is the one before."""
+    pair = Pair(link_a=BOTH, link_b=BOTH).establish()
+    assert report(pair.b, 1.0, 2)
+    assert report(pair.b, 3.0, 2)
+    pair.b.receive(only(datagrams(pair.a.node.close(4.0))), 4.0)
+    pair.a.configure_path(10.0)
+    pair.establish(10.0)
+    assert pair.b.session.parameters.generation == 1
+    assert report(pair.b, 10.0, 2)
 
 
 @pytest.mark.parametrize(("ours", "theirs"), [(c.KNOWN_FEATURES, 3), (3, c.KNOWN_FEATURES)])
@@ -75,3 +87,14 @@ def test_after_a_silence_the_peer_is_asked_whether_a_report_is_new() -> None:
         for answer in datagrams(pair.b.receive(question, now + 0.1)):
             pair.a.receive(answer, now + 0.2)
     assert pair.a.peer.problem_claim == ((2,), now + 0.2)
+
+
+def test_a_report_on_a_superseded_session_is_ignored() -> None:
+    """The peer has sent on newer keys for a while, so it is not asked either."""
+    pair = Pair(link_a=BOTH, link_b=BOTH).establish()
+    late = pair.a.envelope(1.0, ProblemReport((1,)).encode())
+    pair.rekey(121.0)
+    assert pair.carries(121.0)
+    assert pair.carries(124.0)
+    assert pair.b.receive(late, 125.0) == []
+    assert pair.b.peer.problem_claim.codes == ()

@@ -196,7 +196,7 @@ class Node:
         session, route = peer.session_with(c.FEATURE_PROBLEMS, now), peer.paths.routes[Class.BULK]
         if session is None or not route:
             return []
-        report = peer.own_problems.take(codes, session.parameters.generation, now)
+        report = peer.own_problems.take(codes, session.order_base, now)
         return [] if report is None else seal(peer, session, report.encode(), route, now, is_answer=True)
 
     def send_record(self, peer: Peer, path: Path, record: Record, now: float) -> list[Output]:

@@ -49,13 +49,16 @@ class OwnProblems:
         self._reported_at = -c.NEVER
         self._sends_left = 0
 
-    def take(self, codes: Iterable[int], generation: int, now: float) -> ProblemReport | None:
-        """The next report: after a change or new keys, twice; while a problem lasts, once a minute."""
+    def take(self, codes: Iterable[int], session: int, now: float) -> ProblemReport | None:
+        """The next report: after a change or new keys, twice; while a problem lasts, once a minute.
+
+        ``session``: a number that no session before had. A generation may come again: the peer may have restarted.
+        """
         if now < self._reported_at + c.REFUSALS_INTERVAL_S:
             return None
         present = tuple(sorted(set(codes))[: c.PROBLEMS_PER_REPORT])
-        if (present, generation) != self._reported:
-            self._reported, self._sends_left = (present, generation), c.REFUSALS_SENDS
+        if (present, session) != self._reported:
+            self._reported, self._sends_left = (present, session), c.REFUSALS_SENDS
         elif not self._sends_left and present and now >= self._reported_at + c.PROBLEMS_INTERVAL_S:
             self._sends_left = 1
         if not self._sends_left:
