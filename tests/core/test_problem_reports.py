@@ -40,7 +40,7 @@ def test_changes_and_new_keys_are_reported_twice_and_what_lasts_each_minute() ->
     assert flapping == [*range(302, 322, 2)]
 
 
-def test_a_peer_that_restarted_soon_is_told_again() -> None:
+def test_a_peer_that_restarted_soon_gets_a_report_again() -> None:
     """Both ends have lost their sessions, so the generation of the next one is the one before."""
     pair = Pair(link_a=BOTH, link_b=BOTH).establish()
     assert report(pair.b, 1.0, 2)
