@@ -357,6 +357,9 @@ def test_autopilot_with_another_system_id(daemon: Daemon, owner: int, remedy: st
         "set MAV_SYSID (ArduPilot; before 4.7 SYSID_THISMAV) or MAV_SYS_ID (PX4)" in findings["foreign_system"].remedy
     )
     assert remedy in findings["foreign_system"].remedy
+    found = diagnosis.find(daemon.parts, daemon.now)
+    assert own_codes(found, is_cut_off=False) == [1], "its peers see that it refuses its own autopilot"
+    assert not own_codes([one._replace(subject=Subject.PEER) for one in found], is_cut_off=False)
 
 
 @pytest.mark.parametrize(("pause", "is_found"), [(1, True), (int(OWN_FRAMES_S) + 1, False)])

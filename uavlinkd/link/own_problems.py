@@ -24,7 +24,9 @@ class ReportedProblem(NamedTuple):
 CUT_OFF: Final = 2
 NO_CLIENT: Final = 3
 PROBLEMS: Final = {
-    1: ReportedProblem("all_refused", "its policy refuses all frames of a client", frozenset({"all_refused"})),
+    1: ReportedProblem(
+        "all_refused", "its policy refuses all frames of a client", frozenset({"all_refused", "foreign_system"})
+    ),
     CUT_OFF: ReportedProblem("cut_off", "no endpoint has a client"),
     NO_CLIENT: ReportedProblem(
         "no_client", "an endpoint has no client", frozenset({"no_client", "client_unreachable"})
