@@ -31,13 +31,23 @@ def _odd_key() -> str:
     return base64.b64encode(bytes([1]) + secrets.token_bytes(30) + bytes([0])).decode()
 
 
-@pytest.mark.parametrize("secret", [keys.generate_private_key(), _odd_key()], ids=["form", "no-form"])
-def test_private_key_beside_the_file(tmp_path: Path, secret: str) -> None:
+@pytest.mark.parametrize(
+    ("secret", "name"),
+    [(keys.generate_private_key(), "other.txt"), (_odd_key(), "other.psk")],
+    ids=["form", "no-form"],
+)
+def test_private_key_beside_the_file(tmp_path: Path, secret: str, name: str) -> None:
     """The file that holds the key is named, also if the key has no form of its own. The key is exposed by that."""
-    (tmp_path / "other.txt").write_text(secret + "\n")
+    (tmp_path / name).write_text(secret + "\n")
     message = _problem(tmp_path, secret)
-    assert message.startswith("is the secret key in other.txt")
+    assert message.startswith(f"is the secret key in {name}")
     assert "make a new one there with `uavlinkd keygen`" in message
+
+
+def test_public_key_beside_the_file(tmp_path: Path) -> None:
+    """People keep what `keygen` printed, under any name: no secret is exposed."""
+    (tmp_path / "drone1.txt").write_text(KEY["drone1"] + "\n")
+    load(tmp_path, GOOD)
 
 
 def test_own_private_key(tmp_path: Path) -> None:

@@ -27,11 +27,11 @@ from uavlinkd.core.refusals import RefusalReport, Refused
 from uavlinkd.core.sessions import Twin
 from uavlinkd.endpoints.url import parse_url
 from uavlinkd.link import diagnosis, down_problems
-from uavlinkd.link.evidence import OWN_FRAMES_S, History
+from uavlinkd.link.evidence import EVIDENCE_S, OWN_FRAMES_S, History
 from uavlinkd.link.facts import ICMP_S
 from uavlinkd.link.own_problems import PROBLEMS, own_codes
 from uavlinkd.link.peer_link import PeerLink
-from uavlinkd.link.traffic_problems import SECURITY_S, has_no_client
+from uavlinkd.link.traffic_problems import SECURITY_S, has_no_client, is_contested
 from uavlinkd.mavlink.frames import SplitCounters, split_payload
 from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.mavlink.routing import Router
@@ -451,6 +451,8 @@ def test_key_on_two_machines_is_named_for_ten_minutes(daemon: Daemon) -> None:
     peer.sessions.twins = {Twin.OURS: NOW}
     text = daemon.findings()["key_on_two_machines"].text
     assert text.startswith("two machines use this daemon's private key: another one has sessions with drone1;")
+    assert is_contested([peer], NOW + EVIDENCE_S - 1)
+    assert not is_contested([peer], NOW + EVIDENCE_S), "frames pass again: the second machine is off"
     peer.sessions.twins = {Twin.PEERS: NOW}
     member = SimpleNamespace(peer=peer, peers=[peer], is_own=True, settings=SimpleNamespace(name="member"))
     daemon.parts.relay = SimpleNamespace(members={1: member, 2: SimpleNamespace(peer=peer, is_own=False)})

@@ -41,6 +41,8 @@ ALSO = {
     "peers.*.freshness_unverified_s": "number",
     "peers.*.role": "null",
     "peers.*.problems_there[]": "string",
+    "contested[]": "string",
+    "stopped_there[]": "string",
     "peers.*.paths[].lag_s": "number",
     "peers.*.paths[].network": "string",
     "peers.*.paths[].relay": "string",

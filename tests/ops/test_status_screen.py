@@ -69,7 +69,7 @@ def status_of(peers: dict[str, dict[str, Any]], **facts: object) -> dict[str, An
     return {
         "name": "drone0",
         "frames_pass": all(peer["state"] == "up" for peer in peers.values()),
-        **{key: [] for key in ("blocked", "findings")},
+        **{key: [] for key in ("blocked", "contested", "stopped_there", "findings")},
         "has_no_client": False,
         "peers": peers,
         **{key: {} for key in ("endpoints", "networks", "relays", "drops", "send_failures", "stale")},
@@ -125,6 +125,12 @@ USED = {"state": "up", "peer": None, "round_trip_s": 0.0123, "peers": {"drone1":
             "rssi 200/190, noise 50/60, modem 10 % full",
         ),
         ({"has_no_client": True}, {}, "1 of 1 peers up, no endpoint has a client"),
+        ({"contested": ["a", "b"]}, {}, "1 of 1 peers up, two machines use one key with a, b"),
+        (
+            {"stopped_there": [f"d{number}" for number in range(9)]},
+            {},
+            "1 of 1 peers up, frames stop, as reported by d0, d1, d2, d3, d4, d5, d6, d7 and 1 more",
+        ),
         ({"relays": {"vps": USED}}, {}, "relay vps: up, 12 ms; drone1 bound, drone2 waiting"),
     ],
 )

@@ -85,9 +85,10 @@ def test_no_secret_is_printed(tmp_path: Path) -> None:
     [
         pytest.param('[[relay]]\naddresses = ["relay.example.org:5790"]', "Relays", id="relay"),
         pytest.param("[[member]]", "Members of this relay, and their limits", id="member"),
+        pytest.param('[[peer]]\nrole = "observer"\nsystem_ids = [9]', "Peers", id="peer"),
     ],
 )
-def test_key_of_a_relay_or_member_is_printed_whole(tmp_path: Path, section: str, title: str) -> None:
+def test_key_of_another_daemon_is_printed_whole(tmp_path: Path, section: str, title: str) -> None:
     """The user compares it with what the other machine printed. What may be a private key is not printed."""
     public, private = keys.public_key_text(keys.generate_private_key()), keys.generate_private_key()
     for key, columns in itertools.product((public, private), (None, 40)):

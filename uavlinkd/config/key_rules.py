@@ -25,6 +25,7 @@ EXAMPLE_KEYS = frozenset(
 )
 """The public keys in README.md and configs/. Their private keys do not exist. A test compares this list with them."""
 _MAX_FILES = 512
+_SECRET_FILES = (".key", ".psk")
 _THERE = "write what `uavlinkd pubkey` prints on the {}"
 _EXPOSED = "it is exposed: make a new one there with `uavlinkd keygen`, and write here the public key that it prints"
 
@@ -89,7 +90,7 @@ def _previous_keys(file: Sections) -> Found:
 
 
 def _key_files(folder: Path) -> Mapping[bytes, str]:
-    """The keys in the small files of a folder, with the names of the files. In ``.pub`` people keep public keys."""
+    """The secret keys in the small files of a folder, with the names of the files. People keep public keys too."""
     keys: dict[bytes, str] = {}
     with suppress(OSError):
         for number, path in enumerate(folder.iterdir()):
@@ -99,7 +100,7 @@ def _key_files(folder: Path) -> Mapping[bytes, str]:
                 status = path.lstat()
                 if stat.S_ISREG(status.st_mode) and KEY_TEXT_LENGTH <= status.st_size <= KEY_TEXT_LENGTH + 4:
                     key = decode_key(path.read_text(encoding="ascii"))
-                    if path.suffix != ".pub" or looks_private(key):
+                    if path.suffix in _SECRET_FILES or looks_private(key):
                         keys[key] = path.name
     return keys
 

@@ -100,11 +100,6 @@ def is_canonical_public_key(public: bytes) -> bool:
     return int.from_bytes(public, "little") < _FIELD_PRIME
 
 
-def short_form(public: bytes) -> str:
-    """The first characters of a public key, by which a person recognises it."""
-    return encode_key(public)[:8] + "..."
-
-
 def write_secret_file(path: Path, text: str) -> None:
     """Write a key to a new file that only its owner may read, and sync it to the disk.
 

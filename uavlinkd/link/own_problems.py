@@ -59,6 +59,11 @@ def codes_there(peer: Peer, now: float) -> tuple[int, ...]:
     return claim.codes if peer.is_up and now - claim.received_at <= c.PROBLEMS_LAST_S else ()
 
 
+def stops_frames(peer: Peer, now: float) -> bool:
+    """Whether a peer says that frames stop there."""
+    return not _STOPS_FRAMES.isdisjoint(codes_there(peer, now))
+
+
 def name_of_problem(code: int) -> str:
     """Its name; a number for one that only a newer version knows."""
     return PROBLEMS[code].name if code in PROBLEMS else f"problem_{code}"

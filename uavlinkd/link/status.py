@@ -11,11 +11,11 @@ from uavlinkd.core.path_state import PathState
 from uavlinkd.core.peer import Peer
 from uavlinkd.endpoints.ports import Endpoint
 from uavlinkd.link.diagnosis import find
-from uavlinkd.link.own_problems import codes_there, name_of_problem
+from uavlinkd.link.own_problems import codes_there, name_of_problem, stops_frames
 from uavlinkd.link.parts import DaemonParts
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.relay_link import RelayLink
-from uavlinkd.link.traffic_problems import has_no_client
+from uavlinkd.link.traffic_problems import has_no_client, is_contested
 from uavlinkd.mavlink.dialect import command_name, name_of
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import ANY_OTHER, REFUSALS, Refusal
@@ -31,12 +31,15 @@ WayOf = Callable[[Path], tuple[str | None, SocketAddress | None]]
 def daemon_status(daemon: DaemonParts, now: float) -> dict[str, object]:
     """The status of the whole daemon. Times are ages in seconds. A client computes rates from two of these.
 
-    ``frames_pass``: every peer is up, within the last 10 s no traffic was wholly refused (``blocked`` names it), and
-    clients are not all absent (``has_no_client``).
+    ``frames_pass``: every peer is up, within the last 10 s no traffic was wholly refused (``blocked`` names it),
+    clients are not all absent (``has_no_client``), no two machines contend with one key for a link (``contested``),
+    and no peer says that frames stop there (``stopped_there``).
     """
     node = daemon.node
     blocked, findings = daemon.history.blocked(now), find(daemon, now)
     is_cut_off = has_no_client(findings, len(daemon.local.endpoints))
+    contested = [name for name, link in daemon.links.items() if is_contested(link.peers, now)]
+    stopped_there = [name for name, link in daemon.links.items() if stops_frames(link.peer, now)]
     all_up = (bool(daemon.links) or daemon.config.is_only_relay) and all(
         link.peer.is_up for link in daemon.links.values()
     )
@@ -45,9 +48,11 @@ def daemon_status(daemon: DaemonParts, now: float) -> dict[str, object]:
         "name": daemon.config.name,
         "public_key": encode_key(node.public_key),
         "monotonic_s": now,
-        "frames_pass": all_up and not blocked and not is_cut_off,
+        "frames_pass": all_up and not (blocked or is_cut_off or contested or stopped_there),
         "blocked": [dict(zip(("subject", "name", "direction"), key, strict=True)) for key in blocked],
         "has_no_client": is_cut_off,
+        "contested": contested,
+        "stopped_there": stopped_there,
         "findings": [finding.as_json() for finding in findings],
         "peers": {name: peer_status(link, now, daemon.peer_sockets.way_of) for name, link in daemon.links.items()},
         "relays": {name: used_relay_status(relay, daemon, now) for name, relay in daemon.relays.by_name.items()},

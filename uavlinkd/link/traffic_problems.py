@@ -14,7 +14,7 @@ from uavlinkd.core.peer import Peer
 from uavlinkd.core.refusals import Claim
 from uavlinkd.core.sessions import Twin
 from uavlinkd.endpoints.url import EndpointKind
-from uavlinkd.link.evidence import GateHistory
+from uavlinkd.link.evidence import EVIDENCE_S, GateHistory
 from uavlinkd.link.facts import EndpointFacts, Found, PartFacts, PeerFacts, fault, listed, security, warning
 from uavlinkd.link.own_problems import codes_there, problems_there
 from uavlinkd.mavlink.dialect import GROUPS, IDS, SYSTEM_ID, command_name, name_of
@@ -70,9 +70,14 @@ def peer_problems(peer: PeerFacts) -> Iterator[Found]:
         yield problems_there(codes)
 
 
-def has_twin(peers: Iterable[Peer], twin: Twin, now: float) -> bool:
+def has_twin(peers: Iterable[Peer], twin: Twin, now: float, within_s: float = SECURITY_S) -> bool:
     """Whether one of these pairs of keys showed a second process with a private key."""
-    return any(now - peer.sessions.twins.get(twin, -SECURITY_S) < SECURITY_S for peer in peers)
+    return any(now - peer.sessions.twins.get(twin, -within_s) < within_s for peer in peers)
+
+
+def is_contested(peers: Iterable[Peer], now: float) -> bool:
+    """Whether two processes with one key displace each other now: each loses about half of the frames."""
+    return any(has_twin(peers, twin, now, EVIDENCE_S) for twin in Twin)
 
 
 def places(peers: Iterable[Peer]) -> str:

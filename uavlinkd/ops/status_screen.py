@@ -114,7 +114,18 @@ def _headline(status: Status) -> Text:
         text.append(f", all frames {towards} {blocked['name']} are refused", style="bold red")
     if status["has_no_client"]:
         text.append(", no endpoint has a client", style="bold red")
+    for key, words in (
+        ("contested", "two machines use one key with"),
+        ("stopped_there", "frames stop, as reported by"),
+    ):
+        if status[key]:
+            text.append(f", {words} {_some(status[key])}", style="bold red")
     return text
+
+
+def _some(names: Sequence[str]) -> str:
+    more = f" and {len(names) - _SHOWN_NAMES} more" if len(names) > _SHOWN_NAMES else ""
+    return ", ".join(names[:_SHOWN_NAMES]) + more
 
 
 def _findings(findings: list[dict[str, str]]) -> Table:
@@ -132,9 +143,8 @@ def _findings(findings: list[dict[str, str]]) -> Table:
     shown = sum(label == "security" for label, *_ in several) + _SHOWN_FINDINGS
     for (label, subject, text, remedy), names in list(several.items())[:shown]:
         style, is_security = _STYLES[label], label == "security"
-        listed = ", ".join(names[:_SHOWN_NAMES])
-        more = f" and {len(names) - _SHOWN_NAMES} more" if len(names) > _SHOWN_NAMES else ""
-        line = Text({"peer": f"{listed}{more}: ", "endpoint": f"endpoint {listed}: "}.get(subject, ""), style="bold")
+        listed = _some(names)
+        line = Text({"peer": f"{listed}: ", "endpoint": f"endpoint {listed}: "}.get(subject, ""), style="bold")
         line.append(text, style=style if is_security else "not bold")
         line.append(f". Remedy: {remedy}", style="not bold")
         table.add_row(Text(label.upper() if is_security else label, style=style), line)

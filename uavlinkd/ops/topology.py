@@ -14,7 +14,7 @@ from rich.text import Text
 
 from uavlinkd.config import Config, EndpointConfig, PeerConfig, PolicyData
 from uavlinkd.config.advice import exposure
-from uavlinkd.config.keys import encode_key, looks_private, short_form
+from uavlinkd.config.keys import encode_key, looks_private
 from uavlinkd.config.model import KEY_GRACE_S
 from uavlinkd.config.network_rules import used_networks
 from uavlinkd.core.crypto import x25519_public_key
@@ -26,7 +26,7 @@ from uavlinkd.ops.surroundings import Surroundings
 
 _MOST_COLUMNS: Final = 100_000
 """More than any line has."""
-_NEVER_BROKEN: Final = frozenset({"name", "key", "public key", "address", "URL"})
+_NEVER_BROKEN: Final = frozenset({"name", "public key", "address", "URL"})
 
 
 def print_topology(config: Config, here: Surroundings | None = None, console: Console | None = None) -> None:
@@ -62,8 +62,9 @@ def _facts(config: Config, here: Surroundings | None) -> list[RenderableType]:
     if config.networks:
         parts += [_heading("Networks"), _networks(config, here)]
     if config.peers:
-        titles = ("name", "key", "address", "suites", "mode, at least", "PSK")
-        parts += [_heading("Peers"), _table(titles, map(_peer, config.peers))]
+        links = _table(("name", "address", "suites", "mode, at least", "PSK"), map(_peer, config.peers))
+        keys = _table(("name", "public key"), ((peer.name, _keys(peer)) for peer in config.peers))
+        parts += [_heading("Peers"), links, Text(), keys]
         if not all(peer.is_called for peer in config.peers):
             port = config.listen[0].port
             parts.append(Text(f"(it connects): the peer's file needs an address of this machine, with port {port}"))
@@ -116,8 +117,13 @@ def _yes(condition: object) -> str:
 
 
 def _whole(public_key: bytes) -> str:
-    """Not shortened: the user compares it with what the other machine printed."""
+    """Not shortened: the user compares it with what the other machine printed. A private key is never printed."""
     return "(private?)" if looks_private(public_key) else encode_key(public_key)
+
+
+def _keys(peer: PeerConfig) -> str:
+    before = peer.previous_public_key
+    return _whole(peer.settings.public_key) + ("" if before is None else f"\nor {_whole(before)}")
 
 
 def _identity(config: Config) -> Table:
@@ -185,15 +191,13 @@ def _networks(config: Config, here: Surroundings | None) -> Table:
 
 
 def _peer(peer: PeerConfig) -> tuple[str, ...]:
-    now, before, link = peer.settings.public_key, peer.previous_public_key, peer.settings.link
-    keys = short_form(now) if before is None else f"{short_form(now)}\nor {short_form(before)}"
+    link = peer.settings.link
     mode = "encrypted"
     if not link.confidential:
         key = "" if link.mac_key_bits == Link().mac_key_bits else f", {link.mac_key_bits}-bit key"
         mode = f"authentic, {8 * link.tag_bytes}-bit tag{key}"
     return (
         peer.name,
-        "(private?)" if looks_private(now) else keys,  # perhaps it is: then not even its beginning is printed
         "\n".join([*map(str, peer.addresses), *(f"relayed via {name}" for name in peer.relays)]) or "(it connects)",
         " ".join(suite.name for suite in link.suites),
         mode,
