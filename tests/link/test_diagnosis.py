@@ -25,6 +25,7 @@ from uavlinkd.core.path import Path
 from uavlinkd.core.problem_reports import ProblemClaim
 from uavlinkd.core.refusals import RefusalReport, Refused
 from uavlinkd.core.sessions import Twin
+from uavlinkd.core.settings import PeerSettings
 from uavlinkd.endpoints.url import parse_url
 from uavlinkd.link import diagnosis, down_problems
 from uavlinkd.link.evidence import EVIDENCE_S, OWN_FRAMES_S, History
@@ -71,6 +72,7 @@ class Daemon(Scene):
                 routing=SimpleNamespace(relay=False),
             ),
             links=self.links,
+            node=self.node,
             peer_sockets=self.sockets,
             evidence=self.evidence,
             history=self.history,
@@ -450,9 +452,13 @@ def test_key_on_two_machines_is_named_for_ten_minutes(daemon: Daemon) -> None:
     assert "key_on_two_machines" not in daemon.findings(NOW + SECURITY_S)
     peer.sessions.twins = {Twin.OURS: NOW}
     text = daemon.findings()["key_on_two_machines"].text
-    assert text.startswith("two machines use this daemon's private key: another one has sessions with drone1;")
+    assert text.startswith("two machines use this daemon's private key: drone1 states a session with another one;")
     assert is_contested([peer], NOW + EVIDENCE_S - 1)
     assert not is_contested([peer], NOW + EVIDENCE_S), "frames pass again: the second machine is off"
+    daemon.node.add_peer(PeerSettings("member", bytes([3]) * 32), 0.0).sessions.twins = {Twin.OURS: NOW}
+    text = daemon.findings()["key_on_two_machines"].text
+    assert "drone1, member states a session" in text, "a relay's own key too"
+    daemon.node.peers["member"].sessions.twins = {}
     peer.sessions.twins = {Twin.PEERS: NOW}
     member = SimpleNamespace(peer=peer, peers=[peer], is_own=True, settings=SimpleNamespace(name="member"))
     daemon.parts.relay = SimpleNamespace(members={1: member, 2: SimpleNamespace(peer=peer, is_own=False)})

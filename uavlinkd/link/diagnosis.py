@@ -17,8 +17,6 @@ from uavlinkd.link.down_problems import down_problems, silence, versions
 from uavlinkd.link.evidence import ELSEWHERE, EVIDENCE_S
 from uavlinkd.link.facts import EndpointFacts, Found, Moment, PeerFacts, fault, keys_at, listed, security, warning
 from uavlinkd.link.parts import DaemonParts
-from uavlinkd.link.peer_link import PeerLink
-from uavlinkd.link.relay_link import RelayLink
 from uavlinkd.link.serial_networks import RECENT_S
 from uavlinkd.ops.findings import Finding, Subject
 from uavlinkd.ops.log import shown
@@ -38,9 +36,8 @@ def daemon_problems(moment: Moment) -> Iterator[Found]:
             f"a sender at {at} uses this daemon's private key, or an attacker replays an old recording",
             "if a card was copied, run `uavlinkd keygen` on one machine; else the key may be stolen: replace it",
         )
-    partners: list[PeerLink | RelayLink] = [*daemon.links.values(), *daemon.relays.by_name.values()]
-    if names := {one.config.name: None for one in partners if traffic.has_twin(one.peers, Twin.OURS, now)}:
-        yield traffic.two_machines(f"this daemon's private key: another one has sessions with {listed(names)}")
+    if names := [name for name, peer in daemon.node.peers.items() if traffic.has_twin([peer], Twin.OURS, now)]:
+        yield traffic.two_machines(f"this daemon's private key: {listed(names)} states a session with another one")
     fault_if_down = fault if moment.down else warning
     if absent := daemon.peer_sockets.absent_addresses():
         yield fault_if_down(

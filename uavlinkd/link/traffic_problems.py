@@ -92,8 +92,8 @@ def two_machines(facts: str) -> Found:
         "key_on_two_machines",
         f"two machines use {facts}; a card was copied, or the key is stolen",
         "run `uavlinkd pubkey` on both machines. If both print one key, run `uavlinkd keygen` on one; rotate the key"
-        " only if a second machine has it: an attacker that holds handshakes back until a restart can also"
-        " cause this",
+        " only if a second machine has it: an attacker that holds handshakes back until a restart, or a captured"
+        " peer, can also cause this",
     )
 
 
