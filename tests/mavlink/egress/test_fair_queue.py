@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable
+from itertools import groupby
 
 import pytest
 from hypothesis import given
@@ -11,16 +12,18 @@ from hypothesis import strategies as st
 
 from tests.policies import TRUSTED
 from tests.samples import attitude, battery, command, file_part, heartbeat, manual_control, parameter
+from uavlinkd.mavlink.dialect import Lane
 from uavlinkd.mavlink.egress.fair_queue import (
     LANE_BYTES,
     MAX_SOURCES,
+    MOST_AHEAD,
     QUEUE_BYTES,
     SUPERSEDED_S,
     FairQueue,
 )
 from uavlinkd.mavlink.egress.lanes import EgressDrop
 from uavlinkd.mavlink.flows import flow_key
-from uavlinkd.mavlink.frames import Frame
+from uavlinkd.mavlink.frames import MAX_FRAME_BYTES, Frame
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.delivery import Source
 
@@ -91,6 +94,32 @@ def test_urgent_frames_have_half_of_the_line_beside_many_sources() -> None:
         queue.put([parameter(number) for number in range(20)], Source(f"member{member}", GATE), 0.0)
     queue.put([manual_control(number) for number in range(300)], HONEST, 0.0)
     assert bytes_by_source(popped(queue, 8000))[HONEST] == pytest.approx(4000, abs=300)
+
+
+def test_many_sources_of_other_frames_delay_urgent_ones_by_a_frame() -> None:
+    """However many sources sent urgent frames before, at the same time."""
+    queue, _ = make()
+    for name, make_frame in (
+        *((f"operator{n}", command) for n in range(20)),
+        *((f"member{n}", parameter) for n in range(50)),
+    ):
+        queue.put([make_frame(number) for number in range(20)], Source(name, GATE), 0.0)
+    runs = groupby(popped(queue, 8000), key=lambda one: one[0].header.kind.lane is Lane.URGENT)
+    others = [sum(len(item.raw) for item, _ in run) for is_urgent, run in runs if not is_urgent]
+    assert 0 < max(others) <= MOST_AHEAD + MAX_FRAME_BYTES
+
+
+def test_source_of_many_urgent_frames_owes_a_frame_at_most() -> None:
+    """Half of the line was more than its share, and its other frames do not pay for it for seconds."""
+    queue, _ = make()
+    for member in range(50):
+        queue.put([parameter(number) for number in range(20)], Source(f"member{member}", GATE), 0.0)
+    queue.put([manual_control(number) for number in range(300)], HONEST, 0.0)
+    assert bytes_by_source(popped(queue, 8000))[HONEST] > 3000
+    queue.clear()
+    queue.put([parameter(number) for number in range(400)], CAPTURED, 0.0)
+    queue.put([parameter(0)], HONEST, 0.0)
+    assert HONEST in bytes_by_source(popped(queue, MOST_AHEAD + MAX_FRAME_BYTES))
 
 
 def test_source_that_was_idle_has_saved_nothing_up() -> None:

@@ -40,7 +40,7 @@ QUEUE_BYTES: Final = 256 * 1024
 MAX_FLOWS: Final = 256
 """Flows of one source that are remembered while none of their frames waits."""
 MAX_SOURCES: Final = 64
-"""Sources that are remembered while none of their frames waits."""
+"""Sources that are remembered while none of their frames waits. One that is forgotten owes a frame at most."""
 MOST_AHEAD: Final = MAX_FRAME_BYTES
 """A source, or a class of frames, is ahead of others by so many bytes at most. What exceeds that is forgiven."""
 
@@ -161,7 +161,7 @@ class FairQueue:
         self._clock = min(waiters[0].sent for waiters in (urgent, rest) if waiters)
         self.charge(frames.source, size)
         lead = size if waiting.flow.lane is Lane.URGENT else -size
-        self._lead = max(-MOST_AHEAD, min(self._lead + lead, MOST_AHEAD)) if urgent and rest else 0
+        self._lead = min(self._lead + lead, MOST_AHEAD) if urgent and rest else 0
         frames.lanes.serve(waiting, now)
         self.count -= 1
         self.size -= size
@@ -195,14 +195,10 @@ class FairQueue:
 
     def _add(self, source: Source) -> _SourceFrames:
         if len(self._sources) >= self._sources_limit:
-            self._sources = {source: frames for source, frames in self._sources.items() if self._is_needed(frames)}
+            self._sources = {source: frames for source, frames in self._sources.items() if frames.lanes.count}
             self._sources_limit = max(MAX_SOURCES, 2 * len(self._sources))
         added = self._sources[source] = _SourceFrames(source, self._on_drop)
         return added
-
-    def _is_needed(self, frames: _SourceFrames) -> bool:
-        """Whether a source must be remembered."""
-        return bool(frames.lanes.count) or frames.sent > self._clock
 
     def _on_drop(self, waiting: Waiting, reason: EgressDrop) -> None:
         self.count -= 1
