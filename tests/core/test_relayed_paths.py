@@ -6,7 +6,7 @@ import pytest
 
 from tests.core.harness import AT_A, Pair, datagrams
 from tests.core.harness import of as outputs_of
-from tests.core.test_path_set import answer, fail, linked, of, path_set, route, suspect
+from tests.core.test_path_set import PEER, answer, fail, linked, of, path_set, route, suspect
 from uavlinkd.core import constants as c
 from uavlinkd.core import probing, wire
 from uavlinkd.core.limits import prefix_of
@@ -79,6 +79,24 @@ def test_further_relayed_path_replaces_one_that_is_suspect_or_down() -> None:
     assert route(paths, Class.CRITICAL)[:2] == [LTE, LTE_B]
 
 
+def test_new_handle_hastens_the_questions_along_all_paths() -> None:
+    """The peer's NAT has forgotten it. Its former handle must not carry the copies for seconds, nor the direct path
+    the stream. A relay that invents handles causes no more questions than suspect paths get.
+    """
+    paths = linked(LTE, LTE_A)
+    asked_at = 4.0 - c.PROBE_FAST_S
+    of(paths, LTE).questioned_at, of(paths, LTE_A).questioned_at = asked_at - 0.01, asked_at + 0.01
+    paths.configure([LTE, LTE_A], 4.0)
+    paths.schedule(4.0)
+    assert of(paths, LTE).question_at > 4.0  # nothing is new
+    paths.configure([LTE, LTE_A, LTE_A2], 4.0)
+    paths.schedule(4.0)
+    assert of(paths, LTE).question_at == 4.0 < of(paths, LTE_A).question_at
+    answer(paths, LTE_A2, 4.1, 0.2)
+    suspect(paths, LTE_A, 4.2)
+    assert route(paths, Class.CRITICAL) == [LTE, LTE_A2, LTE_A]
+
+
 # Envelopes.
 
 
@@ -91,6 +109,18 @@ def test_envelopes_along_a_relay_are_shorter() -> None:
     sizes = c.RELAYED_ENVELOPE_LIMIT, c.RELAYED_ENVELOPE_LIMIT + 1
     assert [paths.carries(of(paths, LTE_A), size) for size in sizes] == [True, False]
     assert [made.has_relayed for made in (linked(LTE, MESH), path_set(), paths)] == [False, False, True]
+
+
+def test_envelopes_hold_one_class_before_a_new_relayed_path_has_answered() -> None:
+    """It carries the critical ones again then. Meanwhile the other path may be dead."""
+    paths = linked(LTE)
+    paths.configure([LTE, LTE_A], 2.0)
+    paths.update(PEER, 2.0)
+    assert paths.is_multiple
+    assert route(paths, Class.CRITICAL) == [LTE]
+    paths.configure([LTE], 2.1)
+    paths.update(PEER, 2.1)
+    assert (paths.is_multiple, paths.has_relayed) == (False, True)
 
 
 def test_new_handles_do_not_hasten_initiations_without_limit() -> None:

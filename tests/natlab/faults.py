@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from time import monotonic
 from types import MappingProxyType
 from typing import Final
@@ -76,13 +77,13 @@ class Scene:
         return Outcome(back_s, sent, self.talk.lost(since, before))
 
 
-async def filtered_nat_forgets(scene: Scene) -> Outcome:
+async def filtered_nat_forgets(scene: Scene, voice: type[Voice] = Voice) -> Outcome:
     """One end's NAT forgets its mappings under a direct link: its next datagram gets another port.
 
     The other one's NAT filters by port, so both have to ask again. It is direct again then.
     """
     places = scene.place("port-restricted"), scene.place("port-restricted")
-    scene.join(places)
+    scene.join(places, voice)
     await scene.start()
     await scene.talk.start()
     assert await until_direct(scene.ends.daemons, DIRECT_S) is not None
@@ -166,6 +167,7 @@ def _name(daemon: DaemonProcess, hosts: str) -> None:
 FAULTS: Final[Mapping[str, Callable[[Scene], Awaitable[Outcome]]]] = MappingProxyType(
     {
         "a NAT forgets, direct, both filter by port": filtered_nat_forgets,
+        "the same, critical frames": partial(filtered_nat_forgets, voice=CriticalVoice),
         "one of two networks dies, critical frames": one_network_dies,
         "a member roams": member_roams,
         "the relay is killed and starts": relay_restarts,

@@ -221,8 +221,8 @@ PROBE_IDLE_S = 15.0
 IDLE_AFTER_S = 10.0
 """A link is idle if no frames were sent for this long."""
 STREAM_ENVELOPES = 4
-"""A path carries stream with more envelopes of it than so many within :data:`STREAM_ENDS_AFTER_S`: the two a second
-of a ground station are not worth four questions."""
+"""The best path carries a stream with more envelopes than so many in :data:`STREAM_ENDS_AFTER_S`: the two a second of
+a ground station are not worth four questions."""
 STREAM_ENDS_AFTER_S = 1.0
 """A path carries stream until it carried none for this long."""
 FIRST_ANSWER_S = 1.0

@@ -66,6 +66,10 @@ class PathSlots:
             if hosts[path.socket, path.host] <= c.PATHS_PER_HOST and len(wanted) < c.CONFIGURED_PATHS:
                 wanted.append(path)
         before = self.by_path
+        if any(path.is_relayed and path not in before for path in wanted):  # the peer may have another address
+            for state in before.values():
+                if now >= state.questioned_at + max(c.PROBE_FAST_S, self.facts.least_probe_s(state.path)):
+                    state.questioned_at = -c.NEVER  # ask at once
         self.by_path = {}
         for path in wanted:
             self.by_path[path] = before.get(path) or self._new(path, now, is_configured=True, others=before)

@@ -111,7 +111,7 @@ class PathSet(PathSlots):
         self.slots_at = c.NEVER
         """When a slot is given up: the same."""
         self.has_relayed = False
-        """Whether one of them leads through a relay."""
+        """Whether one of them led through a relay, now or before."""
         self.reports_single = False
         """Whether the condition of a path is reported even if it is the only one."""
         self.is_multiple = False
@@ -129,7 +129,7 @@ class PathSet(PathSlots):
         self.searched_at = -c.NEVER
         """When a candidate was asked last."""
         self.stream_at = -c.NEVER
-        """When the best path carried stream last."""
+        """When the best path carried a stream last."""
         self._stream_times = deque[float](maxlen=c.STREAM_ENVELOPES)  # of envelopes, the oldest first
 
     # Facts.
@@ -267,10 +267,12 @@ class PathSet(PathSlots):
         others = [
             state for state in self.by_path.values() if state is not best and state.is_validated and not state.is_off
         ]
-        self.has_relayed = any(state.path.is_relayed for state in self.by_path.values())
-        if self.has_relayed:
+        relayed = [state for state in self.by_path.values() if state.path.is_relayed]
+        if relayed:
+            self.has_relayed = True
             others = self._without_spares(best, others)
-        self.is_multiple = bool(others)
+        # Also before the first answer along a relayed path, which carries recent critical envelopes again then.
+        self.is_multiple = bool(others) or any(state is not best for state in relayed)
         alone = (best,)
         critical = alone if self._redundancy is Redundancy.NONE else (best, *others)
         stream: Route = alone
@@ -294,7 +296,9 @@ class PathSet(PathSlots):
         direct = Counter(path.socket for path in usable if not path.is_relayed)
         carrying: dict[int, Counter[str]] = {}  # by socket, how many through each relay
         picked = [state for state in others if not state.path.is_relayed]
-        others.sort(key=lambda state: (not state.works, state.srtt_s or c.NEVER))
+        others.sort(
+            key=lambda state: (state.condition is not PathCondition.USABLE, not state.works, state.srtt_s or c.NEVER)
+        )
         for state in (best, *others):
             if not state.path.is_relayed:
                 continue
@@ -342,10 +346,10 @@ class PathSet(PathSlots):
         return now > self.active_at + c.IDLE_AFTER_S
 
     def note_stream(self, now: float) -> bool:
-        """Frames of another class than critical are sent. Returns whether the best path begins to carry stream now.
+        """Frames are sent. Returns whether the best path begins to carry a stream now.
 
-        It carries stream only with enough envelopes a second: questions four times a second would cost more than a
-        rare frame is worth.
+        It carries one only with enough envelopes a second: questions four times a second would cost more than a rare
+        frame is worth.
         """
         times = self._stream_times
         is_stream = len(times) == c.STREAM_ENVELOPES and now < times[0] + c.STREAM_ENDS_AFTER_S

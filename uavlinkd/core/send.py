@@ -33,7 +33,7 @@ def send_frames(peer: Peer, frames: Sequence[bytes], now: float, cls: Class) -> 
     limit = session.payload_limit
     asks_at = NEVER
     if len(paths.by_path) > 1:
-        _note_activity(peer, cls, now)
+        _note_activity(peer, now)
     if paths.is_multiple or paths.has_relayed or paths.facts.envelope_limits:
         limit = min(limit, session.payload_limit_of(paths.longest(cls)))
     if paths.is_multiple and cls is not Class.CRITICAL and len(route) == 1:
@@ -76,14 +76,12 @@ def resend(peer: Peer, state: PathState, now: float) -> list[Output]:
     return out
 
 
-def _note_activity(peer: Peer, cls: Class, now: float) -> None:
+def _note_activity(peer: Peer, now: float) -> None:
     """Frames are sent: an idle link, or a stream that begins, is probed more often from now on."""
     paths = peer.paths
     begins = paths.is_idle(now)
     paths.active_at = now
-    if cls is not Class.CRITICAL:
-        begins = paths.note_stream(now) or begins
-    if begins:
+    if paths.note_stream(now) or begins:
         paths.schedule(now)
         peer.set_paths_timer()
 
