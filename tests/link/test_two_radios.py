@@ -10,8 +10,9 @@ import pytest
 
 from tests.link.two_radios import End, Network, Radio
 from tests.mavlink.egress.links import CLASS_OF
-from tests.samples import attitude, command, manual_control, read_by_name, value
-from uavlinkd.core.path_state import PathCondition
+from tests.samples import attitude, blank, command, heartbeat, manual_control, read_by_name, value
+from uavlinkd.core.path_state import PathCondition, PathState
+from uavlinkd.link.copies import BEGIN_LOSS
 from uavlinkd.link.peer_output import STICKS_COPIED_S, PeerOutput
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.mavlink.frames import Frame
@@ -72,6 +73,51 @@ def test_stick_positions_are_copied_rarely_while_the_best_path_is_healthy(phase_
     pair.radios[0] = Radio(FAST.delay_s, loss=0.1)
     fly(pair, 20.0)
     assert fly(pair, 1.0)[1] >= STICKS_PER_S
+
+
+OVERRIDE, SETPOINT = blank("RC_CHANNELS_OVERRIDE"), blank("SET_POSITION_TARGET_LOCAL_NED")
+
+
+@pytest.mark.parametrize(
+    ("frames", "radios"),
+    [
+        ([manual_control(2)], {0: 1}),
+        ([OVERRIDE, manual_control(2)], {0: 1, 1: 1}),  # one of them was not copied yet
+        ([manual_control(2), command(2)], {0: 1, 1: 1}),
+        ([command(2)], {0: 1, 1: 1}),
+        ([heartbeat(2)], {0: 1, 1: 1}),
+        ([SETPOINT], {0: 1, 1: 1}),
+    ],
+)
+def test_nothing_but_stick_positions_is_spared(frames: list[Frame], radios: dict[int, int]) -> None:
+    """However soon it follows one of its flow."""
+    pair = network(FAST, SLOW)
+    for those in ([manual_control(1), command(1)], [manual_control(1)], [heartbeat(1)], [SETPOINT]):
+        pair.alpha.send(*those)
+    pair.alpha.sent.clear()
+    pair.alpha.send(*frames)
+    assert radios_of(pair.alpha, *frames) == {one.raw: radios for one in frames}
+
+
+@pytest.mark.parametrize("sign", ["loss", "repair", "suspect"])
+def test_no_stick_position_is_spared_while_the_best_path_is_not_healthy(
+    sign: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also a path that is down gets a copy then: it may be the one that carries it."""
+    pair = network(FAST, SLOW, SLOW)
+    paths = pair.alpha.peer.paths
+    best, _, last = paths.states
+    last._set(PathCondition.DOWN, "unanswered", pair.now)
+    if sign == "loss":
+        monkeypatch.setattr(PathState, "loss_out", BEGIN_LOSS)
+    elif sign == "repair":
+        pair.alpha.link.output.repair.is_on = True
+    else:
+        best._set(PathCondition.SUSPECT, "unanswered", pair.now)
+    paths._set_routes(pair.now)
+    pair.alpha.send(manual_control(1))
+    pair.alpha.send(manual_control(2))
+    assert set(radios_of(pair.alpha, manual_control(2))[manual_control(2).raw]) == {0, 1, 2}
 
 
 RADIO_BITS_S = 9600

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from math import inf
 from operator import itemgetter
+from typing import Final
 
 from uavlinkd.core.constants import CRITICAL_ENVELOPE_LIMIT, NEVER
 from uavlinkd.core.node import Node
@@ -18,7 +19,7 @@ from uavlinkd.core.peer import Peer
 from uavlinkd.core.settings import Class, Redundancy
 from uavlinkd.link.copies import BEGIN_LOSS, Copies, Repair
 from uavlinkd.link.networks import COPIES_SHARE, NetworkBudget, carrier_bytes
-from uavlinkd.mavlink.dialect import Lane
+from uavlinkd.mavlink.dialect import IDS
 from uavlinkd.mavlink.egress.bucket import Bucket
 from uavlinkd.mavlink.egress.budgeted import EgressSettings, EnvelopeShape
 from uavlinkd.mavlink.egress.by_class import ClassOf, PeerEgress, split_by_class
@@ -30,6 +31,8 @@ RAW = itemgetter(0)
 STICKS_COPIED_S = 0.05
 """Between copies of MANUAL_CONTROL or RC_CHANNELS_OVERRIDE, at least, while the best path is healthy. At 50/s every
 third one is copied, so a path that dies costs at most two in a row."""
+
+_STICKS: Final = frozenset(IDS[name] for name in ("MANUAL_CONTROL", "RC_CHANNELS_OVERRIDE"))
 
 OnSent = Callable[[list[bytes], list[Output], float], None]
 """Receives frames that were sent, and the outputs of the core for them, which are to be performed."""
@@ -222,8 +225,7 @@ class PeerOutput:
 
     def _is_spared(self, peer: Peer, frames: Sequence[Frame], now: float) -> bool:
         """Whether these frames go along the best path alone: stick positions, which newer ones replace soon."""
-        kinds = [frame.header.kind for frame in frames]
-        if self.repair.is_on or not all(kind.is_state and kind.lane is Lane.URGENT for kind in kinds):
+        if self.repair.is_on or not all(frame.header.msgid in _STICKS for frame in frames):
             return False
         best = peer.paths.best
         is_healthy = best is not None and best.condition is PathCondition.USABLE and best.loss_out < BEGIN_LOSS
