@@ -32,7 +32,7 @@ from uavlinkd.config import PeerAddress
 from uavlinkd.config import PeerConfig as Peer
 from uavlinkd.config.build import verify_interval_s
 from uavlinkd.core import handshake
-from uavlinkd.core.constants import NEVER
+from uavlinkd.core.constants import KNOWN_FEATURES, NEVER
 from uavlinkd.core.cookie import MacKeys
 from uavlinkd.core.outputs import Output, Transmit
 from uavlinkd.core.path import Path
@@ -42,7 +42,7 @@ from uavlinkd.link.peer_link import Carriage, PeerLink, Rates, radio_figures
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.mavlink.frames import Frame, SplitCounters, split_payload
 from uavlinkd.mavlink.own_frames import LinkFigures
-from uavlinkd.system.addresses import Address
+from uavlinkd.system.addresses import IPV4_UDP_BYTES, Address
 
 BUDGET_BITS_S = 4000
 REPLAYS_PER_S = 4
@@ -217,6 +217,23 @@ def test_reports_leave_room_for_frames(budget: int) -> None:
         link.report_refusals(30.0)
         assert len(of(sent, Transmit)) == 1
         assert link.output.egress.demand(30.0) > before
+
+
+def test_problem_reports_use_little_of_a_slow_link() -> None:
+    """Problems that come and go each second: at 4 kbit/s their reports use less than a tenth, and frames go first."""
+    pair, sent = Pair(quiet(features=KNOWN_FEATURES), quiet(features=KNOWN_FEATURES)).establish(), list[Output]()
+    link = member_of(pair, sent, BUDGET_BITS_S)
+    link.follow_paths(0.0)
+    for second in range(1, SECONDS + 1):
+        link.report_problems([second % 2 + 1], float(second))
+    reports = of(sent, Transmit)
+    assert SECONDS / 4 < len(reports) <= SECONDS / 2
+    assert 8 * sum(len(report.datagram) + IPV4_UDP_BYTES for report in reports) < BUDGET_BITS_S * SECONDS / 10
+    waiting = split_payload(b"".join(frames.heartbeat(1, seq=number) for number in range(250)), SplitCounters())
+    link.send(waiting, PASSES, SECONDS + 2.0, 0.0)
+    sent.clear()
+    link.report_problems([9], SECONDS + 2.0)
+    assert of(sent, Transmit) == []
 
 
 # The figures of a link with several paths.

@@ -33,7 +33,7 @@ def share(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "share"
 
 
-@pytest.mark.parametrize(
+LINES = pytest.mark.parametrize(
     ("line", "completed"),
     [
         ("uavlinkd st", "status"),
@@ -45,12 +45,25 @@ def share(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("uavlink-mitm relay --li", "--list"),
     ],
 )
+
+
+@LINES
 def test_bash_completes(line: str, completed: str, share: Path) -> None:
     """Commands, options, choices and files."""
     script = share / "bash-completion/completions" / line.split(maxsplit=1)[0]
     command: list[str | Path] = ["bash", "-c", PRESS_TAB, "bash", script, ROOT, *line.split()]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert (done.stdout.strip(), done.stderr) == (completed, "")
+
+
+@LINES
+def test_fish_completes(line: str, completed: str, share: Path) -> None:
+    """The same. It adds a description to each."""
+    need(shutil.which("fish") is not None, "fish")
+    script = share / "fish/vendor_completions.d" / f"{line.split(maxsplit=1)[0]}.fish"
+    command = ["fish", "--no-config", "--command", f"source {script}; complete --do-complete '{line}'"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT)
+    assert (done.stdout.split()[0], done.stderr) == (completed, "")
 
 
 @pytest.mark.parametrize("script", SCRIPTS)

@@ -126,6 +126,16 @@ def test_a_captured_drone_floods_only_its_own_claims() -> None:
     assert len(victim.delivered) >= achieved.frames_sent - 1  # the last one may still be underway
 
 
+def test_a_captured_drone_lies_about_itself_only() -> None:
+    """With problem reports alone: the newest one is shown as the word of c, and no frame is delivered."""
+    victim = Victim()
+    lies = Impostor("impostor", [Disguise("a", A.public, "b", C, PSK_C)], 0.0, lies=True)
+    assert victim.suffer(lies, 1.0).sessions == 1
+    claims = {name: len(peer.problem_claim.codes) for name, peer in victim.node.peers.items()}
+    assert claims == {"b": 0, "c": c.PROBLEMS_PER_REPORT}
+    assert victim.delivered == []
+
+
 def test_the_right_keys_succeed() -> None:
     """The impostor works: with b's own keys it is b."""
     victim = Victim()

@@ -217,6 +217,7 @@ async def test_quick_run(tmp_path: Path) -> None:
         ("block-rekey", "handshakes_unanswered"),
         ("sealed-cookies", "cookies_taken"),
         ("captured drone, as itself", "refused_foreign_system"),
+        ("captured drone, invented problems", "unexpected_response"),
         ("bytes injected on the line", "line_noise"),
         ("datagrams replayed on the line", "duplicate"),
         ("datagrams forged on the line", "bad_tag"),

@@ -110,6 +110,7 @@ class Impostor(PassiveAttack):
 
     Args:
         frames: the frames to send on a session, if it gets one. Then it also invents refusals and problems.
+        lies: send invented problems and no frame.
     """
 
     def __init__(
@@ -120,11 +121,13 @@ class Impostor(PassiveAttack):
         *,
         relays: bool = False,
         frames: tuple[bytes, ...] = (),
+        lies: bool = False,
     ) -> None:
         self.name = name
         self.achieved = {disguise.victim: Achieved() for disguise in disguises}
         self.relays = relays
         self._frames = frames
+        self._speaks = bool(frames) or lies
         self._claimed = 0
         self._speaks_at = now
         self._directions = {disguise.victim: Direction(disguise.pose, disguise.victim) for disguise in disguises}
@@ -157,9 +160,10 @@ class Impostor(PassiveAttack):
         for victim, node in self._nodes.items():
             actions += self._perform(victim, node.handle_timeout(now), now)
             peer = node.peers[victim]
-            if self._frames and now >= self._speaks_at and peer.sessions.current is not None:
+            if self._speaks and now >= self._speaks_at and peer.sessions.current is not None:
                 self.achieved[victim].frames_sent += len(self._frames)
-                actions += self._perform(victim, node.send(peer, self._frames, now), now)
+                if self._frames:
+                    actions += self._perform(victim, node.send(peer, self._frames, now), now)
                 actions += self._perform(victim, self._invent(peer, peer.sessions.current, now), now)
         if now >= self._speaks_at:
             self._speaks_at = now + RETRY_S
@@ -172,13 +176,13 @@ class Impostor(PassiveAttack):
             self._claimed += 1
             entries = (Refused(self._claimed % 2**24, 400, place, 2**32 - 1) for place in range(REFUSALS_PER_REPORT))
             problems = ProblemReport(tuple(range(self._claimed % 249, self._claimed % 249 + PROBLEMS_PER_REPORT)))
-            for report in (RefusalReport(tuple(entries)), problems):
+            for report in (RefusalReport(tuple(entries)), problems) if self._frames else (problems,):
                 out += seal(peer, session, report.encode(), peer.paths.routes[Class.BULK], now, is_answer=True)
         return out
 
     def next_deadline(self) -> float:
         deadlines = [node.next_deadline() for node in self._nodes.values()]
-        return min([*deadlines, *([self._speaks_at] if self._frames else [])], default=NEVER)
+        return min([*deadlines, *([self._speaks_at] if self._speaks else [])], default=NEVER)
 
     def _perform(self, victim: str, outputs: list[Output], now: float) -> list[Action]:
         actions: list[Action] = []
@@ -232,6 +236,7 @@ class KeyAttack:
     disguises: Sequence[Disguise]
     relays: bool = False
     frames: tuple[bytes, ...] = ()
+    lies: bool = False
 
 
 def key_attacks(stage: DaemonStage) -> list[KeyAttack]:
@@ -269,23 +274,31 @@ def key_attacks(stage: DaemonStage) -> list[KeyAttack]:
             [to_a(captured, with_c)],
             frames=of_b,
         ),
+        KeyAttack(
+            "captured drone, invented problems",
+            f"holds all keys of {c}, has a session as {c}, and reports problems that it does not have",
+            [to_a(captured, with_c)],
+            lies=True,
+        ),
     ]
 
 
 async def run_key_attack(bench: Bench, attack: KeyAttack) -> None:
-    impostor = Impostor(attack.name, attack.disguises, monotonic(), relays=attack.relays, frames=attack.frames)
+    now, lies = monotonic(), attack.lies
+    impostor = Impostor(attack.name, attack.disguises, now, relays=attack.relays, frames=attack.frames, lies=lies)
 
     def total(name: str) -> int:
         return sum(getattr(achieved, name) for achieved in impostor.achieved.values())
 
     attacker = KeyHolder(
         [impostor],
-        # As itself, a captured drone has a genuine session: only its frames matter.
-        sessions=lambda: 0 if attack.frames else total("sessions"),
+        # As itself, a captured drone has a genuine session: only its frames and reports matter.
+        sessions=lambda: 0 if attack.frames or lies else total("sessions"),
         achieved=lambda: {name: total(name) for name in ("initiations", "answers", "sessions", "frames_read")},
     )
     least_s = 2.0 if attack.relays else 0.5
-    plan = TrialPlan(attack.name, KEYS, (), restarts=attack.relays, least_s=least_s, notes=attack.notes)
+    needs = ("problem_began",) if lies else ()
+    plan = TrialPlan(attack.name, KEYS, (), restarts=attack.relays, least_s=least_s, needs=needs, notes=attack.notes)
     await bench.run(plan, attacker)
 
 
