@@ -8,7 +8,7 @@ from tests.core.harness import AT_A, Pair, datagrams
 from tests.core.harness import of as outputs_of
 from tests.core.test_path_set import PEER, answer, fail, linked, of, path_set, route, suspect
 from uavlinkd.core import constants as c
-from uavlinkd.core import probing, wire
+from uavlinkd.core import establish, probing, wire
 from uavlinkd.core.limits import prefix_of
 from uavlinkd.core.outputs import Output, PathChanged, PathSuspected, Transmit
 from uavlinkd.core.path import Path, relay_name, relayed
@@ -174,19 +174,44 @@ def test_relays_are_asked_when_a_direct_path_from_their_socket_fails(pair: Pair)
     assert [suspected(probing.update(pair.a.peer, now)) for now in (3.0, 3.1)] == [[LTE_A], []]
 
 
+def resent(pair: Pair, path: Path, now: float) -> list[bytes]:
+    """What a side sends again when a question along this path, beside the relayed one, is answered."""
+    paths, session = pair.a.peer.paths, pair.a.session
+    paths.configure([LTE_A, path], now)
+    state, question, before = paths.by_path[path], round(10 * now), paths.by_path[path].sent
+    state.make_probe(question, 0, now)
+    out = probing.receive_probe(pair.a.peer, session, Probe(0, question, 0, 0), state, now)
+    sent = [output.datagram for output in outputs_of(out, Transmit) if output.path == path]
+    assert state.sent == before + len(sent), "the peer counts them too"
+    return sent
+
+
+def send_critical(pair: Pair, now: float, size: int = 20) -> bytes:
+    """Send a critical envelope along the relayed path."""
+    sent = pair.a.node.send(pair.a.peer, [b"\xfd" + bytes(size)], now, Class.CRITICAL)
+    return outputs_of(sent, Transmit)[0].datagram
+
+
 def test_new_relayed_path_carries_the_critical_envelopes_of_the_last_second(pair: Pair) -> None:
-    """Once, and of the current session: the path that they went along may have failed."""
-    sent = [pair.a.node.send(pair.a.peer, [b"\xfd" + bytes(20)], now, Class.CRITICAL) for now in (3.0, 4.0, 4.5)]
+    """Once: the path that they went along may have failed."""
+    sent = [send_critical(pair, now) for now in (3.0, 4.0, 4.5)]
     pair.a.node.send(pair.a.peer, [b"\xfd" + bytes(20)], 4.6, Class.STREAM)
-    resent = []
-    for path, number in ((LTE_A2, 5), (LTE_B, 6)):
-        paths, session = pair.a.peer.paths, pair.a.peer.sessions.current
-        assert session is not None
-        paths.configure([LTE_A, path], 4.6)
-        paths.by_path[path].make_probe(number, 0, 4.6)
-        out = probing.receive_probe(pair.a.peer, session, Probe(0, number, 0, 0), paths.by_path[path], 4.7)
-        resent.append([output.datagram for output in outputs_of(out, Transmit) if output.path == path])
-    assert resent == [[outputs_of(outputs, Transmit)[0].datagram for outputs in sent[1:]], []]
+    assert resent(pair, LTE_A2, 4.7) == sent[1:]
+    assert resent(pair, LTE_B, 4.8) == []
+
+
+def test_no_other_envelope_is_sent_again_and_along_no_other_path(pair: Pair) -> None:
+    """A direct path, or one that has answered before, is no replacement. A former session's envelopes are old."""
+    assert resent(pair, LTE_B, 1.0) == []
+    recent = send_critical(pair, 1.1)
+    assert resent(pair, LTE, 1.2) == resent(pair, LTE_A, 1.3) == []
+    assert resent(pair, LTE_A2, 1.4) == [recent]
+    send_critical(pair, 1.5, c.MIN_ENVELOPE_LIMIT)
+    pair.a.node.facts.envelope_limits = {MESH_A.socket: c.MIN_ENVELOPE_LIMIT}
+    assert resent(pair, MESH_A, 1.6) == [], "too long for it"
+    send_critical(pair, 1.7)
+    pair.complete(datagrams(establish.initiate(pair.a.peer, 1.8), wire.INITIATION)[0], 1.8)
+    assert resent(pair, LTE_B, 1.9) == []
 
 
 def test_path_ends_with_its_handle(pair: Pair) -> None:
