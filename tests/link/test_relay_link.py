@@ -108,6 +108,12 @@ def test_data_with_an_unknown_handle_causes_a_bind(scene: Scene) -> None:
             binds += 1
             scene.bound(now, (ONE, 5), (TWO, 6))
     assert binds == 4
+    binds = 0
+    for number in range(90):
+        scene.link.on_unknown_handle(AT_B, T + 2.5 + number / 1000)
+        binds += bool(scene.binds(T + 2.5 + number / 1000))
+    assert binds == 1, "no other one before an answer, but the usual repeats"
+    scene.bound(T + 2.6, (ONE, 5), (TWO, 6))
     many = [ONE, TWO, *(bytes((number,)) * 32 for number in range(100, 130))]
     scene.link.follow(many)
     assert len(scene.binds(T + 3)) == 2
