@@ -150,7 +150,7 @@ def test_every_cause_is_documented_with_its_severity() -> None:
 )
 def test_errors_of_this_machine(daemon: Daemon, error: str, cause: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """They name the address and the error. Then the peer gets no response to confirm."""
-    monkeypatch.setattr(down_problems, "has_unconfirmed", lambda _: True)
+    monkeypatch.setattr(down_problems, "is_deaf", lambda *_: True)
     daemon.now = 5.0
     assert set(daemon.findings()) == {"not_confirmed"}
     daemon.evidence.add_error(error, THERE, 5.0)
@@ -211,11 +211,11 @@ def test_address_of_this_daemon(daemon: Daemon) -> None:
 def test_evidence_from_before_the_link_went_down_does_not_count(daemon: Daemon) -> None:
     """Also what an attacker sent while it was up. After a time, the silence is reported."""
     daemon.dropped(DropReason.BAD_MAC1, THERE)
-    daemon.link.silent_since = NOW + 1.0
+    daemon.link.expected_since = NOW + 1.0
     assert daemon.findings(NOW + 2.0) == {}
     assert set(daemon.findings(NOW + 20.0)) == {"no_answer"}
     daemon.set_up(role="all", system_ids="all")
-    daemon.link.silent_since = 0.0
+    daemon.link.expected_since = 0.0
     assert daemon.findings() == {}, "the link is up"
 
 

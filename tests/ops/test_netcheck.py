@@ -7,7 +7,19 @@ from typing import Any
 
 import pytest
 
-from uavlinkd.ops.netcheck import INTERVAL_S, Filtered, Mapped, behaviours, folded, ping, report
+from uavlinkd.ops.netcheck import (
+    BLOCKED,
+    INTERVAL_S,
+    NO_RELAY,
+    ONE_PORT,
+    ONE_RELAY,
+    Filtered,
+    Mapped,
+    behaviours,
+    folded,
+    ping,
+    report,
+)
 
 PRIVATE, PUBLIC, OTHER = "192.168.1.5:5790", "203.0.113.7:40001", "203.0.113.7:40002"
 
@@ -26,7 +38,13 @@ def shown(passes: bool | None, **more: Any) -> dict[str, Any]:
 def answer(*views: dict[str, Any], state: str = "up", filtering: tuple[dict[str, Any], ...] = ()) -> dict[str, Any]:
     """A daemon's answer with these views, of the relays that they name."""
     relays = {
-        name: {"state": state, "round_trip_s": 0.0234, "addresses": [f"{name}.example.org:5790"], "unresolved": []}
+        name: {
+            "state": state,
+            "round_trip_s": 0.0234,
+            "addresses": [f"{name}.example.org:5790"],
+            "unresolved": [],
+            "silent": [],
+        }
         for name in ("one", "two")
     }
     return {
@@ -34,6 +52,8 @@ def answer(*views: dict[str, Any], state: str = "up", filtering: tuple[dict[str,
         "views": list(views),
         "filtering": list(filtering),
         "candidates": [PUBLIC, PRIVATE],
+        "others": [],
+        "is_udp_blocked": False,
         "is_relay": False,
         "own": [PRIVATE],
     }
@@ -90,6 +110,69 @@ def test_report_fits_80_columns(state: str) -> None:
     assert any(line.startswith(" " * 13) and place in line for line in printed) is (state == "up")
     rest = printed[printed.index("candidates   203.0.113.7:40001, 192.168.1.5:5790") + 1 :]
     assert not [line for line in rest if line.startswith(" ")]
+
+
+def silent(at: str, icmp: str = "", *, host_answers: bool = False) -> dict[str, Any]:
+    """An address of a relay without an answer."""
+    return {"address": at, "icmp": icmp, "host_answers": host_answers}
+
+
+ONE, TWO = "198.51.100.1:5790", "[2001:db8::2]:5790"
+CHECK = "`nc -zvw3 {} 22`"
+
+
+@pytest.mark.parametrize(
+    ("down", "silences", "facts", "headline", "shown", "advice"),
+    [
+        ("", {}, {}, "gets out: 2 of 2 relays answer", "one: up, 23 ms", ()),
+        (
+            *("one two", {"one": [silent(ONE)], "two": [silent(TWO)]}, {"is_udp_blocked": True}),
+            "is probably blocked here: none of 2 relays on different hosts answers",
+            *(f"one: waiting; no answer at {ONE}", (BLOCKED, CHECK.format("198.51.100.1"))),
+        ),
+        (
+            *("one two", {"one": [silent(ONE, "ECONNREFUSED")]}, {}, "gets no answer: 0 of 2 relays answer"),
+            *(f"one: waiting; no answer at {ONE} (ICMP: no process listens there)", (NO_RELAY,)),
+        ),
+        (
+            *("one two", {"two": [silent(TWO, "EACCES")]}, {"others": ["drone1"]}),
+            "gets out: drone1 answers directly, no relay does",
+            *(f"two: waiting; no answer at {TWO} (ICMP: not reachable)", (ONE_RELAY, CHECK.format("2001:db8::2"))),
+        ),
+        (
+            *("two", {"two": [silent(TWO)]}, {}, "gets out: 1 of 2 relays answer; two alone does not"),
+            *(f"two: waiting; no answer at {TWO}", (ONE_RELAY, CHECK.format("2001:db8::2"))),
+        ),
+        (
+            *("", {"one": [silent(ONE, host_answers=True)]}, {}),
+            f"gets out: 2 of 2 relays answer; one port does not: {ONE}",
+            *(f"one: up, 23 ms; no answer at {ONE}", (ONE_PORT,)),
+        ),
+    ],
+)
+def test_headline_and_advice_name_the_case(
+    down: str,
+    silences: dict[str, list[dict[str, Any]]],
+    facts: dict[str, Any],
+    headline: str,
+    shown: str,
+    advice: tuple[str, ...],
+) -> None:
+    """UDP at all, the relays, one relay, one port: in the headline, and in the advice at the end."""
+    result = answer() | facts
+    for name in down.split():
+        result["relays"][name]["state"] = "waiting"
+    for name, addresses in silences.items():
+        result["relays"][name]["silent"] = addresses
+    lines = list(report(result))
+    assert lines[0] == f"UDP          {headline}"
+    assert f"relay        {shown}" in lines
+    (last,) = [number for number, line in enumerate(lines) if line.startswith("candidates")]
+    said = " ".join(lines[last + 1 :])
+    assert all(text in said for text in advice)
+    given = [text for text in (BLOCKED, NO_RELAY, ONE_RELAY, ONE_PORT) if text in said]
+    assert len(given) == len(advice[:1])
+    assert max(len(part) for line in lines for part in folded(line).splitlines()) <= 80
 
 
 DIRECT: dict[str, Any] = {

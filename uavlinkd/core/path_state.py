@@ -139,6 +139,10 @@ class PathState:
         """The share of our datagrams, repeats too, that it lost, as the peer reports."""
         return self._reported_loss.share()
 
+    def recent_losses(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """In and out, how many envelopes were sent in the last :data:`c.LOSS_WINDOW_S`, and how many of them lost."""
+        return self._loss_in.recent(c.LOSS_WINDOW_S), self._reported_loss.recent(c.LOSS_WINDOW_S)
+
     def loss_to_repair(self) -> tuple[float, int]:
         """The share of our datagrams that it lost in the last :data:`c.REPAIR_WINDOW_S`, and how many envelopes."""
         loss = self._reported_loss

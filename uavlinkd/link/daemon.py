@@ -16,6 +16,7 @@ from uavlinkd.core.path import Path
 from uavlinkd.endpoints.sockets import BindError
 from uavlinkd.link.carrier import FrameCarrier
 from uavlinkd.link.diagnosis import find
+from uavlinkd.link.facts import Moment
 from uavlinkd.link.local_endpoints import PilotNotes
 from uavlinkd.link.own_problems import own_codes
 from uavlinkd.link.parts import DaemonParts
@@ -25,6 +26,7 @@ from uavlinkd.link.traffic_problems import has_no_client
 from uavlinkd.mavlink.own_frames import INTERVAL_S
 from uavlinkd.ops import LOG_SCHEMA
 from uavlinkd.ops.control import ControlServer
+from uavlinkd.ops.log import shown
 from uavlinkd.ops.recorder import Recorder
 from uavlinkd.ops.sdnotify import Supervisor
 from uavlinkd.system.addresses import Address
@@ -173,7 +175,7 @@ class Daemon:
                 tests.begin(parts.relays.by_name.values(), monotonic())
                 self.carrier.arm()
                 await tests.ended.wait()
-                return netcheck(parts)
+                return netcheck(parts, monotonic())
             case ("ping", " ", name):
                 return ping(parts, self.carrier, name, monotonic())
         return None
@@ -284,9 +286,13 @@ def ping(parts: DaemonParts, carrier: FrameCarrier, name: str, now: float) -> di
     return {"paths": paths}
 
 
-def netcheck(parts: DaemonParts) -> dict[str, object]:
-    """How each relay sees each socket, what the last filter tests showed, and the candidates of this daemon."""
-    relays, sockets = parts.relays, parts.peer_sockets
+def netcheck(parts: DaemonParts, now: float) -> dict[str, object]:
+    """How each relay sees each socket, what the last filter tests showed, and the candidates of this daemon.
+
+    ``silent``: the addresses of a relay without an answer, each with the error that ICMP messages report, and whether
+    another port of that host answers. ``others``: the peers that answer directly.
+    """
+    relays, sockets, moment = parts.relays, parts.peer_sockets, Moment(parts, now)
     own, candidates = relays.places()
 
     def along(relay: str, path: Path, **facts: object) -> dict[str, object]:
@@ -300,6 +306,14 @@ def netcheck(parts: DaemonParts) -> dict[str, object]:
                 "round_trip_s": relay.peer.round_trip_s,
                 "addresses": [str(written) for written in relay.config.addresses],
                 "unresolved": sorted(sockets.unresolved(relay.name if relay.link is None else relay.link.name)),
+                "silent": [
+                    {
+                        "address": shown(path.address),
+                        "icmp": moment.reported_at(path),
+                        "host_answers": path.host in moment.answering,
+                    }
+                    for path in moment.silent_paths(relay)
+                ],
             }
             for name, relay in relays.by_name.items()
         },
@@ -312,6 +326,8 @@ def netcheck(parts: DaemonParts) -> dict[str, object]:
             along(test.relay, test.path, other_port_passes=test.passes) for test in relays.filter_tests.results
         ],
         "candidates": [str(Address(*place)) for place in candidates],
+        "others": [link.name for link in parts.links.values() if moment.working(link)],
+        "is_udp_blocked": moment.is_udp_blocked,
         "is_relay": parts.relay is not None,
         "own": [str(Address(*place)) for place in own],
     }

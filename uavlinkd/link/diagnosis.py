@@ -7,19 +7,21 @@ once a second and when a client asks for the status. Frames cost nothing here.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from itertools import chain
 from typing import Final
 
 from uavlinkd.config.keys import encode_key
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.sessions import Twin
 from uavlinkd.link import traffic_problems as traffic
-from uavlinkd.link.down_problems import down_problems, silence, versions
+from uavlinkd.link.down_problems import down_problems, is_deaf, relay_warnings, silence, versions
 from uavlinkd.link.evidence import ELSEWHERE, EVIDENCE_S
 from uavlinkd.link.facts import EndpointFacts, Found, Moment, PeerFacts, fault, keys_at, listed, security, warning
 from uavlinkd.link.parts import DaemonParts
 from uavlinkd.link.serial_networks import RECENT_S
 from uavlinkd.ops.findings import Finding, Subject
 from uavlinkd.ops.log import shown
+from uavlinkd.relay.service import RelayMember
 
 LOAD: Final = 50
 """Refused handshake messages within :data:`EVIDENCE_S` that are reported."""
@@ -97,6 +99,13 @@ def member_problems(moment: Moment) -> Iterator[Found]:
     if daemon.relay is None:
         return
     members = [one for one in daemon.relay.members.values() if one.is_own]
+    if deaf := [one for one in members if is_deaf(one.peers, now)]:
+        yield warning(
+            "member_not_confirmed",
+            f"initiations of {listed(map(_initiator, deaf))} arrive, and it does not confirm the responses of this"
+            " relay: these do not reach it, or the PSKs differ",
+            "let UDP from this relay through the firewalls here, there and between; compare the PSKs",
+        )
     if twins := [one for one in members if traffic.has_twin(one.peers, Twin.PEERS, now)]:
         facts = (f"{one.settings.name}, from {traffic.places(one.peers)}" for one in twins)
         yield traffic.two_machines(f"the private key of a member: {listed(facts)}")
@@ -117,6 +126,12 @@ def member_problems(moment: Moment) -> Iterator[Found]:
             "compare the [[relay]] of each member that is down: public_key ="
             f' "{encode_key(daemon.config.public_key)}"',
         )
+
+
+def _initiator(member: RelayMember) -> str:
+    """A member, and where its last initiation came from that it has not confirmed."""
+    waiting = [one for peer in member.peers for one in peer.sessions.unconfirmed.values()]
+    return f"{member.settings.name} at {shown(waiting[-1].paths[0].address)}"
 
 
 def line_problems(moment: Moment) -> Iterator[Found]:
@@ -153,7 +168,8 @@ def find(daemon: DaemonParts, now: float) -> list[Finding]:
         for severity, cause, text, remedy in problems:
             findings.append(Finding(cause, severity, subject, name, text, remedy))
 
-    add(Subject.DAEMON, "", [*daemon_problems(moment), *member_problems(moment), *line_problems(moment)])
+    of_daemon = (daemon_problems, relay_warnings, member_problems, line_problems)
+    add(Subject.DAEMON, "", chain.from_iterable(problems(moment) for problems in of_daemon))
     for link in daemon.links.values():
         peer = PeerFacts(moment, link)
         add(Subject.PEER, link.name, traffic.peer_problems(peer))

@@ -6,29 +6,39 @@ accepts a key, a name or an address because it arrived.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from typing import Final
 
 from uavlinkd.config.keys import encode_key
 from uavlinkd.core import constants as c
 from uavlinkd.core.drops import DropReason
+from uavlinkd.core.path import relay_name
+from uavlinkd.core.peer import Peer
 from uavlinkd.link.evidence import REPORTED, Sighting
-from uavlinkd.link.facts import Found, PeerFacts, at, fault, keys_at, listed, place
+from uavlinkd.link.facts import (
+    UNREACHABLE,
+    UNROUTED,
+    Found,
+    Moment,
+    PeerFacts,
+    at,
+    fault,
+    hosts_of,
+    keys_at,
+    listed,
+    place,
+    warning,
+)
 from uavlinkd.link.relay_link import RelayLink
 from uavlinkd.ops.log import shown
 from uavlinkd.system.error_meanings import meaning_of
 
 CONFIRM_S: Final = 2.0
 """A handshake that is not complete after this time is reported."""
-RELAY_SILENT_S: Final = 5.0
-"""A relay that does not answer for this long is reported with the peers that need it."""
-_UNROUTED: Final = ("ENETUNREACH", "EHOSTUNREACH", "ENETDOWN", "EADDRNOTAVAIL", "EINVAL", "EMSGSIZE", "EAFNOSUPPORT")
-"""Errors of sending that are certain: this machine's kernel reports them at once."""
-_UNREACHABLE: Final = ("EHOSTUNREACH", "ENETUNREACH", "EACCES")
-"""Errors that ICMP messages report, except a closed port."""
 _ASK_THERE: Final = "run `uavlinkd status` at {}: it names the cause if datagrams arrive there"
 _EXPLAIN_NO_ANSWER: Final = {"firewall_here", "no_route", "wrong_psk", "no_common_suite"}
+_IS_REACHABLE: Final = "`nc -zvw3 {} 22` shows whether the host is reachable by TCP: connected and refused mean yes"
 
 _RelayProblem = tuple[str, RelayLink]
 
@@ -39,17 +49,27 @@ def down_problems(peer: PeerFacts) -> Iterator[Found]:
     found = [*_here(peer, relays), *_at_relays(peer, relays), *_hints(peer), *_handshakes(peer, relays), *_icmp(peer)]
     yield from found
     is_explained = any(one.cause in _EXPLAIN_NO_ANSWER for one in found)
-    if not is_explained and has_unconfirmed(peer) and peer.now - peer.link.silent_since >= CONFIRM_S:
+    if not is_explained and is_deaf(peer.link.peers, peer.now):
         yield fault(
             "not_confirmed",
-            "it initiates, and does not confirm this daemon's responses",
-            f"compare the PSKs; let UDP from this daemon through the firewall at {peer.name}",
+            "its initiations arrive, and it does not confirm this daemon's responses: these do not reach it, or the"
+            " PSKs differ",
+            f"let UDP from this daemon through the firewall at {peer.name}; compare the PSKs",
         )
 
 
-def has_unconfirmed(peer: PeerFacts) -> bool:
-    """Whether it initiated and has not confirmed the response."""
-    return any(one.sessions.unconfirmed for one in peer.link.peers)
+def is_deaf(peers: Iterable[Peer], now: float) -> bool:
+    """Whether a peer initiates, and has not confirmed the responses for :data:`CONFIRM_S`.
+
+    One initiation may have become superfluous. So those of a peer that is up count only if they span this time.
+    """
+    for peer in peers:
+        current = peer.sessions.current
+        since = current.created_at if peer.is_up and current is not None else peer.received_at or -c.NEVER
+        begun = [at for one in peer.sessions.unconfirmed.values() if (at := one.session.created_at) > since]
+        if begun and (max(begun) if peer.is_up else now) - min(begun) >= CONFIRM_S:
+            return True
+    return False
 
 
 def _relays(peer: PeerFacts) -> Iterator[_RelayProblem]:
@@ -58,9 +78,9 @@ def _relays(peer: PeerFacts) -> Iterator[_RelayProblem]:
     relays = [daemon.relays.by_name[name] for name in link.config.relays if name in daemon.relays.by_name]
     if any(relay.peer.is_up and relay.state_for(link) == "bound" for relay in relays):
         return
-    may_fail = ("EPERM", *(() if daemon.peer_sockets.absent_addresses() else _UNROUTED))
+    may_fail = ("EPERM", *(() if daemon.peer_sockets.absent_addresses() else UNROUTED))
     for relay in relays:
-        if not relay.peer.is_up and any(peer.seen_at(relay, error) is not None for error in may_fail):
+        if not relay.peer.is_up and any(peer.moment.seen_at(relay, error) for error in may_fail):
             yield "not_sent", relay
         elif not link.is_overdue(peer.now):
             continue
@@ -70,7 +90,7 @@ def _relays(peer: PeerFacts) -> Iterator[_RelayProblem]:
             yield "name_not_resolved", relay
         elif daemon.evidence.seen_at(DropReason.BAD_HANDSHAKE, ("relay", relay.config.name), peer.now) is not None:
             yield "wrong_psk", relay
-        elif peer.now - relay.silent_since >= RELAY_SILENT_S:
+        elif relay in peer.moment.silent_relays:
             yield "relay_not_answering", relay
 
 
@@ -103,41 +123,90 @@ def _here(peer: PeerFacts, relays: Sequence[_RelayProblem]) -> Iterator[Found]:
         )
     # Errors of sending to the peer, and to the relays to which nothing could be sent.
     look_ups: list[Callable[[str], Sighting | None]] = [peer.seen]
-    look_ups += [partial(peer.seen_at, relay) for problem, relay in relays if problem == "not_sent"]
+    look_ups += [partial(peer.moment.seen_at, relay) for problem, relay in relays if problem == "not_sent"]
     for seen in look_ups:
         if (sighting := seen("EPERM")) is not None:
             remedy = "allow outgoing UDP from the daemon's port: see `sudo nft list ruleset`"
             yield fault("firewall_here", f"this machine refuses to send to {at(sighting)} (EPERM)", remedy)
-        errors = ((error, sighting) for error in _UNROUTED if (sighting := seen(error)) is not None)
+        errors = ((error, sighting) for error in UNROUTED if (sighting := seen(error)) is not None)
         if not sockets.absent_addresses() and (first := next(errors, None)) is not None:
             error, sighting = first
             yield fault("no_route", f"this machine cannot send to {at(sighting)} ({error})", meaning_of(error))
 
 
 def _at_relays(peer: PeerFacts, relays: Sequence[_RelayProblem]) -> Iterator[Found]:
-    for problem, relay in relays:
-        name = relay.config.name
-        if problem == "not_bound":
-            yield fault(
-                "not_bound",
-                f"{peer.name} is not bound at the relay {name}: it is off, not a member, does not use it, or keys"
-                " differ",
-                f"start {peer.name}; compare both public_key with `uavlinkd pubkey`; write a [[relay]] for {name}"
-                " into its file, and a [[member]] for it into the file of the relay",
+    for name in (relay.config.name for problem, relay in relays if problem == "not_bound"):
+        yield fault(
+            "not_bound",
+            f"{peer.name} is not bound at the relay {name}: it is off, cannot reach the relay (UDP blocked there), is"
+            " not a member, does not use it, or keys differ",
+            f"start {peer.name}; compare both public_key with `uavlinkd pubkey`; write a [[relay]] for {name}"
+            " into its file, and a [[member]] for it into the file of the relay",
+        )
+    yield from silent_relays(peer.moment, [relay for problem, relay in relays if problem == "relay_not_answering"])
+
+
+def silent_relays(
+    moment: Moment, relays: Sequence[RelayLink], fault_or_warning: Callable[..., Found] = fault
+) -> Iterator[Found]:
+    """What the silence of these relays means, by what else answers."""
+    if relays and moment.is_udp_blocked:
+        names = [relay.config.name for relay in moment.silent_relays]
+        yield fault_or_warning(
+            "udp_blocked",
+            f"UDP is probably blocked here: none of {len(names)} relays on different hosts answers ({listed(names)})",
+            "try another network, or let UDP to the ports of the relays, and back, through the firewalls here."
+            f" {_IS_REACHABLE.format(min(hosts_of(relays[0])))}. If this daemon is new to the relays, it must be a"
+            " [[member]] there: `uavlinkd status` there shows what arrives",
+        )
+        return
+    for relay in relays:
+        name, hosts = relay.config.name, hosts_of(relay)
+        text = f"the relay {name} does not answer at {listed(map(str, relay.config.addresses))}: "
+        remedy = (
+            f"{_ASK_THERE.format(name)}; else open its firewall. `uavlinkd pubkey` there must print the public_key of"
+            " the [[relay]] here, and this daemon must be a [[member]] there"
+        )
+        error, path = moment.reported(relay) or ("", None)
+        if path is not None and error in UNREACHABLE:
+            text += f"the network reports that {shown(path.address)} is not reachable ({error}, ICMP)"
+            remedy = f"compare its address, and see `ip route get ADDRESS`; or {remedy}"
+        elif error:
+            text += "no process listens there, or a firewall there rejects (ICMP)"
+            listen = "compare its `listen` with the addresses of the [[relay]] here"
+            remedy = f"start the relay, and {listen}; or {remedy}"
+        elif same := next((who for host, who in moment.answering.items() if host in hosts), ""):
+            text += f"that host answers ({same}), so the relay is off, its port wrong, or closed by a firewall"
+        elif other := moment.other_answer(hosts):
+            text += (
+                f"UDP gets out here ({other} answers), so this relay is off, its address is wrong, a firewall there"
+                " drops UDP, or keys or suites differ"
             )
-        elif problem == "relay_not_answering":
-            text = f"the relay {name} does not answer at {listed(map(str, relay.config.addresses))}: "
-            remedy = (
-                f"{_ASK_THERE.format(name)}; else open its firewall. `uavlinkd pubkey` there must print the"
-                " public_key of the [[relay]] here, and this daemon must be a [[member]] there"
-            )
-            if peer.seen_at(relay, f"{REPORTED}ECONNREFUSED") is not None:
-                text += "no process listens there, or a firewall there rejects (ICMP)"
-                listen = "compare its `listen` with the addresses of the [[relay]] here"
-                remedy = f"start the relay, and {listen}; or {remedy}"
-            else:
-                text += "it is off, the address is wrong, a firewall drops UDP, or keys or suites differ"
-            yield fault("relay_not_answering", text, remedy)
+        elif moment.passes(relay):
+            text += "datagrams still come through it, so the direction from here to it is blocked"
+        elif any(peer.received_at is not None for peer in relay.peers):
+            text += "it did before, so it is off, or UDP to it or back is blocked"
+        else:
+            text += "it is off, the address is wrong, a firewall drops UDP here or there, or keys or suites differ"
+            remedy += f". {_IS_REACHABLE.format(min(hosts, default=name))}"
+        yield fault_or_warning("relay_not_answering", text, remedy)
+
+
+def relay_warnings(moment: Moment) -> Iterator[Found]:
+    """Relays that are silent while no peer needs them, and ports of relays that are silent while others answer."""
+    needed = {name for link in moment.down for name in link.config.relays}
+    spare = [relay for relay in moment.silent_relays if relay.config.name not in needed]
+    yield from silent_relays(moment, spare, warning)
+    for relay in moment.daemon.relays.by_name.values() if moment.answering else ():
+        for path in moment.silent_paths(relay) if relay.peer.is_up else ():
+            if answering := moment.answering.get(path.host, ""):
+                yield warning(
+                    "relay_port_silent",
+                    f"no answer from {shown(path.address)}, an address of the relay {relay.config.name}: that host"
+                    f" answers ({answering}), so a firewall drops UDP to this port only, or no process listens there",
+                    "let UDP to this port through the firewalls here and there, or compare `listen` of the relay with"
+                    " the addresses of the [[relay]] here",
+                )
 
 
 # Hints: anything here may be forged.
@@ -171,7 +240,7 @@ def _icmp(peer: PeerFacts) -> Iterator[Found]:
             f"no process listens at {at(sighting)}, or a firewall there rejects (ICMP)",
             f"start uavlinkd at {peer.name}, and compare its `listen` with `addresses` here",
         )
-    for error in _UNREACHABLE:
+    for error in UNREACHABLE:
         if (sighting := peer.seen(REPORTED + error)) is not None:
             yield fault(
                 "host_unreachable",
@@ -246,17 +315,30 @@ def silence(peer: PeerFacts) -> Iterator[Found]:
     config, ask = peer.link.config, _ASK_THERE.format(peer.name)
     if not peer.link.is_overdue(peer.now):
         return
+    was_up = any(one.received_at is not None for one in peer.link.peers)
     if config.addresses and all(written.is_serial for written in config.addresses):
         yield fault(
             "no_answer",
             f"no answer along {peer.addresses}: it is off or out of range, or keys or modem settings differ",
             f"compare the baud rate, NETID and air speed of both modems, and set MAVLINK=0; {ask}",
         )
-    elif config.addresses:
+    elif was_up:
+        by_name = peer.daemon.relays.by_name
+        through = [name for name, relay in by_name.items() if relay.state_for(peer.link) == "bound"]
+        via = f" through the relay {through[0]}, which answers" if through else ""
         yield fault(
             "no_answer",
-            f"no answer from {peer.addresses}: it is off, a firewall drops UDP, or addresses, keys or protocol"
-            " versions differ",
+            f"nothing arrives from it any more{via}: it is off, or the direction from it to here is blocked",
+            f"{ask}; if its link is up there, look for a bad radio or a firewall in the direction from it to here",
+        )
+    elif config.addresses:
+        hosts = {path.host for path in peer.link.peers[0].paths.configured}
+        other = peer.moment.other_answer({host for host in hosts if relay_name((host, 0)) is None})
+        where = f"there, while UDP gets out here ({other} answers)" if other else "here or there"
+        yield fault(
+            "no_answer",
+            f"no answer from {peer.addresses}: it is off, a firewall drops UDP {where}, or addresses, keys or"
+            " protocol versions differ",
             f"{ask}; else open its firewall",
         )
     elif config.relays:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import sub
 from typing import NamedTuple
 
 from uavlinkd.config import PeerConfig
-from uavlinkd.core.constants import CONFIGURED_PATHS
+from uavlinkd.core.constants import CONFIGURED_PATHS, LOSS_WINDOW_S, NEVER
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import LinkedPeer, Output, Transmit
 from uavlinkd.core.path import Path
@@ -28,10 +29,8 @@ from uavlinkd.mavlink.policy.delivery import Source
 from uavlinkd.ops.findings import LinkProblem
 from uavlinkd.ops.recorder import TO_PEER, Recorder
 
-NOT_ANSWERING_S = 5.0
-"""The log reports a peer that does not answer our handshakes for this long."""
-NOT_CONNECTING_S = 10.0
-"""The same for a peer without an address here, which has to connect."""
+NOT_ANSWERING_S = 3.0
+"""A peer or relay that is silent for this long is reported. A normal start takes less, and tries are more often."""
 
 RELAYED_LEAST = 3
 """Slots for configured paths that relayed ones have at least: one for each relay."""
@@ -112,8 +111,8 @@ class PeerLink:
         """In the core: the one of the current keys first, then those of the pairs with a previous key."""
         self.previous: dict[Peer, tuple[KeyPairing, float]] = {}
         """The latter, and until when they are valid: a key is being changed, and the new one is not confirmed yet."""
-        self.silent_since = now
-        """When it was up last, to the second; before that, when the daemon began to expect it."""
+        self.expected_since = now
+        """When the daemon began to expect it."""
         self.relayed: Sequence[Path] = ()
         """The paths to it through relays."""
         self.rates = Rates(now)
@@ -127,6 +126,9 @@ class PeerLink:
         self._answers = ParameterAnswers()
         self._newest: dict[LinkedPeer, NewestStates] = {}
         self._direct: Sequence[Path] = ()
+        self.losses: tuple[tuple[int, int], ...] = ()
+        """In and out, how many envelopes were sent recently, and how many of them lost: by the last measurement."""
+        self._missing = deque[tuple[int, int, int]](maxlen=1 + round(LOSS_WINDOW_S))  # session, expected, missing
         self._sample: tuple[int, tuple[int, int, int, int]] | None = None
         # A session, and its counters at one moment: expected and received here, and as the peer reports.
         self.output = PeerOutput(
@@ -145,6 +147,11 @@ class PeerLink:
                 if peer.is_up:
                     return peer
         return self.peers[0]
+
+    @property
+    def silent_since(self) -> float:
+        """When something new came from it last; before that, when the daemon began to expect it."""
+        return silent_since(self.peers, self.expected_since)
 
     def forget(self, peer: Peer) -> None:
         """A previous key is not accepted any more."""
@@ -188,7 +195,7 @@ class PeerLink:
         if config.egress != self.config.egress:
             self.output.change(config.egress, self.peers, now)
         if config.addresses != self.config.addresses:
-            self.silent_since = now
+            self.expected_since = now
             self.set_paths((), now)  # its new names may have no address: do not connect to the old ones
         for peer in self.peers:
             peer.verify_interval_s = config.settings.link.verify_interval_s
@@ -279,18 +286,12 @@ class PeerLink:
         self._set_deadline(now)
 
     def is_overdue(self, now: float) -> bool:
-        """Whether to report that the peer is silent, after a time by its kind.
-
-        It is :data:`NOT_ANSWERING_S` if the daemon initiates to the peer, else :data:`NOT_CONNECTING_S`.
-        """
-        limit_s = NOT_ANSWERING_S if self.config.is_called else NOT_CONNECTING_S
-        return not self.peer.is_up and now - self.silent_since >= limit_s
+        """Whether to report that the peer is silent."""
+        return not self.peer.is_up and now - self.silent_since >= NOT_ANSWERING_S
 
     def measure(self, now: float) -> LinkFigures:
         """The quality of the link since the last call. Call it once a second or less often."""
         peer = self.peer
-        if peer.is_up:
-            self.silent_since = now
         session, before, self._sample = peer.sessions.current, self._sample, None
         if session is not None:
             counts = session.expected, session.received, *peer.traffic.reported
@@ -298,6 +299,8 @@ class PeerLink:
         self.rates.measure(peer, now)
         loss_in = loss_out = 0.0
         best = peer.paths.best
+        missing = peer.missing(now)
+        self.losses = self._recent_losses(missing)
         if best is not None and peer.paths.has_several:
             loss_in, loss_out = best.loss_in, best.loss_out  # gaps in the counters say nothing about one path
         elif self._sample is not None and before is not None and before[0] == self._sample[0]:
@@ -313,9 +316,22 @@ class PeerLink:
             loss_out=loss_out,
             round_trip_s=self.round_trip_s,
             demand=0.0 if self.output.egress is None else self.output.egress.demand(now),
-            receive_errors=peer.missing(now),
+            receive_errors=missing,
         )
         return self.figures
+
+    def _recent_losses(self, missing: int) -> tuple[tuple[int, int], ...]:
+        """``missing``: all that ever did not arrive."""
+        best, session = self.peer.paths.best, self.peer.sessions.current
+        if best is None or session is None:
+            return ()
+        if self._missing and self._missing[-1][0] != session.local_index:
+            self._missing.clear()
+        self._missing.append((session.local_index, session.expected, missing))
+        into, out = best.recent_losses()
+        if not self.peer.paths.has_several:  # then the peer may send no reports
+            into = session.expected - self._missing[0][1], missing - self._missing[0][2]
+        return into, out
 
     @property
     def round_trip_s(self) -> float | None:
@@ -339,6 +355,11 @@ class PeerLink:
             LinkProblem.HANDSHAKES_UNANSWERED: traffic.handshakes_unanswered,
             LinkProblem.COOKIES_TAKEN: traffic.cookies_taken,
         }
+
+
+def silent_since(peers: Iterable[Peer], expected_since: float) -> float:
+    """When something new came last with one of these pairs of keys, or ``expected_since`` if that is later."""
+    return max(expected_since, *(peer.received_at or -NEVER for peer in peers), -NEVER)
 
 
 def radio_figures(links: Iterable[PeerLink]) -> LinkFigures | None:

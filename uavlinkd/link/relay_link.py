@@ -22,7 +22,7 @@ from uavlinkd.core.path_state import PathState
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.relay_records import RELAYED, WAITING, Bind, Bound, binds_of, handle_of, wrap
 from uavlinkd.core.settings import previous_of
-from uavlinkd.link.peer_link import PeerLink, Rates
+from uavlinkd.link.peer_link import PeerLink, Rates, silent_since
 from uavlinkd.system.addresses import Address
 
 WaitingDatagram = tuple[bytes, Path]
@@ -185,8 +185,7 @@ class RelayLink:
         """Of the peers that use it."""
         self.next_at = NEVER
         """When :meth:`do_due` has something to do."""
-        self.silent_since = now
-        """When it was up last, to the second."""
+        self._expected_since = now
         self._node = node
         self._handles = handles
         self._on_handles = on_handles
@@ -207,6 +206,11 @@ class RelayLink:
         if self.link is not None:
             return self.link.peer
         return next((peer for peer in self._peers if peer.is_up), self._peers[0])
+
+    @property
+    def silent_since(self) -> float:
+        """When something new came from it last; before that, when the daemon began to expect it."""
+        return silent_since(self.peers, self._expected_since)
 
     def views(self) -> list[tuple[Path, Address]]:
         """The paths to the relay, each with this daemon's address as the relay sees it there."""
@@ -317,8 +321,6 @@ class RelayLink:
 
     def do_housekeeping(self, now: float) -> None:
         """Call it about once a second."""
-        if self.peer.is_up:
-            self.silent_since = now
         self.rates.measure(self.peer, now)
         self._forget_lost(now)
         self._schedule()

@@ -32,6 +32,10 @@ CLAIMS_S: Final = 60.0
 """A peer's claim whose count grew within this time is a present problem."""
 REFUSED_S: Final = 10.0
 """Other refusals stay for this time."""
+LOSSY: Final = 0.1
+"""A link that loses more than this share of one direction is reported,"""
+LOSSES: Final = 5
+"""if at least so many envelopes are lost."""
 SILENT_S: Final = 5.0
 """An endpoint without frames for this time is reported: MAVLink clients send a heartbeat every second. Its errors
 count for the same time. It is opened again more often."""
@@ -112,14 +116,31 @@ def up_problems(peer: PeerFacts) -> Iterator[Found]:
         yield fault(
             "freshness_unverified",
             f"freshness unverified for {peer.now - since:.0f} s: the peer's frames arrive, its echo replies do not:"
-            " the direction back is blocked, or an attacker delays frames. Commands, missions, parameters and manual"
-            " control are held and dropped; reports pass and may be old",
-            "fly by other means until answers return; look for a bad radio in the direction to it",
+            " the direction from here to it is blocked, or an attacker delays frames. Commands, missions, parameters"
+            " and manual control are held and dropped; reports pass and may be old",
+            "fly by other means until answers return; look for a bad radio or a firewall in the direction to it",
         )
+    yield from _losses(peer)
     exchanged = list(_roles_exchanged(peer, is_blocked=bool(peer.history.blocked(peer.now))))
     yield from (one for one in _refused(peer) if not exchanged or one.cause != "all_refused")
     yield from exchanged
     yield from _commands(peer)
+
+
+def _losses(peer: PeerFacts) -> Iterator[Found]:
+    """Loss by direction. A network may lose in one only."""
+    directions = ("from it to here", "from here to it")
+    shares = [
+        (direction, min(1.0, lost / max(1, sent)))
+        for direction, (sent, lost) in zip(directions, peer.link.losses, strict=False)
+        if lost >= max(LOSSES, LOSSY * sent)
+    ]
+    if shares:
+        yield warning(
+            "high_loss",
+            f"many datagrams are lost: {' and '.join(f'{share:.0%} {direction}' for direction, share in shares)}",
+            "look for a bad radio, a full network or a rate limit in this direction",
+        )
 
 
 def _about_systems(part: PartFacts, systems: Mapping[int, int], which: str) -> tuple[str, str]:

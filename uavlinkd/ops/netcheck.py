@@ -97,6 +97,28 @@ ONE_HOST = (
 )
 
 
+BLOCKED = (
+    "No UDP comes back from any of these hosts, so something near this machine probably drops it. Try another"
+    " network, or let UDP to the ports of the relays, and back, through the firewalls here. If this daemon is new to"
+    " the relays, it must be a [[member]] there: `uavlinkd status` there shows what arrives"
+)
+NO_RELAY = (
+    "No relay answers: it is off, a firewall drops UDP here or there, or this daemon is not its [[member]]. Compare"
+    " addresses and public_key. `uavlinkd status` here and there names the cause"
+)
+ONE_RELAY = (
+    "UDP gets out, so the cause is at the silent relay or close to it: it is off, its address or public_key is wrong,"
+    " it has no [[member]] for this daemon, or a firewall there drops UDP. `uavlinkd status` there names the cause"
+)
+ONE_PORT = (
+    "The same host answers at another port: let UDP to the silent port through the firewalls here and there, or"
+    " correct `listen` of the relay, or `addresses` here"
+)
+_ICMP: Final = {"": "", "ECONNREFUSED": " (ICMP: no process listens there)"}
+_UNREACHABLE: Final = " (ICMP: not reachable)"
+REACHABLE = "`nc -zvw3 {} 22` shows whether the host is reachable by TCP: connected and refused mean yes"
+
+
 def report(answer: Answer) -> Iterator[str]:
     """The lines of the report for a daemon's answer."""
     relays = answer["relays"]
@@ -109,7 +131,10 @@ def report(answer: Answer) -> Iterator[str]:
             yield "This daemon is a relay itself: run netcheck at its members"
         return
     up = sum(relay["state"] == "up" for relay in relays.values())
-    yield f"UDP          {'gets out' if up else 'gets no answer'}: {up} of {len(relays)} relays answer"
+    down = [name for name, relay in relays.items() if relay["state"] != "up"]
+    silent = [one for relay in relays.values() for one in relay["silent"]]
+    ports = [one["address"] for one in silent if one["host_answers"]]
+    yield f"UDP          {_headline(answer, down, ports)}"
     for name, relay in relays.items():
         yield f"relay        {name}: {relay['state']}{_about(relay)}"
     for view in answer["views"] if up else ():
@@ -121,11 +146,31 @@ def report(answer: Answer) -> Iterator[str]:
         yield f"filtering    {filtered}{on_network}"
         yield f"             {meaning(mapped, filtered)}"
     yield f"candidates   {', '.join(answer['candidates']) or 'none'}"
-    if not up:
-        yield (
-            "No relay answers: compare addresses and public_key with the relay, write a [[member]] for this daemon"
-            " there, and let UDP through the firewalls. `uavlinkd status` here and there names the cause"
-        )
+    if answer["is_udp_blocked"]:
+        yield BLOCKED
+    elif down:
+        yield ONE_RELAY if up or answer["others"] else NO_RELAY
+    if ports:
+        yield ONE_PORT
+    if down and (hosts := [_host(one["address"]).strip("[]") for one in silent if not one["host_answers"]]):
+        yield REACHABLE.format(hosts[0])
+
+
+def _headline(answer: Answer, down: list[str], ports: list[str]) -> str:
+    """Which case it is."""
+    count = len(answer["relays"])
+    counted = f"{count - len(down)} of {count} relays answer"
+    if answer["is_udp_blocked"]:
+        return f"is probably blocked here: none of {count} relays on different hosts answers"
+    if len(down) == count:
+        others = ", ".join(answer["others"])
+        return f"gets out: {others} answers directly, no relay does" if others else f"gets no answer: {counted}"
+    if down:
+        return f"gets out: {counted}; {', '.join(down)} alone {'does' if len(down) == 1 else 'do'} not"
+    if ports:
+        which = "one port does" if len(ports) == 1 else f"{len(ports)} ports do"
+        return f"gets out: {counted}; {which} not: {', '.join(ports)}"
+    return f"gets out: {counted}"
 
 
 def folded(line: str) -> str:
@@ -135,12 +180,15 @@ def folded(line: str) -> str:
 
 
 def _about(relay: Answer) -> str:
-    """How fast a relay answers; where it does not."""
+    """How fast a relay answers; where it does not, and what ICMP messages report there."""
+    about, silent = "", [one["address"] + _ICMP.get(one["icmp"], _UNREACHABLE) for one in relay["silent"]]
     if relay["state"] == "up":
-        return f", {1000 * relay['round_trip_s']:.0f} ms" if relay["round_trip_s"] is not None else ""
-    if names := relay["unresolved"]:
+        about = f", {1000 * relay['round_trip_s']:.0f} ms" if relay["round_trip_s"] is not None else ""
+    elif names := relay["unresolved"]:
         return f"; {', '.join(names)} has no address now: see `getent hosts {names[0]}`"
-    return f"; no answer at {', '.join(relay['addresses'])}" if relay["addresses"] else ""
+    else:
+        silent = silent or relay["addresses"]
+    return f"{about}; no answer at {', '.join(silent)}" if silent else about
 
 
 def behaviours(answer: Answer) -> Iterator[tuple[str | None, Mapped, Filtered]]:
