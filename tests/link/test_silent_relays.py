@@ -13,7 +13,7 @@ from tests.link.test_diagnosis import NOW, Daemon
 from tests.link.test_evidence import THERE
 from uavlinkd.config import PeerAddress, RelayConfig
 from uavlinkd.core.drops import DropReason
-from uavlinkd.core.outputs import Dropped
+from uavlinkd.core.outputs import Dropped, PeerClosed
 from uavlinkd.core.path import Path, relayed
 from uavlinkd.core.path_state import PathCondition
 from uavlinkd.core.settings import PeerSettings
@@ -186,6 +186,17 @@ def test_a_peer_that_was_up_and_is_silent(member: Member, monkeypatch: pytest.Mo
     monkeypatch.setattr(relay, "state_for", lambda _: "bound")
     member.answers(relay, FIRST)
     assert "any more through the relay one, which answers: it is off" in member.only(2 * LATER).text
+
+
+def test_a_partner_that_closes_may_start_again(member: Member) -> None:
+    """Its silence begins then, however long nothing was sent before. One that is lost has been silent already."""
+    relay = member.add_relay("one", FIRST)
+    relay.on_event(PeerClosed(relay.peer), 9.0)
+    member.link.on_down(9.0, is_closed=True)
+    assert member.findings(9.0 + LATER - 0.1) == {}
+    assert member.only(9.0 + LATER).cause == "relay_not_answering"
+    member.link.on_down(13.0, is_closed=False)
+    assert member.only(13.0).cause == "relay_not_answering"
 
 
 def test_a_silent_peer_with_addresses_is_compared_with_others() -> None:

@@ -367,7 +367,7 @@ class FrameCarrier:
         parts.events.write(event, now)
         if isinstance(event, o.PeerLost | o.PeerClosed):
             if not link.peer.is_up:  # with any key
-                link.on_down(now)
+                link.on_down(now, is_closed=isinstance(event, o.PeerClosed))
         elif isinstance(event, o.PathChanged | o.PathStateChanged | o.SessionEstablished):
             link.follow_paths(now)
             if isinstance(event, o.SessionEstablished) and event.peer is link.peers[0]:

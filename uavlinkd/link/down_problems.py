@@ -197,7 +197,7 @@ def relay_warnings(moment: Moment) -> Iterator[Found]:
     needed = {name for link in moment.down for name in link.config.relays}
     spare = [relay for relay in moment.silent_relays if relay.config.name not in needed]
     yield from silent_relays(moment, spare, warning)
-    for relay in moment.daemon.relays.by_name.values() if moment.answering else ():
+    for relay in moment.daemon.relays.by_name.values():
         for path in moment.silent_paths(relay) if relay.peer.is_up else ():
             if answering := moment.answering.get(path.host, ""):
                 yield warning(

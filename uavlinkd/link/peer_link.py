@@ -112,7 +112,7 @@ class PeerLink:
         self.previous: dict[Peer, tuple[KeyPairing, float]] = {}
         """The latter, and until when they are valid: a key is being changed, and the new one is not confirmed yet."""
         self.expected_since = now
-        """When the daemon began to expect it."""
+        """When the daemon began to expect it, at first or again."""
         self.relayed: Sequence[Path] = ()
         """The paths to it through relays."""
         self.rates = Rates(now)
@@ -150,7 +150,7 @@ class PeerLink:
 
     @property
     def silent_since(self) -> float:
-        """When something new came from it last; before that, when the daemon began to expect it."""
+        """When something new came from it last, or the daemon began to expect it."""
         return silent_since(self.peers, self.expected_since)
 
     def forget(self, peer: Peer) -> None:
@@ -280,8 +280,10 @@ class PeerLink:
         self.output.follow(self.peer, now)
         self._set_deadline(now)
 
-    def on_down(self, now: float) -> None:
-        """The peer is lost: drop what waits, which would be old when it is back."""
+    def on_down(self, now: float, *, is_closed: bool) -> None:
+        """The peer is lost, or has closed the link: drop what waits, which would be old when it is back."""
+        if is_closed:  # perhaps to start again at once
+            self.expected_since = now
         self.output.clear(now)
         self._set_deadline(now)
 

@@ -209,7 +209,7 @@ class RelayLink:
 
     @property
     def silent_since(self) -> float:
-        """When something new came from it last; before that, when the daemon began to expect it."""
+        """When something new came from it last, or the daemon began to expect it."""
         return silent_since(self.peers, self._expected_since)
 
     def views(self) -> list[tuple[Path, Address]]:
@@ -254,6 +254,8 @@ class RelayLink:
 
         After a session with its current key, no other one is accepted.
         """
+        if isinstance(event, o.PeerClosed):
+            self._expected_since = now
         if isinstance(event, o.SessionEstablished) and event.peer is self.peers[0]:
             self._is_confirmed = True
         for path, binding in self._bindings.items():
