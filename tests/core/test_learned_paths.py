@@ -66,6 +66,14 @@ def condition(side: Side, place: Path) -> PathCondition | None:
 # Asking.
 
 
+def test_question_that_was_too_long_follows_when_enough_came(pair: Pair) -> None:
+    """At once, not a quarter of a second later: a NAT that forgot has given the peer another port."""
+    begin = pair.b.receive(pair.a.envelope(1.0), 1.0, ELSEWHERE) + pair.b.timeout(1.0)
+    assert ELSEWHERE not in {sent.path for sent in of(begin, Transmit)}
+    asked = [datagrams(pair.b.receive(pair.a.envelope(now), now, ELSEWHERE)) for now in (1.01, 1.02)]
+    assert [len(those) for those in asked] == [1, 0]
+
+
 def test_envelope_from_an_unknown_address_causes_a_question_there(pair: Pair) -> None:
     """The frames are delivered, and traffic does not go there before the answer: it may be forwarded."""
     assert probe_in(pair.a, question_to(pair, 1.0)).question
