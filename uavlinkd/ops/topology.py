@@ -64,10 +64,11 @@ def _facts(config: Config, here: Surroundings | None) -> list[RenderableType]:
     if config.peers:
         links = _table(("name", "address", "suites", "mode, at least", "PSK"), map(_peer, config.peers))
         keys = _table(("name", "public key"), ((peer.name, _keys(peer)) for peer in config.peers))
-        parts += [_heading("Peers"), links, Text(), keys]
+        parts += [_heading("Peers"), links]
         if not all(peer.is_called for peer in config.peers):
             port = config.listen[0].port
             parts.append(Text(f"(it connects): the peer's file needs an address of this machine, with port {port}"))
+        parts += [Text(), keys]
     if config.relays:
         relays = (
             (
