@@ -13,6 +13,7 @@ from uavlinkd.core import establish, freshness, wire
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import FreshnessUnverified, FreshnessVerified, PeerClosed, PeerLost
+from uavlinkd.core.path import FREE, Pace
 from uavlinkd.core.session import Session
 from uavlinkd.core.sessions import EchoRequests
 from uavlinkd.core.settings import Link, Screen
@@ -60,6 +61,22 @@ def test_requests_are_remembered_while_a_reply_can_be_in_time() -> None:
     assert questions.answer(tokens[10]) is not None
     assert questions.answer(tokens[10]) is None
     assert not any(map(questions.is_late, tokens))
+
+
+def test_unanswered_requests_are_repeated_ever_later_where_there_is_a_budget() -> None:
+    """At most every two seconds. An answer in time begins again. Elsewhere the interval stays."""
+    questions, session, slow = EchoRequests(bytes), cast(Session, None), Pace(1.4, 1.0, 0.15)
+    waits = list[float]()
+    for number in range(100):
+        waits.append(questions.repeat_s(slow))
+        token = questions.add(session, float(number))
+        assert questions.repeat_s(FREE) == c.HOLD_ASK_S
+    assert waits[:5] == pytest.approx([0.15, 0.3, 0.6, 1.2, c.LATE_AFTER_S])
+    assert waits[-1] == c.LATE_AFTER_S
+    questions.was_late = True
+    assert questions.answer(token) is not None
+    assert questions.repeat_s(slow) == 0.15
+    assert not questions.was_late
 
 
 def test_answer_to_a_request_from_before_a_restart_answers_none_of_now() -> None:

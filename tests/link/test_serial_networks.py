@@ -17,10 +17,11 @@ from uavlinkd.endpoints.url import SerialUrl
 from uavlinkd.link.diagnosis import line_problems
 from uavlinkd.link.serial_networks import (
     LATER_S,
+    LEAST_BITS_S,
     LEAST_SHARE,
     NOISE_PIECES,
-    SHARE_UNANSWERED,
     SHORTEST_OF_S,
+    SLOW_FOR_S,
     UNANSWERED,
     LineRate,
     SerialNetworks,
@@ -68,8 +69,9 @@ async def test_late_answers_lower_the_budget_of_the_network(serial: SerialNetwor
     assert budgets[NUMBER].all.rate == BITS_S / 8
     assert budgets[NUMBER].all.burst == pytest.approx(300, abs=5)
     state = SimpleNamespace(path=serial.path_to("sik"), round_trip_s=0.2, answered_at=now, is_off=False)
-    traffic, paths = SimpleNamespace(echoes_unanswered=0), SimpleNamespace(states=[state], best=state)
-    links = cast(Any, [SimpleNamespace(peer=SimpleNamespace(paths=paths, traffic=traffic))])
+    requests = SimpleNamespace(was_late=False, unanswered=0)
+    paths = SimpleNamespace(states=[state], best=state)
+    links = cast(Any, [SimpleNamespace(peer=SimpleNamespace(paths=paths, echo_requests=requests))])
     assert serial.follow_rates(budgets, links, now) == {}
     state.round_trip_s, state.answered_at = 5.0, now + 6
     for rates in ({NUMBER: BITS_S / 2}, {}):
@@ -82,30 +84,63 @@ async def test_late_answers_lower_the_budget_of_the_network(serial: SerialNetwor
     assert len(reported) == 3  # each a quarter more than the one before, and the full rate
 
 
-async def test_unanswered_questions_lower_the_budget_of_the_best_path(serial: SerialNetworks) -> None:
-    """Those along another path do not count, nor while the device is absent, nor does a total that begins again."""
+async def test_late_and_missing_answers_along_the_best_path_lower_the_budget(serial: SerialNetworks) -> None:
+    """Not along another path, nor while the device is absent. After an answer it is half of that before."""
     now = monotonic()
     budgets = serial.budgets(now)
     state = SimpleNamespace(path=serial.path_to("sik"), round_trip_s=None, answered_at=0.0, is_off=False)
-    traffic, paths = SimpleNamespace(echoes_unanswered=0), SimpleNamespace(states=[state], best=None)
-    links = cast(Any, [SimpleNamespace(peer=SimpleNamespace(paths=paths, traffic=traffic))])
-    for total, best, share in (
-        (40, "off", 1.0),
-        (50, None, 1.0),
-        (UNANSWERED - 1, state, 1.0),
-        (2 * UNANSWERED - 2, state, 1.0),
-        (2 * UNANSWERED - 1, state, SHARE_UNANSWERED),
+    requests, paths = SimpleNamespace(was_late=False, unanswered=0), SimpleNamespace(states=[state], best=None)
+    links = cast(Any, [SimpleNamespace(peer=SimpleNamespace(paths=paths, echo_requests=requests))])
+    for unanswered, was_late, best, is_off, bits_s in (
+        (UNANSWERED, True, None, False, BITS_S),
+        (UNANSWERED, True, state, True, BITS_S),
+        (UNANSWERED - 1, False, state, False, BITS_S),
+        (UNANSWERED, False, state, False, LEAST_BITS_S),
+        (0, False, state, False, BITS_S / 2),
+        (0, True, state, False, LEAST_BITS_S),
+        (0, True, state, False, LEAST_BITS_S),
+        (0, False, state, False, BITS_S / 4),
     ):
-        traffic.echoes_unanswered, paths.best, state.is_off = total, state if best == "off" else best, best == "off"
+        requests.unanswered, requests.was_late, paths.best, state.is_off = unanswered, was_late, best, is_off
         serial.follow_rates(budgets, links, now)
-        assert budgets[NUMBER].all.rate == share * BITS_S / 8
+        assert budgets[NUMBER].all.rate == bits_s / 8
+
+
+@pytest.mark.parametrize("carried", [4_000, 24_000])
+async def test_finding_about_a_radio_that_carries_less_than_the_file_says(
+    serial: SerialNetworks, carried: int
+) -> None:
+    """What it carried in both directions while answers were late, unless it is what the file says."""
+    (network,) = serial.networks
+    state: Any = SimpleNamespace(path=network.path, round_trip_s=None, answered_at=0.0, is_off=False)
+    requests, paths = SimpleNamespace(was_late=True, unanswered=0), SimpleNamespace(states=[state], best=state)
+    peer: Any = SimpleNamespace(paths=paths, echo_requests=requests)
+    parts: Any = SimpleNamespace(peer_sockets=SimpleNamespace(serial=serial))
+    network.note_answers(peer, state, 0.0)
+    for _ in range(20):
+        network.line.bytes_written += carried // 16
+        network.line.bytes_received += carried // 16
+        serial.do_housekeeping()
+    assert [*line_problems(cast(Any, SimpleNamespace(daemon=parts, now=20.0)))] == []
+    network.note_answers(peer, state, 20.0)
+    requests.was_late = False
+    network.note_answers(peer, state, 20.5)
+    found = [*line_problems(cast(Any, SimpleNamespace(daemon=parts, now=20.0 + SLOW_FOR_S)))]
+    assert [one.cause for one in found] == (["radio_slow"] if carried == 4_000 else [])
+    assert [*line_problems(cast(Any, SimpleNamespace(daemon=parts, now=20.1 + SLOW_FOR_S)))] == []
+    for one in found:
+        assert "4,000 bits/s" in one.text
+        assert "24,000" in one.text
+        assert "air_bits_s = 4000" in one.remedy
 
 
 async def test_findings_about_modem_and_noise(serial: SerialNetworks) -> None:
     """They name the setting, and end when it stops."""
     decoder = serial.networks[0].line.decoder
     serial.do_housekeeping()
-    moment: Any = SimpleNamespace(daemon=SimpleNamespace(peer_sockets=SimpleNamespace(serial=serial)))
+    moment: Any = SimpleNamespace(
+        daemon=SimpleNamespace(peer_sockets=SimpleNamespace(serial=serial)), now=monotonic()
+    )
     assert [*line_problems(moment)] == []
     decoder.feed(report())
     decoder.feed(b"noise\0" * NOISE_PIECES)
@@ -147,13 +182,14 @@ def test_one_queue_halves_the_rate_once() -> None:
     assert rate.add_round_trip(3.0, 13.1)
 
 
-def test_rate_has_a_least_value() -> None:
+@pytest.mark.parametrize(("full", "least"), [(FULL, LEAST_BITS_S), (48_000.0, LEAST_SHARE * 48_000), (800.0, 800.0)])
+def test_rate_has_a_least_value(full: float, least: float) -> None:
     """However late the answers are, while the shortest one is remembered."""
-    rate = LineRate(FULL, 1, 0.0)
+    rate = LineRate(full, 1, 0.0)
     rate.add_round_trip(0.1, 0.0)
     for at in range(1, 30):
         rate.add_round_trip(1.5, at * 1.6)
-    assert rate.bits_s(0.0) == pytest.approx(FULL * LEAST_SHARE)
+    assert rate.bits_s(0.0) == pytest.approx(least)
 
 
 def test_shortest_round_trip_is_that_of_the_last_minute() -> None:

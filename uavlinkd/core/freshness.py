@@ -126,6 +126,7 @@ def end(peer: Peer, sessions: list[Session]) -> list[Output]:
 
 def _refute(peer: Peer) -> None:
     """An answer came late: so slow a path, or an attacker that stretches time. Nothing is known to be new."""
+    peer.echo_requests.was_late = True
     for session in peer.sessions.confirmed:
         session.trusted_until = -c.NEVER
         session.verification.refute()

@@ -172,14 +172,15 @@ def ask_for_echo(peer: Peer, session: Session, now: float, route: Route = ()) ->
     """
     peer.timers.stop(Timer.PROBE)  # until traffic asks for another
     peer.traffic.echoes_unanswered += peer.echo_requests.expire(now)
+    repeat_s = peer.echo_requests.repeat_s(session.held.pace)
     if not route:
-        session.held.asked(now)
-    session.verification.asked(now)
+        session.held.asked(now, repeat_s)
+    session.verification.asked(now, repeat_s)
     peer.set_freshness()
     repeats = NO_REPEATS if peer.paths.best is None else peer.paths.best.repeats
     token = peer.echo_requests.add(session, now, session.send_counter + 1 - session.candidate_questions, repeats)
     echo = wire.Echo(False, token, session.received, session.expected)
     out = send_echo(peer, session, echo, route or peer.paths.routes[Class.CRITICAL], now)
     peer.asked_at = now
-    peer.echo_at = now + peer.echo_after_s
+    peer.echo_at = now + max(peer.echo_after_s, repeat_s)
     return out

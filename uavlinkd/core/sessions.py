@@ -17,7 +17,7 @@ from typing import Generic, TypeVar
 from uavlinkd.core import constants as c
 from uavlinkd.core.crypto import Entropy
 from uavlinkd.core.drops import Drop, DropReason
-from uavlinkd.core.path import Path
+from uavlinkd.core.path import FREE, Pace, Path
 from uavlinkd.core.path_measures import NO_REPEATS, Repeats
 from uavlinkd.core.session import Session
 
@@ -268,11 +268,13 @@ class EchoRequests:
     Tokens begin at a random one: a request from before a restart, which an attacker held, must not be one of them.
     """
 
-    __slots__ = ("_by_token", "_last", "_last_answered")
+    __slots__ = ("_by_token", "_last", "_last_answered", "was_late")
 
     def __init__(self, entropy: Entropy) -> None:
         self._last = self._last_answered = int.from_bytes(entropy(4), "big") >> 1
         self._by_token: dict[int, EchoRequest] = {}  # the oldest first
+        self.was_late = False
+        """Whether the last answer was late: a queue, or an attacker that holds it back."""
 
     def __len__(self) -> int:
         return len(self._by_token)
@@ -283,6 +285,20 @@ class EchoRequests:
         token = self._last % 2**32
         self._by_token[token] = EchoRequest(session, now, sent, repeats)
         return token
+
+    @property
+    def unanswered(self) -> int:
+        """How many were sent since the last one that was answered in time."""
+        return self._last - self._last_answered
+
+    def repeat_s(self, pace: Pace) -> float:
+        """How long to wait for the answer to the next request. On a network with a budget twice as long each time.
+
+        Else the requests that repeat it fill a network that carries less than its budget.
+        """
+        if pace is FREE:
+            return pace.ask_s
+        return min(pace.ask_s * 2.0 ** min(self.unanswered, 32), c.LATE_AFTER_S)
 
     def expire(self, now: float) -> int:
         """Forget the requests that can only be answered late. Returns how many of them were not answered."""
@@ -299,6 +315,7 @@ class EchoRequests:
         if request is None or request.is_answered:
             return None
         request.is_answered = True
+        self.was_late = False
         self._last_answered = max(self._last_answered, token)
         return request
 

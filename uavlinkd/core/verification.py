@@ -46,13 +46,13 @@ class Verification:
         self._interval_s, self._hold_s, self._lifetime_s = interval_s, hold_s, lifetime_s
         self.look_at = min(self.ask_at, self.until)
 
-    def asked(self, now: float) -> None:
-        """An echo request was sent on the session."""
+    def asked(self, now: float, repeat_s: float) -> None:
+        """An echo request was sent on the session. ``repeat_s``: :meth:`.sessions.EchoRequests.repeat_s`."""
         if self.due_at == c.NEVER:
             return
         self.ask_at = now + self._interval_s
         is_slow = self._interval_s > c.VERIFY_INTERVAL_S
-        repeat_at = now + (c.VERIFY_REPEAT_SHARE * self._interval_s if is_slow else c.HOLD_ASK_S)
+        repeat_at = now + max(repeat_s, c.VERIFY_REPEAT_SHARE * self._interval_s if is_slow else c.HOLD_ASK_S)
         self.due_at = max(repeat_at, self._answered_at + self._interval_s)
         self.look_at = min(self.ask_at, self.until)
 
@@ -107,10 +107,10 @@ class HeldFrames:
         self._ends_at = now + self.pace.hold_s
         return True
 
-    def asked(self, now: float) -> None:
-        """An echo request was sent on the session."""
+    def asked(self, now: float, repeat_s: float) -> None:
+        """An echo request was sent on the session. It is repeated after ``repeat_s``."""
         if self.due_at != c.NEVER:
-            self._ask_at = now + self.pace.ask_s
+            self._ask_at = now + repeat_s
             self._set_due()
 
     def add(self, counter: int, payload: bytes, now: float) -> int:

@@ -154,6 +154,14 @@ def line_problems(moment: Moment) -> Iterator[Found]:
                 f"compare the baud rate ({network.line.url.baud} here) with the modem's; set MAVLINK=0 on both SiK"
                 " modems; let no other process and no autopilot use the line; else the radio is at its limit",
             )
+        if (carried := network.carried_bits_s(moment.now)) is not None:
+            yield warning(
+                "radio_slow",
+                f"answers come late over the serial network {network.name}: its radio carries about"
+                f" {round(carried, -2):,.0f} bits/s, both directions together, and air_bits_s is"
+                f" {network.config.air_bits_s:,}",
+                f"write air_bits_s = {round(carried, -2):.0f} at both ends, unless the radio carries more nearby",
+            )
 
 
 def find(daemon: DaemonParts, now: float) -> list[Finding]:

@@ -37,7 +37,9 @@ PROBLEMS: Final = {
     7: ReportedProblem(
         "network_absent", "a network is absent", frozenset({"network_absent", "listen_address_missing"})
     ),
-    8: ReportedProblem("radio_disturbed", "a radio's line is disturbed", frozenset({"line_noise", "modem_reports"})),
+    8: ReportedProblem(
+        "radio_disturbed", "a radio's line is disturbed", frozenset({"line_noise", "modem_reports", "radio_slow"})
+    ),
     9: ReportedProblem("daemon_paused", "its process was paused", frozenset({"daemon_paused"})),
     10: ReportedProblem("recording_stopped", "it does not record", frozenset({"recording_stopped"})),
 }

@@ -43,14 +43,16 @@ GROWTH: Final = 1.05
 GROWN_AFTER_S: Final = 60.0
 """It grows from the lowest to the full rate in less. A longer gap, such as a suspend, would overflow the power."""
 LEAST_SHARE: Final = 1 / 16
-"""The rate falls to this part of the full one at most: heartbeats and commands still pass."""
-UNANSWERED: Final = 6
-"""So many echo requests in a row without an answer in time show a queue that is longer than answers may take. A noisy
-radio loses fewer."""
-SHARE_UNANSWERED: Final = 1 / 4
-"""The part of the full rate that is used then, until an answer comes."""
-SHARE_AFTER: Final = 1 / 2
-"""The part from which it grows after that answer."""
+"""The rate falls to this part of the full one at most,"""
+LEAST_BITS_S: Final = 1000
+"""and not below this: heartbeats and commands still pass."""
+UNANSWERED: Final = 4
+"""So many echo requests in a row, each after twice the time, show a queue that is longer than answers may take. Few
+noisy radios lose so many."""
+SLOW_SHARE: Final = 0.75
+"""A radio that carries less than this part of what the file says, while answers are late, is reported,"""
+SLOW_FOR_S: Final = 60.0
+"""for this long after the last late answer."""
 ENVELOPES: Final = 2
 """So many of the largest envelopes, one at each end, may precede a question or its answer without any queue in a
 modem."""
@@ -62,30 +64,33 @@ class LineRate:
     ``full_bits_s``: that of the configuration. ``envelope_bytes``: the largest envelope with its framing.
     """
 
-    __slots__ = ("_at", "_bits_s", "_envelope_bits", "_halved_at", "_shortest", "_unanswered", "full_bits_s")
+    __slots__ = ("_at", "_bits_s", "_envelope_bits", "_halved_at", "_is_late", "_shortest", "full_bits_s")
 
     def __init__(self, full_bits_s: float, envelope_bytes: int, now: float) -> None:
         self.full_bits_s = full_bits_s
         self._envelope_bits = 8 * envelope_bytes
         self._bits_s = full_bits_s
         self._at = now
-        self._unanswered = 0  # since the last answer
+        self._is_late = False
         self._halved_at = now - SHORTEST_OF_S
         self._shortest = deque[tuple[float, float]]()  # times and round trips, both ascending
 
+    @property
+    def least_bits_s(self) -> float:
+        """It is no lower."""
+        return max(LEAST_SHARE * self.full_bits_s, min(LEAST_BITS_S, self.full_bits_s))
+
     def bits_s(self, now: float) -> float:
         """The rate now."""
-        if self._bits_s < self.full_bits_s and now > self._at and self._unanswered < UNANSWERED:
+        if self._is_late:
+            return self.least_bits_s
+        if self._bits_s < self.full_bits_s and now > self._at:
             self._bits_s = min(self.full_bits_s, self._bits_s * GROWTH ** min(now - self._at, GROWN_AFTER_S))
         self._at = max(self._at, now)
         return self._bits_s
 
     def add_round_trip(self, round_trip_s: float, now: float) -> bool:
         """Note the time until the answer to a probe. Returns whether the rate was halved for it."""
-        if self._unanswered >= UNANSWERED:  # the queue is gone, or the peer is back
-            self._bits_s = SHARE_AFTER * self.full_bits_s
-            self._at = max(self._at, now)
-        self._unanswered = 0
         shortest = self._shortest
         while shortest and shortest[0][0] < now - SHORTEST_OF_S:
             shortest.popleft()
@@ -98,15 +103,23 @@ class LineRate:
         # The answers to questions from before the last halving still show the queue that caused it.
         if not is_late or now - self._halved_at <= round_trip_s:
             return False
-        self._bits_s = max(LEAST_SHARE * self.full_bits_s, self.bits_s(now) / 2)
-        self._halved_at = now
+        self._halve(now)
         return True
 
-    def add_unanswered(self, count: int, now: float) -> None:
-        """Note echo requests that had no answer in time: it may be lost, or late behind a long queue."""
-        self._unanswered += count
-        if self._unanswered >= UNANSWERED:
-            self._bits_s = min(self.bits_s(now), SHARE_UNANSWERED * self.full_bits_s)
+    def set_late(self, now: float, *, is_late: bool) -> None:
+        """Note whether answers to echo requests come too late, or not at all.
+
+        Until one comes in time, the rate is the least one, so that the queue empties. Then it is half of that before.
+        """
+        if is_late and not self._is_late:
+            self._halve(now)
+        elif self._is_late:  # it does not grow meanwhile
+            self._at = max(self._at, now)
+        self._is_late = is_late
+
+    def _halve(self, now: float) -> None:
+        self._bits_s = max(self.least_bits_s, self.bits_s(now) / 2)
+        self._halved_at = now
 
 
 class SerialNetwork:
@@ -125,8 +138,8 @@ class SerialNetwork:
         self._log = log
         self._on_change: Callable[[], None] = lambda: None
         self._answered_at = 0.0
-        self._unanswered = 0
-        self._seconds = deque[tuple[int, int, int]](maxlen=RECENT_S + 1)  # totals, one for each second
+        self._carried = -SLOW_FOR_S, 0.0  # when answers came late, and bits a second then
+        self._seconds = deque[tuple[int, int, int, int]](maxlen=RECENT_S + 1)  # totals, one for each second
         # Imported only if configured: a daemon on UDP starts faster and stays smaller.
         from uavlinkd.endpoints.serial_line import SerialLine  # noqa: PLC0415
 
@@ -164,8 +177,8 @@ class SerialNetwork:
 
     def do_housekeeping(self) -> None:
         """Note what was received. Write to the log what it does not say yet about the device."""
-        decoder = self.line.decoder
-        self._seconds.append((decoder.line_noise, decoder.datagrams, decoder.reports))
+        decoder, size = self.line.decoder, self.line.bytes_written + self.line.bytes_received
+        self._seconds.append((decoder.line_noise, decoder.datagrams, decoder.reports, size))
         self._log.note(self.presence, monotonic())
 
     @property
@@ -183,12 +196,17 @@ class SerialNetwork:
         if state.round_trip_s is not None and state.answered_at > self._answered_at:
             self._answered_at = state.answered_at
             self.rate.add_round_trip(state.round_trip_s, state.answered_at)
-        unanswered, self._unanswered = (
-            peer.traffic.echoes_unanswered - self._unanswered,
-            peer.traffic.echoes_unanswered,
-        )
-        if unanswered > 0 and state is peer.paths.best and not state.is_off:  # they went along this line
-            self.rate.add_unanswered(unanswered, now)
+        requests, is_best = peer.echo_requests, state is peer.paths.best and not state.is_off
+        if is_best and requests.was_late and len(self._seconds) > 1:
+            first, last = self._seconds[0], self._seconds[-1]
+            self._carried = now, 8 * (last[3] - first[3]) / (len(self._seconds) - 1)
+        is_late = requests.was_late or requests.unanswered >= UNANSWERED
+        self.rate.set_late(now, is_late=is_best and is_late)  # the requests go along the best path
+
+    def carried_bits_s(self, now: float) -> float | None:
+        """What the radio carried, both directions together, if answers came late recently and it is little."""
+        at, bits_s = self._carried
+        return bits_s if now <= at + SLOW_FOR_S and bits_s < SLOW_SHARE * self.config.air_bits_s else None
 
     @property
     def recent_reports(self) -> int:
@@ -200,7 +218,7 @@ class SerialNetwork:
         """Damaged pieces and whole datagrams of the last seconds, if the damaged ones are many."""
         if not self._seconds:
             return None
-        (noise_before, whole_before, _), (noise, whole, _) = self._seconds[0], self._seconds[-1]
+        (noise_before, whole_before, *_), (noise, whole, *_) = self._seconds[0], self._seconds[-1]
         damaged, whole = noise - noise_before, whole - whole_before
         is_much = damaged >= NOISE_PIECES and damaged > NOISE_SHARE * (damaged + whole)
         return (damaged, whole) if is_much else None
@@ -292,7 +310,6 @@ class SerialNetworks:
         has_changed = False
         for line in self.networks:
             budget, bits_s = budgets[line.number], line.rate.bits_s(now)
-            line.line.bytes_s = bits_s / 8
             budget.set_rate(bits_s, now)
             has_changed |= budget.update_core(bits_s)
         return {line.number: budgets[line.number].core_bits_s for line in self.networks} if has_changed else {}
