@@ -156,7 +156,7 @@ def test_silence_saves_up_no_more_than_a_burst() -> None:
 
 
 def test_limit_of_all_members_together() -> None:
-    """A datagram that exceeds it is counted for no member, and uses up nothing of its sender's limits."""
+    """A datagram that exceeds it is counted for no member. Beside it the limits of a member hold again later."""
     relay = Relay(total=RelayLimits(1000, 10**9))
     for _ in range(40):
         relay.arrive(wrap(A.handle, DATAGRAM))
@@ -166,9 +166,18 @@ def test_limit_of_all_members_together() -> None:
     assert [meter.over_limit for meter in relay.meters] == [0, 0]
     assert relay.forwarding.dropped == {RelayReason.OVER_TOTAL: 80 - len(relay.sent)}
     relay.forwarding.total.set_limits(AMPLE)
-    relay.arrive(*[wrap(A.handle, DATAGRAM)] * 100)
-    burst = DEFAULT.datagrams_s * BURST_S
-    assert relay.meters[0].datagrams == pytest.approx(burst, abs=1)
+    relay.arrive(*[wrap(A.handle, DATAGRAM)] * 200, now=1.0)
+    assert relay.meters[0].datagrams - 25 == pytest.approx(DEFAULT.datagrams_s * BURST_S, abs=2)
+
+
+def test_member_above_its_limit_uses_up_nothing_of_the_others() -> None:
+    """The limit of all members together has room for both. One of them sends more than all may."""
+    limits = RelayLimits(200, 10**9)
+    relay = Relay(limits, total=RelayLimits(1000, 10**9))
+    relay.arrive(*[wrap(A.handle, DATAGRAM)] * 1000)
+    relay.arrive(*[wrap(B.handle, DATAGRAM)] * 1000, path=AT_B)
+    assert [meter.datagrams for meter in relay.meters] == [limits.datagrams_s * BURST_S] * 2
+    assert RelayReason.OVER_TOTAL not in relay.forwarding.dropped
 
 
 def test_limits_can_change() -> None:

@@ -158,21 +158,23 @@ class FrameCarrier:
             self.perform(self._node.receive(*arrived[0], now))
             if epoch != self._stall.epoch:
                 self._drop_held()
-        else:
+        elif arrived:
             self._receive_several(arrived, now, epoch)
         if (relay := self._parts.relay) is not None and relay.is_due:
             relay.settle(monotonic())
 
     def _unwrap(self, socket: int, data: bytes, source: SocketAddress) -> WaitingDatagram | None:
         """The datagram inside one of a relay or a member, with its path. None: it was handled, or dropped."""
-        relays, relay, path = self._parts.relays, self._parts.relay, Path(socket, source)
-        if data[:1] == RELAYED_START:
-            inside = self._sockets.handles.unwrap(socket, data, source) if relays.by_name else None
-            if isinstance(inside, tuple):
-                return inside
-            if relay is not None:
-                relay.forwarding.take(socket, data, source)
-                return None
+        relays, relay = self._parts.relays, self._parts.relay
+        is_data = data[:1] == RELAYED_START
+        inside = self._sockets.handles.unwrap(socket, data, source) if is_data and relays.by_name else None
+        if isinstance(inside, tuple):
+            return inside
+        if is_data and relay is not None:
+            relay.forwarding.take(socket, data, source)
+            return None
+        path = Path(socket, source)
+        if is_data:
             if inside is not None:
                 self._drop_datagram(inside, path=path)
                 if inside is DropReason.RELAY_UNKNOWN_HANDLE:

@@ -72,14 +72,6 @@ class Meter:
         self._datagram_s, self._byte_s = 1 / limits.datagrams_s, 8 / limits.bits_s
         self._burst_s = max(BURST_S, self._datagram_s, BURST_BYTES * self._byte_s)
 
-    def has(self, size: int, now: float) -> bool:
-        """Whether a datagram of so many bytes is within the limits."""
-        latest = now + self._burst_s
-        return (
-            max(self._count_until, now) + self._datagram_s <= latest
-            and max(self._bytes_until, now) + size * self._byte_s <= latest
-        )
-
     def take(self, size: int, now: float) -> bool:
         """Use up what a datagram of so many bytes takes. Returns whether it is within the limits."""
         count_until, bytes_until = self._count_until, self._bytes_until
@@ -135,16 +127,15 @@ class Forwarding:
             self.dropped[DropReason.RELAY_MALFORMED] += 1
         elif route is None:
             self.dropped[DropReason.RELAY_UNKNOWN_HANDLE] += 1
-        elif not self.total.has(size, now := self._clock()):  # no single member exceeds it
+        elif not (meter := route.meter).take(size, now := self._clock()):  # this costs the others nothing
+            meter.over_limit += 1
+            self.dropped[DropReason.RELAY_OVER_LIMIT] += 1
+        elif not self.total.take(size, now):
             self.dropped[RelayReason.OVER_TOTAL] += 1
-        elif (meter := route.meter).take(size, now):
-            self.total.take(size, now)
+        else:
             meter.datagrams += 1
             meter.bytes += size
             self._send(route.header + data[_HEADER_BYTES:], route.path)
-        else:
-            meter.over_limit += 1
-            self.dropped[DropReason.RELAY_OVER_LIMIT] += 1
 
 
 def _key(end: ConnectionEnd) -> _Key:
