@@ -40,6 +40,7 @@ from uavlinkd.core import noise as noise_protocol
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.crypto import Entropy, KeyPair
 from uavlinkd.core.drops import DropReason
+from uavlinkd.core.node import PEERS_AT_ONCE
 from uavlinkd.core.outputs import Dropped, Output, SessionEstablished
 from uavlinkd.core.path import Path
 from uavlinkd.core.probe import Probe
@@ -572,3 +573,19 @@ def test_address_of_two_peers_outlives_the_first() -> None:
     assert len(datagrams(pair.b.receive(stray(), 1.0), wire.INITIATION)) == 1
     pair.b.node.set_paths(charlie, [], 2.0)
     assert datagrams(pair.b.receive(stray(), 9.0)) == []
+
+
+def test_many_peers_that_are_due_together_are_handled_in_parts() -> None:
+    """A shell reads its sockets in between. The next deadline stays in the past until each peer has had its turn."""
+    node, count = Pair().a.node, 3 * PEERS_AT_ONCE
+    for number in range(count):
+        key = KeyPair((1000 + number).to_bytes(32)).public
+        node.set_paths(node.add_peer(PeerSettings(str(number), key), 0.0), [Path(0, (f"192.0.2.{number}", 1))], 0.0)
+    parts = list[int]()
+    while node.next_deadline() <= 5.0:
+        before = {peer for peer in node.peers.values() if peer.timers.next_at <= 5.0}
+        node.handle_timeout(5.0)
+        parts.append(len(before) - sum(peer.timers.next_at <= 5.0 for peer in before))
+    assert max(parts) == PEERS_AT_ONCE
+    assert sum(parts) >= count
+    assert all(peer.timers.next_at > 5.0 for peer in node.peers.values())

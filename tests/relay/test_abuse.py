@@ -17,6 +17,7 @@ from uavlinkd.core.path import Path, relayed
 from uavlinkd.core.path_state import PathState
 from uavlinkd.core.relay_records import Bind, Bound, Candidates, FilterTest, Record, token_datagram, wrap
 from uavlinkd.link.direct_search import DirectSearch, OwnSocket
+from uavlinkd.relay import service
 from uavlinkd.relay.service import BINDS_BURST, LOOK_S
 
 FLEET = 50
@@ -109,6 +110,18 @@ def test_spoofed_sources_move_no_path(relay: FuzzedRelay) -> None:
     assert relay.forwarded == [(wrap(to_other, DATA), HOMES[0][0])]
     assert one.peer.is_up
     assert ELSEWHERE not in relay.service.bindings.paths_of(KEYS[1])
+
+
+def test_path_that_the_core_gave_up_is_found_in_turn(relay: FuzzedRelay, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A large relay looks at a part of its members each time, so the last one is found after as many parts."""
+    connect(relay)
+    monkeypatch.setattr(service, "CHECKED_PER_S", 1)
+    relay.service.members[KEYS[2]].peer.paths.clear()
+    routes = []
+    for _ in relay.members:
+        relay.service.do_housekeeping(relay.now)
+        routes.append(len(relay.service.forwarding))
+    assert routes == [2, 0, 0]
 
 
 def test_unproven_address_gets_no_report(relay: FuzzedRelay) -> None:

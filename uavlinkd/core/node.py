@@ -32,6 +32,9 @@ from uavlinkd.core.settings import Class, PeerSettings, Screen, hold_all
 from uavlinkd.core.timeouts import handle_timeout
 from uavlinkd.core.timers import Schedule
 
+PEERS_AT_ONCE = 8
+"""Peers that one call of :meth:`Node.handle_timeout` handles: datagrams wait meanwhile."""
+
 
 class Node:
     """All peers of one identity.
@@ -250,9 +253,9 @@ class Node:
             return [self._count(datagram, drop, path)]
 
     def handle_timeout(self, now: float) -> list[Output]:
-        """Do what is due. Call it at :meth:`next_deadline`, or at any time."""
+        """Do what is due, for at most :data:`PEERS_AT_ONCE`. Call it at :meth:`next_deadline`, or at any time."""
         out: list[Output] = []
-        for peer in self._schedule.pop(now):
+        for peer in self._schedule.pop(now, PEERS_AT_ONCE):
             out += handle_timeout(peer, now)
             self._schedule.update(peer)
         return out

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from enum import IntEnum
 from heapq import heapify, heappop, heappush
+from math import inf
 from typing import Generic, Protocol, TypeVar
 
 from uavlinkd.core.constants import NEVER
@@ -124,10 +125,10 @@ class Schedule(Generic[T]):
         owner.timers.scheduled_at = NEVER
         self.next_at = self._heap[0][0] if self._heap else NEVER
 
-    def pop(self, now: float) -> list[T]:
-        """The owners whose deadline has come. Call :meth:`update` with each when it was handled."""
+    def pop(self, now: float, most: float = inf) -> list[T]:
+        """The owners whose deadline has come, at most so many. Call :meth:`update` with each when it was handled."""
         due: list[T] = []
-        while self._heap:
+        while self._heap and len(due) < most:
             at, _, owner = self._heap[0]
             timers = owner.timers
             if now < at == timers.scheduled_at == timers.next_at:

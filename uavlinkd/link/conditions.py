@@ -101,6 +101,10 @@ class LineLimits:
         limit.take(now)
         return self.pop_omitted(kind, name)
 
+    def are_used_up(self, kind: str, now: float) -> bool:
+        """Whether no name may have a line of this kind now, except a security line."""
+        return not self._limit((kind, None, False), TOTAL_LINES_PER_S, TOTAL_BURST, now).has(now)
+
     def _limit(self, key: tuple[str, str | None, bool], rate: float, burst: int, now: float) -> TokenBucket:
         return self._limits.get(key) or self._limits.setdefault(key, TokenBucket(rate, burst, now))
 

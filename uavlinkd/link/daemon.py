@@ -58,6 +58,7 @@ class Daemon:
         self.carrier = FrameCarrier(self.parts)
         self._notes = PilotNotes(self.parts.switch.router.addresses)
         self._housekeeping: asyncio.TimerHandle | None = None
+        self._reporting: asyncio.Handle | None = None
         self._control: ControlServer | None = None
         self._metrics: MetricsServer | None = None
         self._supervisor = Supervisor(os.environ, os.getpid())
@@ -132,6 +133,8 @@ class Daemon:
         self._supervisor.stopping()
         if self._housekeeping is not None:
             self._housekeeping.cancel()
+        if self._reporting is not None:
+            self._reporting.cancel()
         self.carrier.stop()
         self._close_sockets()
         if self._control is not None:
@@ -262,6 +265,10 @@ class Daemon:
         parts.history.sample(links, ((one, parts.local.policies[one.name]) for one in parts.local.endpoints), now)
         parts.local.do_housekeeping(radio_figures(links), now)
         parts.local.write_note(self._notes.next(links, now), now)
+        self._reporting = self._loop.call_soon(self._report, now)  # datagrams must not wait for all of it
+
+    def _report(self, now: float) -> None:
+        parts, links = self.parts, self.parts.links.values()
         findings = find(parts, now)
         parts.events.write_findings(findings, now)
         codes = own_codes(findings, is_cut_off=has_no_client(findings, len(parts.local.endpoints)))

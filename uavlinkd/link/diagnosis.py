@@ -118,8 +118,11 @@ def member_problems(moment: Moment) -> Iterator[Found]:
             " `uavlinkd reload` here: a key that arrives proves nothing",
         )
     other = daemon.evidence.seen_at(DropReason.BAD_MAC1, ELSEWHERE, now)
-    is_down = any(not member.peer.is_up for member in daemon.relay.members.values())
-    if other is not None and other.address is not None and is_down:
+    if (
+        other is not None
+        and other.address is not None
+        and any(not member.peer.is_up for member in daemon.relay.members.values())
+    ):
         yield warning(
             "other_relay_key",
             f"a sender at {shown(other.address)} has another public key for this relay",

@@ -70,9 +70,10 @@ class EventLog:
 
     def check(self, now: float) -> None:
         """Write the lines that are due. Call it about once a second."""
-        for watch in list(self._watches.values()):
-            if watch.omitted_state is not None:
-                self._write_event(watch.omitted_state, now)
+        for state in [watch.omitted_state for watch in self._watches.values() if watch.omitted_state is not None]:
+            if self._limits.are_used_up("peer", now):
+                break
+            self._write_event(state, now)
         self._problem_conditions.check(now)
         self._pauses.check(now)
         self._finding_conditions.check(now)

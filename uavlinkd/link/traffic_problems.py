@@ -76,7 +76,7 @@ def peer_problems(peer: PeerFacts) -> Iterator[Found]:
 
 def has_twin(peers: Iterable[Peer], twin: Twin, now: float, within_s: float = SECURITY_S) -> bool:
     """Whether one of these pairs of keys showed a second process with a private key."""
-    return any(now - peer.sessions.twins.get(twin, -within_s) < within_s for peer in peers)
+    return any(peer.sessions.twins and now - peer.sessions.twins.get(twin, -within_s) < within_s for peer in peers)
 
 
 def is_contested(peers: Iterable[Peer], now: float) -> bool:

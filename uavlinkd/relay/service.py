@@ -25,6 +25,8 @@ from uavlinkd.relay.forwarding import Forwarding, MemberSettings, Meter, RelayLi
 
 BINDS_PER_S = 32  # Binds of one member a second, each of up to 16 keys. Each may cause reports to other members.
 BINDS_BURST = 256  # So many at once, after a quiet while: a ground station with 1,000 vehicles, along four paths.
+CHECKED_PER_S = 50
+"""Members whose wishes are compared with the paths that the core knows: data waits while that is done."""
 LOOK_S = 0.1  # paths of binds that came before their validation are looked at so often, and after an event
 
 
@@ -48,7 +50,8 @@ class RelayMember:
     @property
     def peer(self) -> Peer:
         """Its object in the core: one that is up, or the one of the current keys."""
-        return next((peer for peer in self.peers if peer.is_up), self.peers[0])
+        first, *others = self.peers
+        return first if first.is_up or not others else next((peer for peer in others if peer.is_up), first)
 
     @property
     def key(self) -> bytes:
@@ -89,6 +92,7 @@ class RelayService:
         self._due: dict[tuple[bytes, Path], dict[bytes, None]] = {}  # reports to members
         self._asked: dict[bytes, dict[Path, _Asked]] = {}
         self._look_at = 0.0
+        self._unchecked: list[bytes] = []  # keys of members whose paths are to be looked at
         self._filter_tests: list[tuple[Peer, Path, bytes]] = []  # tokens to be sent
         self._reported = Counter[Reason]()
         self._unreported: list[tuple[Reason, str, int]] = []  # drops of removed members, and of binds that waited
@@ -245,10 +249,13 @@ class RelayService:
     def do_housekeeping(self, now: float) -> None:
         """End the wishes that were not renewed, and those along paths that the core has given up."""
         self._apply(self.bindings.expire(now))
-        for key, member in self.members.items():
-            for path in self.bindings.paths_of(key):
+        if not self._unchecked:
+            self._unchecked = list(self.members)
+        checked, self._unchecked = self._unchecked[:CHECKED_PER_S], self._unchecked[CHECKED_PER_S:]
+        for member in filter(None, map(self.members.get, checked)):
+            for path in self.bindings.paths_of(member.key):
                 if member.peer.paths.find(path) is None:
-                    self._apply(self.bindings.end_path(key, path, now))
+                    self._apply(self.bindings.end_path(member.key, path, now))
         self.settle(now)
 
     def count_drops(self) -> Iterator[tuple[Reason, str, int]]:
@@ -260,7 +267,8 @@ class RelayService:
         unreported, self._unreported = self._unreported, []
         yield from unreported
         for member in self.members.values():
-            yield from _over_limit(member)
+            if member.meter.over_limit > member.reported_over_limit:
+                yield from _over_limit(member)
 
     def _apply(self, changes: Changes) -> None:
         for connection in changes.closed:
