@@ -100,12 +100,12 @@ def test_instances_are_apart_and_otherwise_alike() -> None:
 
 
 def test_relay_is_restarted_and_isolated_as_a_daemon_is() -> None:
-    """With more memory, and without devices."""
+    """With more memory and processor time, and without devices."""
     one, relay = settings("uavlinkd.service"), settings("uavlinkd-relay.service")
     differing = {key for key in one.keys() | relay.keys() if one[key] != relay[key]}
     assert differing == {
         *("Description", "ExecStart", "LoadCredential", "RuntimeDirectory", "StateDirectory", "MemoryMax"),
-        *("Wants", "After", "SupplementaryGroups", "DevicePolicy", "DeviceAllow", "PrivateDevices"),
+        *("CPUWeight", "Wants", "After", "SupplementaryGroups", "DevicePolicy", "DeviceAllow", "PrivateDevices"),
     }
     assert relay["PrivateDevices"] == ["yes"]
     assert relay["ExecStart"] == ["/opt/uavlinkd/bin/uavlinkd relay --config /etc/uavlinkd/relay.toml"]

@@ -41,6 +41,9 @@ from uavlinkd.system.stall import StallWatch
 
 _EPHEMERAL = (Address("0.0.0.0", 0), Address("::", 0))
 """Without a listen address the daemon only connects to peers, from any port."""
+RELAY_BUFFER_BYTES: Final = 1 << 22
+"""Requested for the receive buffers of a relay: 10,000 short datagrams, a busy relay's in 0.2 s. The kernel may grant
+less (net.core.rmem_max)."""
 LOOK_AGAIN_S: Final = 0.1
 """After failed sends, the networks are looked at this often at most."""
 _NETWORK_CHANGED: Final = frozenset(
@@ -94,7 +97,7 @@ class PeerSockets:
         self.senders: list[Sender] = []
         """Send a datagram to an address, by the number of the socket. Relayed paths and budgets are included."""
         self.pause_s = PAUSE_S
-        """How long datagrams gather in a busy socket."""
+        """How long datagrams gather in a busy socket; a relay's do not."""
         self._receive: Receive = lambda *_: None
         self._stall = stall
         self._drops = drops
@@ -240,6 +243,8 @@ class PeerSockets:
 
     def _read(self, slot: _Slot) -> None:
         if slot.sock is not None:
+            if not self.pause_s:
+                slot.sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RELAY_BUFFER_BYTES)
             receive, on_failure = partial(self._receive, slot.number), partial(self._on_read_error, slot)
             slot.reader = Reader(slot.sock, receive, on_failure, self._stall, self.pause_s)
             slot.reader.start()
