@@ -32,14 +32,14 @@ def daemon_status(daemon: DaemonParts, now: float) -> dict[str, object]:
     """The status of the whole daemon. Times are ages in seconds. A client computes rates from two of these.
 
     ``frames_pass``: every peer is up, within the last 10 s no traffic was wholly refused (``blocked`` names it),
-    clients are not all absent (``has_no_client``), no two machines contend with one key for a link (``contested``),
-    and no peer says that frames stop there (``stopped_there``).
+    clients are not all absent (``has_no_client``), and no two machines contend with one key for a link
+    (``contested``). ``stopped_there``: peers that say so of themselves; that is a claim, and health checks act on
+    ``frames_pass``.
     """
     node = daemon.node
     blocked, findings = daemon.history.blocked(now), find(daemon, now)
     is_cut_off = has_no_client(findings, len(daemon.local.endpoints))
     contested = [name for name, link in daemon.links.items() if is_contested(link.peers, now)]
-    stopped_there = [name for name, link in daemon.links.items() if stops_frames(link.peer, now)]
     all_up = (bool(daemon.links) or daemon.config.is_only_relay) and all(
         link.peer.is_up for link in daemon.links.values()
     )
@@ -48,11 +48,11 @@ def daemon_status(daemon: DaemonParts, now: float) -> dict[str, object]:
         "name": daemon.config.name,
         "public_key": encode_key(node.public_key),
         "monotonic_s": now,
-        "frames_pass": all_up and not (blocked or is_cut_off or contested or stopped_there),
+        "frames_pass": all_up and not (blocked or is_cut_off or contested),
         "blocked": [dict(zip(("subject", "name", "direction"), key, strict=True)) for key in blocked],
         "has_no_client": is_cut_off,
         "contested": contested,
-        "stopped_there": stopped_there,
+        "stopped_there": [name for name, link in daemon.links.items() if stops_frames(link.peer, now)],
         "findings": [finding.as_json() for finding in findings],
         "peers": {name: peer_status(link, now, daemon.peer_sockets.way_of) for name, link in daemon.links.items()},
         "relays": {name: used_relay_status(relay, daemon, now) for name, relay in daemon.relays.by_name.items()},
