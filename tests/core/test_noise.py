@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from pathlib import Path
 from types import SimpleNamespace
@@ -126,7 +125,7 @@ def test_altered_message_leaves_its_receiver_waiting(suite: Suite) -> None:
 
 def wrong_psk(state: HandshakeState) -> HandshakeState:
     """The same state with another PSK."""
-    return dataclasses.replace(state, psk=Secret(bytes(32)))
+    return state._replace(psk=Secret(bytes(32)))
 
 
 @pytest.mark.parametrize("suite", KINDS)
@@ -150,7 +149,7 @@ def test_each_message_is_of_and_for_the_holder_of_one_key(suite: Suite) -> None:
     assert reason_of(responder, first(start(suite, rs=KEY_A.public)[0])[1]) is DropReason.BAD_HANDSHAKE
     initiator, message = first(initiator)
     read, _ = responder.read(message)
-    thief = dataclasses.replace(read, s=KeyPair(bytes([9]) * 32), rs=KeyPair(bytes([8]) * 32).public)
+    thief = read._replace(s=KeyPair(bytes([9]) * 32), rs=KeyPair(bytes([8]) * 32).public)
     assert reason_of(initiator, second(thief)[1]) is DropReason.BAD_HANDSHAKE
     genuine, response = second(read)
     assert completes(initiator, response, genuine)
@@ -163,7 +162,7 @@ def test_key_of_low_order_is_refused(low: bytes, suite: Suite) -> None:
     initiator, responder = start(suite)
     liar = KeyPair(bytes([9]) * 32)
     liar.public = low
-    _, sealed = first(dataclasses.replace(initiator, s=liar))
+    _, sealed = first(initiator._replace(s=liar))
     assert reason_of(responder, sealed) is DropReason.INVALID_KEY_SHARE
     initiator, message = first(initiator)
     read, _ = responder.read(message)

@@ -43,15 +43,15 @@ def write(
         if token == "e":
             e = KeyPair(entropy(c.KEY_BYTES))
             message += e.public
-            state = replace(state, e=e, symmetric=symmetric.mix_hash(e.public).mix_key(e.public))
+            state = state._replace(e=e, symmetric=symmetric.mix_hash(e.public).mix_key(e.public))
         elif token in ("s", "e1", "ekem1"):
             symmetric, sealed = symmetric.encrypt_and_hash(state.s.public if token == "s" else share)
             message += sealed
-            state = replace(state, symmetric=symmetric)
+            state = state._replace(symmetric=symmetric)
         else:
             state = state._mix(token)
     symmetric, sealed = state.symmetric.encrypt_and_hash(payload)
-    return replace(state, symmetric=symmetric), message + sealed
+    return state._replace(symmetric=symmetric), message + sealed
 
 
 def _payload(script: Script, header: bytes) -> bytes:

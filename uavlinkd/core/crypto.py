@@ -136,6 +136,10 @@ class KeyPair:
             raise Drop(DropReason.INVALID_KEY_SHARE) from None
 
 
+_ANY_KEY = KeyPair(bytes(range(KEY_BYTES)))
+"""Any private key tells whether a point has a low order: the result is zero for all."""
+
+
 def x25519_public_key(private: bytes) -> bytes:
     """The public key of a 32-byte private key."""
     return KeyPair(private).public
@@ -146,7 +150,7 @@ def is_usable_public_key(public: bytes) -> bool:
     if len(public) != KEY_BYTES:
         return False
     try:
-        KeyPair(bytes(range(KEY_BYTES))).exchange(public)  # any private key tells: the result is zero for all
+        _ANY_KEY.exchange(public)
     except Drop:
         return False
     return True

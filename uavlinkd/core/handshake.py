@@ -6,7 +6,7 @@ or written, and what it changes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 from uavlinkd.core import noise, wire
@@ -86,7 +86,7 @@ def respond(
     initiation = received.initiation
     header = wire.response_header(initiation.suite, index, initiation.sender_index)
     ours = parameters_of(peer.link, generation)
-    state = replace(received.state, psk=peer.psk or noise.NO_PSK)
+    state = received.state._replace(psk=peer.psk or noise.NO_PSK)
     state, message = state.write(header[1:] + ours.encode(), entropy)
     return header + message, _keys(state, ours.stronger(received.parameters), initiation.sender_index)
 

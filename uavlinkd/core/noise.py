@@ -9,7 +9,7 @@ leaves no trace: the old state still exists, and the genuine message completes i
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from uavlinkd.core.constants import AEAD_TAG_BYTES, KEY_BYTES
 from uavlinkd.core.crypto import AeadKey, Entropy, KeyPair, Secret, hkdf_expand, hmac_sha256, sha256
@@ -40,8 +40,7 @@ def hkdf(chaining_key: bytes, material: bytes, outputs: int) -> list[bytes]:
     return [output[at : at + KEY_BYTES] for at in range(0, len(output), KEY_BYTES)]
 
 
-@dataclass(frozen=True, slots=True, repr=False)
-class SymmetricState:
+class SymmetricState(NamedTuple):
     """Noise, section 5.2, with the CipherState of section 5.1 inside. Frozen: each step gives the next state."""
 
     ck: bytes
@@ -49,25 +48,28 @@ class SymmetricState:
     k: AeadKey | None = None
     n: int = 0
 
+    def __repr__(self) -> str:  # no secret in a log
+        return "SymmetricState(...)"
+
     def mix_hash(self, data: bytes) -> SymmetricState:
         """h = HASH(h || data)."""
-        return replace(self, h=sha256(self.h + data))
+        return self._replace(h=sha256(self.h + data))
 
     def mix_key(self, material: bytes) -> SymmetricState:
         """ck, k = HKDF(ck, material)."""
         ck, k = hkdf(self.ck, material, 2)
-        return replace(self, ck=ck, k=AeadKey(k), n=0)
+        return self._replace(ck=ck, k=AeadKey(k), n=0)
 
     def mix_key_and_hash(self, material: bytes) -> SymmetricState:
         """ck, temp_h, k = HKDF(ck, material); the PSK goes in here."""
         ck, temp_h, k = hkdf(self.ck, material, 3)
-        return replace(self, ck=ck, h=sha256(self.h + temp_h), k=AeadKey(k), n=0)
+        return self._replace(ck=ck, h=sha256(self.h + temp_h), k=AeadKey(k), n=0)
 
     def encrypt_and_hash(self, plaintext: bytes) -> tuple[SymmetricState, bytes]:
         """The next state, and the ciphertext under k with h as associated data."""
         assert self.k is not None, "the first token makes a key"
         ciphertext = self.k.seal(self.n, plaintext, self.h)
-        return replace(self, h=sha256(self.h + ciphertext), n=self.n + 1), ciphertext
+        return self._replace(h=sha256(self.h + ciphertext), n=self.n + 1), ciphertext
 
     def decrypt_and_hash(self, ciphertext: bytes) -> tuple[SymmetricState, bytes]:
         """The next state, and the plaintext.
@@ -79,7 +81,7 @@ class SymmetricState:
         plaintext = self.k.open(self.n, ciphertext, self.h)
         if plaintext is None:
             raise Drop(DropReason.BAD_HANDSHAKE)
-        return replace(self, h=sha256(self.h + ciphertext), n=self.n + 1), plaintext
+        return self._replace(h=sha256(self.h + ciphertext), n=self.n + 1), plaintext
 
     def split(self) -> tuple[Secret, Secret]:
         """The two transport keys: the initiator sends under the first, the responder under the second."""
@@ -87,8 +89,7 @@ class SymmetricState:
         return Secret(first), Secret(second)
 
 
-@dataclass(frozen=True, slots=True, repr=False)
-class HandshakeState:
+class HandshakeState(NamedTuple):
     """Noise, section 5.3, for one handshake; see :func:`initiator` and :func:`responder`.
 
     :meth:`write` and :meth:`read` return the next state; this one stays as it was, whatever came.
@@ -105,6 +106,9 @@ class HandshakeState:
     e1: KemPrivateKey | None = None
     re1: bytes = b""
 
+    def __repr__(self) -> str:
+        return "HandshakeState(...)"
+
     def write(self, payload: bytes, entropy: Entropy) -> tuple[HandshakeState, bytes]:
         """WriteMessage: the next state and the message.
 
@@ -117,12 +121,12 @@ class HandshakeState:
             if step == "e":  # mixed into the key too: the pattern has a PSK (Noise, section 9.2)
                 e = KeyPair(entropy(KEY_BYTES))
                 part = e.public
-                state = replace(state, e=e, symmetric=state.symmetric.mix_hash(part).mix_key(part))
+                state = state._replace(e=e, symmetric=state.symmetric.mix_hash(part).mix_key(part))
             elif step == "s":
                 state, part = state._seal(state.s.public)
             elif step == "e1":
                 e1 = kem_of(state.suite).generate(entropy)
-                state, part = replace(state, e1=e1)._seal(e1.share)
+                state, part = state._replace(e1=e1)._seal(e1.share)
             elif step == "ekem1":
                 ciphertext, secret = kem_of(state.suite).encapsulate(state.re1, entropy)
                 state, part = state._seal(ciphertext)
@@ -143,13 +147,13 @@ class HandshakeState:
         for step in tokens_of(self.suite)[self.is_initiator]:
             if step == "e":
                 re, rest = rest[:KEY_BYTES], rest[KEY_BYTES:]
-                state = replace(state, re=re, symmetric=state.symmetric.mix_hash(re).mix_key(re))
+                state = state._replace(re=re, symmetric=state.symmetric.mix_hash(re).mix_key(re))
             elif step == "s":
                 state, rs, rest = state._open(rest, KEY_BYTES)
-                state = replace(state, rs=rs)
+                state = state._replace(rs=rs)
             elif step == "e1":
                 state, re1, rest = state._open(rest, state.suite.share_bytes)
-                state = replace(state, re1=re1)
+                state = state._replace(re1=re1)
             elif step == "ekem1":
                 state, ciphertext, rest = state._open(rest, state.suite.ciphertext_bytes)
                 assert state.e1 is not None
@@ -161,21 +165,21 @@ class HandshakeState:
 
     def _seal(self, plaintext: bytes) -> tuple[HandshakeState, bytes]:
         symmetric, sealed = self.symmetric.encrypt_and_hash(plaintext)
-        return replace(self, symmetric=symmetric), sealed
+        return self._replace(symmetric=symmetric), sealed
 
     def _open(self, data: bytes, size: int) -> tuple[HandshakeState, bytes, bytes]:
         """The next state, ``size`` bytes or fewer that were sealed in the data, and the data behind them."""
         sealed, rest = data[: size + AEAD_TAG_BYTES], data[size + AEAD_TAG_BYTES :]
         symmetric, plaintext = self.symmetric.decrypt_and_hash(sealed)
-        return replace(self, symmetric=symmetric), plaintext, rest
+        return self._replace(symmetric=symmetric), plaintext, rest
 
     def _mix_key(self, secret: bytes) -> HandshakeState:
-        return replace(self, symmetric=self.symmetric.mix_key(secret))
+        return self._replace(symmetric=self.symmetric.mix_key(secret))
 
     def _mix(self, step: str) -> HandshakeState:
         """The tokens that send nothing: the key exchanges and the PSK."""
         if step == "psk":
-            return replace(self, symmetric=self.symmetric.mix_key_and_hash(self.psk.reveal()))
+            return self._replace(symmetric=self.symmetric.mix_key_and_hash(self.psk.reveal()))
         # The first letter is the initiator's key, the second the responder's.
         private = self.s if step[not self.is_initiator] == "s" else self.e
         public = self.rs if step[self.is_initiator] == "s" else self.re
