@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import pytest
 
-from tests.core.harness import AT_B, FRAME, KEY_C, Pair, Side
+from tests.core.harness import AT_B, FRAME, KEY_C, Pair, Side, datagrams, exchange, only
 from tests.core.radios import Radios, link
 from uavlinkd.core import constants as c
 from uavlinkd.core import wire
@@ -14,7 +14,7 @@ from uavlinkd.core.outputs import PeerLost
 from uavlinkd.core.path import FREE, SERIAL_HOST, Pace, Path, SocketFacts
 from uavlinkd.core.path_measures import limit_at
 from uavlinkd.core.probe import ANSWER_BYTES, QUESTION_BYTES
-from uavlinkd.core.settings import Class, PeerSettings
+from uavlinkd.core.settings import Class, Link, PeerSettings
 from uavlinkd.core.suites import SUITES_BY_NAME, X25519
 
 LTE, SIK = 0, 1
@@ -194,6 +194,31 @@ def test_waits_grow_with_the_round_trip_to_a_bound() -> None:
     radios.state(radios.a, 0).srtt_s = 100.0
     peer.set_waits()
     assert peer.lost_after_s == c.LOST_ROUND_TRIPS * c.LATE_AFTER_S
+
+
+def test_first_waits_of_a_session_are_those_of_its_handshake() -> None:
+    """A peer that answered an initiation late answers the first envelopes late too, until one is answered sooner."""
+    for response_s, (echo_s, handshake_s, lost_s) in ((0.1, (0.5, 1.0, 3.0)), (0.5, (1, 2, 4)), (9.0, (4, 8, 16))):
+        pair = Pair(Link(), Link())
+        response = only(datagrams(pair.b.receive(pair.initiation(0.0), 0.0), wire.RESPONSE))
+        sent, peer = pair.a.receive(response, response_s), pair.a.peer
+        assert (peer.echo_after_s, peer.handshake_after_s, peer.lost_after_s) == (echo_s, handshake_s, lost_s)
+        exchange(pair.b, pair.a, sent, response_s)
+        assert (peer.echo_after_s, peer.handshake_after_s, peer.lost_after_s) == (0.5, 1.0, 3.0)
+
+
+def test_only_path_is_not_asked_fast_beside_its_echo_requests() -> None:
+    """Before the first answer: these ask too."""
+    pair = Pair(Link(), Link())
+    response = only(datagrams(pair.b.receive(pair.initiation(0.0), 0.0), wire.RESPONSE))
+    pair.a.receive(response, 0.0)
+    (state,) = pair.a.peer.paths.states
+    assert not state.works
+    asked = []
+    for tick in range(1, 26):
+        pair.a.timeout(tick / 10)
+        asked.append(state.questioned_at)
+    assert sorted(set(asked)) == pytest.approx([0.1, 1.1, 2.1])
 
 
 # The longest envelopes.

@@ -83,6 +83,16 @@ def scene() -> Scene:
     return Scene()
 
 
+def test_bind_to_a_busy_relay_is_repeated_later(scene: Scene) -> None:
+    """After two round trips, at most as late as any repeat."""
+    for handshake_s, repeat_s in ((0.2, 0.4), (2.0, c.BIND_RETRY_S)):
+        scene.link.peer.handshake_s = handshake_s
+        scene.link.follow([])
+        scene.link.follow([ONE])
+        assert scene.binds(T)
+        assert scene.link.next_at == pytest.approx(T + repeat_s)
+
+
 def test_bind_that_is_answered_is_repeated_rarely(scene: Scene) -> None:
     """More often while a peer has not asked for this one."""
     assert scene.binds(T)

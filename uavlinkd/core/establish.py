@@ -59,6 +59,8 @@ def receive_response(peer: Peer, pending: Pending, response: wire.Response, path
     keys = peer.initiator.receive_response(pending, response)
     lifetimes = peer.durations.reject_after_s, peer.verify_interval_s
     session = Session(keys, response.receiver_index, now, *lifetimes, is_initiator=True)
+    # A peer that answers many initiations at once answers the first envelopes as late.
+    peer.handshake_s = min(now - pending.sent_at, c.LATE_AFTER_S)
     peer.sessions.note_twin(peer.sessions.twin(keys.parameters.generation - 1), now)
     if path not in pending.paths:  # it was sent on from elsewhere, or our network changed
         path = pending.paths[0]

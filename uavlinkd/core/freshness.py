@@ -72,6 +72,7 @@ def receive_answer(peer: Peer, echo: wire.Echo, now: float) -> list[Output]:
         return []
     peer.round_trip_s = now - request.sent_at
     peer.paths.note_echo(peer.round_trip_s, now)
+    peer.handshake_s = 0.0
     peer.set_waits()
     peer.set_paths_timer()
     session = request.session

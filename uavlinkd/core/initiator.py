@@ -24,6 +24,7 @@ class Pending:
     """Of the initiation; a cookie reply refers to it."""
     paths: tuple[Path, ...]
     """Where it was sent, the best first."""
+    sent_at: float
     expires_at: float
     is_slow: bool = False
     """Whether it was sent along a slow network: its response may take as long as several tries along others."""
@@ -140,7 +141,7 @@ class Initiator:
             # Fast tries along one network must not push out the one that a slow network still carries.
             fast = (old for old, waiting in self.pending.items() if not waiting.is_slow)
             self._forget(next(fast, next(iter(self.pending))))
-        pending = self.pending[index] = Pending(initiated, mac1, tuple(paths), expires_at, slowest_s > 0)
+        pending = self.pending[index] = Pending(initiated, mac1, tuple(paths), now, expires_at, slowest_s > 0)
         return pending, datagrams
 
     def receive_response(self, pending: Pending, response: wire.Response) -> Keys:

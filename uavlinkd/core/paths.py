@@ -374,6 +374,8 @@ class PathSet(PathSlots):
             return c.PROBE_FAST_S
         if not state.works:
             age_s = now - state.since
+            if state.is_configured and not others and state.condition is PathCondition.UNPROVEN:
+                return c.PROBE_DOWN_S  # echo requests ask too
             if age_s < c.DOWN_AFTER_S or (state is self.best and state.condition is PathCondition.UNPROVEN):
                 return c.PROBE_FAST_S
             return c.PROBE_DOWN_S if age_s < c.LONG_DOWN_S else c.PROBE_LONG_DOWN_S

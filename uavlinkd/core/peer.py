@@ -109,6 +109,8 @@ class Peer:
         self.paths = PathSet(settings.link.redundancy, settings.link.idle_probe_s, shared.known, shared.facts)
         """Where the peer is, or may be."""
         self.paths.reports_single = bool(settings.link.features & c.FEATURE_RECORDS)
+        self.handshake_s = 0.0
+        """How long the last response took; 0 after a question was answered since."""
         self.set_waits()
         self.is_up = False
         self.offered_at = -c.NEVER
@@ -246,9 +248,14 @@ class Peer:
             return wanted_at
         return min(wanted_at, self.unanswered_since + self.handshake_after_s)
 
+    @property
+    def answer_s(self) -> float:
+        """How long an answer takes, as far as is known: at most ``LATE_AFTER_S``."""
+        return max(self.paths.round_trip_s, self.handshake_s)
+
     def set_waits(self) -> None:
         """Set what a silence causes, and after how long: the configured durations, longer on a slow path."""
-        durations, round_trip_s = self.durations, self.paths.round_trip_s
+        durations, round_trip_s = self.durations, self.answer_s
         self.echo_after_s = max(durations.echo_after_s, c.ECHO_ROUND_TRIPS * round_trip_s)
         self.handshake_after_s = max(durations.handshake_after_s, c.HANDSHAKE_ROUND_TRIPS * round_trip_s)
         self.lost_after_s = max(durations.lost_after_s, c.LOST_ROUND_TRIPS * round_trip_s)

@@ -114,6 +114,7 @@ def receive_probe(
         is_first = not state.is_validated
         round_trip_s = state.receive_answer(probe.answer, probe.received if counts else None, now)
         if round_trip_s is not None:
+            peer.handshake_s = 0.0
             if peer.round_trip_s is None or not peer.paths.has_several:
                 peer.round_trip_s = round_trip_s
             peer.paths.note_answer(state, now)

@@ -190,17 +190,19 @@ class FrameCarrier:
 
     def _receive_several(self, arrived: list[WaitingDatagram], now: float, epoch: int) -> None:
         was_busy = self._is_busy
-        envelopes = self._receive_handshakes(arrived, now, epoch)
-        if not self._turns.queues:
-            arriving = iter(envelopes)
-            self._do_turn(arriving, now, epoch)
-            envelopes = list(arriving)
-        for datagram, path in envelopes:
-            sender = self._node.claimed_sender(datagram, path)
-            for pushed_out in self._turns.put(sender, datagram, path, epoch):
-                self.perform((self._node.refuse(*pushed_out),))
-        if self._is_busy and not was_busy:
-            self._loop.call_soon(self._do_turns)
+        try:
+            envelopes = self._receive_handshakes(arrived, now, epoch)
+            if not self._turns.queues:
+                arriving = iter(envelopes)
+                self._do_turn(arriving, now, epoch)
+                envelopes = list(arriving)
+            for datagram, path in envelopes:
+                sender = self._node.claimed_sender(datagram, path)
+                for pushed_out in self._turns.put(sender, datagram, path, epoch):
+                    self.perform((self._node.refuse(*pushed_out),))
+        finally:  # an exception must not leave what waits without a turn
+            if self._is_busy and not was_busy:
+                self._loop.call_soon(self._do_turns)
 
     @property
     def _is_busy(self) -> bool:

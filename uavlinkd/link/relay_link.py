@@ -32,7 +32,7 @@ RELAYED_START: Final = bytes((RELAYED,))
 _HEADER_BYTES: Final = 3
 BIND_SOON_S: Final = 0.1
 """The first bind is repeated after this: it may have come before the relay validated the path. Each further wait is
-twice as long, up to ``BIND_RETRY_S``."""
+twice as long, up to ``BIND_RETRY_S``. On a slow path, or to a relay that is busy, after two round trips."""
 ASK_S: Final = 0.25
 """A relay is asked this often at most along one socket."""
 
@@ -118,10 +118,10 @@ class _Binding:
     seen_as: Address | None = None
     """This daemon's address as the relay sees it."""
 
-    def note_sent(self, keys: Sequence[bytes], now: float) -> None:
+    def note_sent(self, keys: Sequence[bytes], soon_s: float, now: float) -> None:
         """A bind was sent. Sets when the next one is due without an answer."""
         self.unanswered = frozenset(keys)
-        self.due_at = now + min(c.BIND_RETRY_S, BIND_SOON_S * 2.0 ** min(self.tries, 8))
+        self.due_at = now + min(c.BIND_RETRY_S, soon_s * 2.0 ** min(self.tries, 8))
         self.tries += 1
 
     def receive(
@@ -315,7 +315,7 @@ class RelayLink:
             out += self._node.ask(self.peer, path, now)
         for binding in self._working():
             if now >= binding.due_at and self.keys:
-                binding.note_sent(self.keys, now)
+                binding.note_sent(self.keys, max(BIND_SOON_S, c.ECHO_ROUND_TRIPS * self.peer.answer_s), now)
                 for bind in binds_of(self.keys):
                     out += self._node.send_record(self.peer, binding.at, bind, now)
         self._schedule()
