@@ -9,7 +9,7 @@ import pytest
 from tests.bench.measure import resident_bytes
 from tests.bench.relay import turn
 from tests.bench.relay.load import Generator
-from tests.bench.relay.members import members
+from tests.bench.relay.members import Members, crews, members
 from tests.needs import need
 
 PAIRS, RATE_S, SECONDS = 3, 20, 1.0
@@ -31,10 +31,21 @@ def test_members_are_bound_and_again_after_a_restart(tmp_path: Path) -> None:
     with members(tmp_path, PAIRS) as (relay, generator):
         check(generator)
         before = relay.flows
-        after_s = relay.restart(generator)
-        assert len(after_s) == 2 * PAIRS
+        relay.process.end()
+        relay.process.start()
+        relay.find_again(generator)
         assert relay.flows != before
         check(generator)
+
+
+def test_members_in_several_processes_are_bound_again(tmp_path: Path) -> None:
+    """Each needs a handshake, and the figures are of this restart only."""
+    with crews(tmp_path, 2, 2) as both:
+        first, again = both.do(Members.bind), both.restart()
+        assert len(first.after_s) == len(again.after_s) == 4
+        assert min(again.after_s) > 0
+        assert again.initiations >= 4
+        assert again.relay_cpu_s > 0
 
 
 def test_what_a_relay_drops_is_lost(tmp_path: Path) -> None:

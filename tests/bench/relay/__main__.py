@@ -5,18 +5,27 @@ The relay runs on one core, the hosts of all members on the other.
 
 from __future__ import annotations
 
+import argparse
 import os
 import statistics
 import tempfile
+import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from tests.bench.measure import resident_bytes
 from tests.bench.relay import turn
 from tests.bench.relay.load import LOAD_CORE, Generator
-from tests.bench.relay.members import members
-from uavlinkd.lab.evaluation.records import cpu_seconds
+from tests.bench.relay.members import LINK, Found, Members, crews, members
+from uavlinkd.core import constants as c
+from uavlinkd.core.crypto import Secret
+from uavlinkd.core.node import Node
+from uavlinkd.core.outputs import Output, Transmit
+from uavlinkd.core.path import Path as PeerPath
+from uavlinkd.core.settings import PeerSettings
 
-PAIRS, RATES_S, SECONDS, MEMBERS, RESTARTS = 400, (5, 25, 50, 75), 10.0, 1000, 3
+PAIRS, RATES_S, SECONDS = 400, (5, 25, 50, 75), 10.0
+MEMBERS, CREWS, RESTARTS, AGAIN_S, HANDSHAKES = 1000, 2, 5, 2.0, 200
 
 
 def measure(generator: Generator) -> None:
@@ -33,25 +42,67 @@ def measure(generator: Generator) -> None:
         )
 
 
-def restart(folder: Path) -> None:
-    """Print how long all members were without a relay that is killed and started.
+def handshake_ms() -> float:
+    """Processor time of the core for one handshake of a relay: an initiation, and the envelope that confirms it."""
+    now, path, relay_key = time.monotonic(), PeerPath(0, ("127.0.0.1", 1)), os.urandom(c.KEY_BYTES)
+    relay, members = Node(Secret(relay_key), os.urandom, now), list[Node]()
+    for number in range(HANDSHAKES):
+        member = Node(Secret(os.urandom(c.KEY_BYTES)), os.urandom, now)
+        relay.add_peer(PeerSettings(f"member{number}", member.public_key, None, LINK, initiates=False), now)
+        member.set_paths(member.add_peer(PeerSettings("relay", relay.public_key, None, LINK), now), [path], now)
+        members.append(member)
+    cpu_s, sent = 0.0, [_datagrams(member.handle_timeout(now)) for member in members]
+    for _ in ("initiations", "envelopes"):
+        began = time.thread_time()
+        answers = [_datagrams(relay.receive(datagram, path, now)) for (datagram,) in sent]
+        cpu_s += time.thread_time() - began
+        sent = [_datagrams(member.receive(got[0], path, now)) for member, got in zip(members, answers, strict=True)]
+    return 1000 * cpu_s / HANDSHAKES
 
-    They share a core, on which the handshakes of 1,000 members take longer than on the relay's.
+
+def _datagrams(outputs: Sequence[Output]) -> list[bytes]:
+    return [output.datagram for output in outputs if isinstance(output, Transmit)]
+
+
+def restart(folder: Path) -> None:
+    """Print how long all members are without a relay that is killed and started.
+
+    They share a core, which computes for all of them what in flight each computes alone.
     """
-    with members(folder, MEMBERS // 2) as (relay, generator):
-        print(f"{MEMBERS} members: {resident_bytes(relay.pid()) / 1e6:.0f} MB", flush=True)
+    print(f"the core of the relay needs {handshake_ms():.2f} ms for a handshake", flush=True)
+    with crews(folder, MEMBERS // 2, CREWS) as found:
+        _print("first bind", found.do(Members.bind))
+        print(f"{MEMBERS} members: {resident_bytes(found.relay.pid) / 1e6:.0f} MB", flush=True)
         for _ in range(RESTARTS):
-            after_s = relay.restart(generator)
-            half, last, cpu_s = statistics.median(after_s), after_s[-1], cpu_seconds(relay.pid())
-            print(
-                f"killed and started: half are bound after {half:.2f} s, all after {last:.2f} s;"
-                f" processor time of the relay {cpu_s:.2f} s",
-                flush=True,
-            )
+            found.do(Members.settle)
+            _print("restart", found.restart())
+            time.sleep(AGAIN_S)
+            _print(f"again after {AGAIN_S:g} s", found.restart())
+
+
+def _print(what: str, found: Found) -> None:
+    after_s = found.after_s
+    print(
+        f"{what:16} half bound after {statistics.median(after_s):.2f} s, all after {after_s[-1]:.2f} s;"
+        f" processor time: relay {found.relay_cpu_s:.2f} s, members {found.cpu_s:.2f} s;"
+        f" sent by each: {found.initiations / len(after_s):.1f} initiations,"
+        f" {found.envelopes / len(after_s):.1f} envelopes",
+        flush=True,
+    )
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--restarts-only", action="store_true", help="measure no rates")
+    arguments = parser.parse_args()
     os.sched_setaffinity(0, {LOAD_CORE})
+    if not arguments.restarts_only:
+        rates()
+    with tempfile.TemporaryDirectory() as folder:
+        restart(Path(folder))
+
+
+def rates() -> None:
     with tempfile.TemporaryDirectory() as folder:
         with members(Path(folder), PAIRS) as (_, generator):
             measure(generator)
@@ -60,8 +111,6 @@ def main() -> None:
                 measure(generator)
         else:
             print("coturn is not installed: not compared")
-    with tempfile.TemporaryDirectory() as folder:
-        restart(Path(folder))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""``uavlinkd relay`` as a process, and its members: nodes of the core."""
+"""``uavlinkd relay`` as a process, and its members: nodes of the core, each with what a daemon has for a relay."""
 
 from __future__ import annotations
 
@@ -6,27 +6,35 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from multiprocessing.context import ForkProcess
 from pathlib import Path as FilePath
-from typing import Final
+from typing import Final, NamedTuple
 
 from tests.bench.relay.load import RELAY_CORE, Generator, host
 from tests.bench.relay.volleys import Address, Flow, Hosts, Received
 from tests.daemon.toml import to_toml
+from uavlinkd.config import RelayConfig
 from uavlinkd.config.build import TIMERS
 from uavlinkd.config.keys import decode_key, encode_key, generate_private_key, public_key_text, write_secret_file
 from uavlinkd.core import constants as c
+from uavlinkd.core import outputs as o
+from uavlinkd.core import wire
 from uavlinkd.core.crypto import KeyPair, Secret
 from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import Output, RecordReceived, SessionEstablished, Transmit
-from uavlinkd.core.path import Path
-from uavlinkd.core.relay_records import RELAYED, Bind, Bound
+from uavlinkd.core.path import RELAY_HOST, Path
+from uavlinkd.core.relay_records import RELAYED
 from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.lab.child_processes import end_with_parent
+from uavlinkd.lab.evaluation.records import cpu_seconds
 from uavlinkd.lab.sim.loopback_ports import free_port
+from uavlinkd.link.relay_link import RelayHandles, RelayLink
 
-_LINK: Final = Link(timers=TIMERS, features=c.FEATURE_RECORDS)
+LINK: Final = Link(timers=TIMERS, features=c.KNOWN_FEATURES)
+_FORK: Final = get_context("fork")
 _START_S: Final = 120.0
 _SETTLING_ASKS: Final = 30
 AMPLE: Final = {"datagrams_s": 1_000_000, "bits_s": 10_000_000_000}
@@ -35,99 +43,120 @@ AMPLE: Final = {"datagrams_s": 1_000_000, "bits_s": 10_000_000_000}
 class Member:
     """One member: its keys, its session with the relay, and its handle."""
 
-    def __init__(self, number: int, relay_key: bytes, relay: Address, hosts: Hosts) -> None:
-        private = os.urandom(c.KEY_BYTES)
+    def __init__(self, number: int, private: bytes, relay_key: bytes, relay: Address, hosts: Hosts) -> None:
         self.key = KeyPair(private).public
         self.host = host(number)
         self.relay = relay
         self.hosts = hosts
         now = time.monotonic()
         self.node = Node(Secret(private), os.urandom, now)
-        self.peer = self.node.add_peer(PeerSettings("relay", relay_key, None, _LINK), now)
+        settings = PeerSettings(RELAY_HOST + "relay", relay_key, None, LINK)
+        self.link = RelayLink(RelayConfig(settings, ()), self.node, RelayHandles(), lambda keys, now: None, now)
         self.path = Path(0, relay)
-        self.other = b""
-        """The key that it asks for."""
         self.handle = 0
         self.bound_at = 0.0
-        self.asked_at = -c.NEVER
+        self.initiations = self.envelopes = 0
+        """Sent so far."""
 
     @property
     def flow(self) -> Flow:
         """What it sends to the other member: to a relay, an envelope."""
         return Flow(self.host, self.relay, bytes((RELAYED,)) + self.handle.to_bytes(2, "big") + b"\x40")
 
+    def start(self, other: bytes) -> None:
+        """Reach this key along the relay."""
+        self.link.follow((other,))
+        self.link.set_paths([self.path], time.monotonic())
+
     def ask(self) -> None:
         """Ask the relay whether it is there."""
-        self.perform(self.node.ask(self.peer, self.path, time.monotonic()))
+        self.perform(self.node.ask(self.link.peer, self.path, time.monotonic()))
 
     def forget(self) -> None:
-        """Ask the relay, which has perhaps been restarted, and bind as soon as it answers."""
-        self.handle, self.asked_at = 0, -c.NEVER
+        """Ask the relay, which was killed: from now on it is silent."""
+        self.handle = self.initiations = self.envelopes = 0
         self.ask()
 
     def do_timers(self, now: float) -> None:
         if self.node.next_deadline() <= now:
             self.perform(self.node.handle_timeout(now))
-        if not self.handle and self.peer.paths.works and now >= self.asked_at + c.BIND_RETRY_S:
-            self.asked_at = now
-            self.perform(self.node.send_record(self.peer, self.path, Bind((self.other,)), now))
+        if self.link.next_at <= now:
+            self.perform(self.link.do_due(now))
 
     def receive(self, datagram: bytes, now: float) -> None:
         """A datagram that is not relayed data."""
         self.perform(self.node.receive(datagram, self.path, now))
-        if not self.handle:
-            self.do_timers(now)
+        self.do_timers(now)
 
-    def perform(self, outputs: Sequence[Output]) -> None:
+    def perform(self, outputs: Sequence[o.Output]) -> None:
         for output in outputs:
-            if isinstance(output, Transmit):
+            if isinstance(output, o.Transmit):
+                self.initiations += output.datagram[0] == wire.INITIATION
+                self.envelopes += output.datagram[:1] in wire.ENVELOPE_STARTS
                 self.hosts.send(self.host, output.datagram, self.relay)
-            elif isinstance(output, SessionEstablished):
-                self.asked_at = -c.NEVER  # the relay may have been restarted
-            elif isinstance(output, RecordReceived) and isinstance(output.record, Bound):
-                self.handle = max(handle for _, handle in output.record.handles)
-                self.bound_at = time.monotonic()
+            elif isinstance(output, o.RecordReceived):
+                self._receive_record(output, time.monotonic())
+            elif not isinstance(output, o.Deliver | o.Dropped):
+                self.link.on_event(output, time.monotonic())
+
+    def _receive_record(self, received: o.RecordReceived, now: float) -> None:
+        if self.link.on_record(received, now) is None:
+            was_bound = bool(self.handle)
+            self.handle = max(
+                (path.address[1] for at in self.link.paths_to(self.link.keys) for path in at), default=0
+            )
+            if self.handle and not was_bound:
+                self.bound_at = now
 
 
-class Members:
-    """All members, and the process of their relay."""
+class RelayProcess:
+    """It can be killed and started again."""
 
-    name = "uavlinkd"
-    data_start = RELAYED
-
-    def __init__(self, folder: FilePath, pairs: int) -> None:
+    def __init__(self, folder: FilePath, keys: Iterable[bytes]) -> None:
         private = generate_private_key()
-        relay = ("127.0.0.1", free_port())
-        relay_key = decode_key(public_key_text(private))
-        self.hosts = Hosts()
-        self.members = [Member(number, relay_key, relay, self.hosts) for number in range(2 * pairs)]
-        for one, other in zip(self.members[::2], self.members[1::2], strict=True):
-            one.other, other.other = other.key, one.key
-        self._by_host = {member.host: member for member in self.members}
+        self.address = "127.0.0.1", free_port()
+        self.key = decode_key(public_key_text(private))
         write_secret_file(folder / "relay.key", private)
         self._file = folder / "relay.toml"
         sections = [
-            {"name": f"member{number}", "public_key": encode_key(member.key), **AMPLE}
-            for number, member in enumerate(self.members)
+            {"name": f"member{number}", "public_key": encode_key(key), **AMPLE} for number, key in enumerate(keys)
         ]
-        config = {"name": "relay", "private_key_file": "relay.key", "listen": [f"{relay[0]}:{relay[1]}"]}
+        config = {"name": "relay", "private_key_file": "relay.key", "listen": [f"127.0.0.1:{self.address[1]}"]}
         self._file.write_text(
             to_toml({**config, "relay_server": AMPLE, "log": {"level": "error"}, "member": sections})
         )
-        self.start_relay()
+        self.start()
 
-    def start_relay(self) -> None:
+    def start(self) -> None:
         """On a core of its own."""
         command = end_with_parent(sys.executable, "-m", "uavlinkd", "relay", "--config", str(self._file))
         self._process = subprocess.Popen(command)
         os.sched_setaffinity(self._process.pid, {RELAY_CORE})
 
-    def end_relay(self) -> None:
+    def end(self) -> None:
         self._process.kill()
         self._process.wait()
 
+    @property
     def pid(self) -> int:
         return self._process.pid
+
+
+class Members:
+    """Pairs of members, from this number on, and their relay."""
+
+    name = "uavlinkd"
+    data_start = RELAYED
+
+    def __init__(self, relay: RelayProcess, privates: Sequence[bytes], first: int = 0) -> None:
+        self.process = relay
+        self.hosts = Hosts()
+        numbered = enumerate(privates, first)
+        self.members = [Member(number, key, relay.key, relay.address, self.hosts) for number, key in numbered]
+        self._by_host = {member.host: member for member in self.members}
+
+    def pid(self) -> int:
+        return self.process.pid
 
     @property
     def flows(self) -> Sequence[Flow]:
@@ -147,41 +176,120 @@ class Members:
 
     def bind(self, generator: Generator) -> None:
         """Have all make sessions with the relay at the same time, and bind."""
-        for member in self.members:
-            member.node.set_paths(member.peer, [member.path], time.monotonic())
+        for one, other in zip(self.members[::2], self.members[1::2], strict=True):
+            one.start(other.key)
+            other.start(one.key)
         generator.until(lambda: self.are_bound, _START_S)
 
     def settle(self, generator: Generator) -> None:
-        """Have each ask a few times, one after the other.
-
-        While a thousand handshakes wait in one queue, their round trips are seconds, and a member waits for several
-        round trips before it takes the relay for lost.
-        """
+        """Have each ask a few times, one after the other, as in minutes of operation."""
         for _ in range(_SETTLING_ASKS):
             for member in self.members:
                 member.ask()
                 generator.turn(0.001)
 
-    def restart(self, generator: Generator) -> list[float]:
-        """Kill the relay and start it again. Returns after how many seconds each was bound again."""
-        self.settle(generator)
-        self.end_relay()
-        began = time.monotonic()
-        self.start_relay()
+    def find_again(self, generator: Generator) -> None:
+        """The relay was killed: wait until all are bound again."""
         for member in self.members:
             member.forget()
         generator.until(lambda: self.are_bound, _START_S)
-        return sorted(member.bound_at - began for member in self.members)
 
 
 @contextmanager
 def members(folder: FilePath, pairs: int) -> Iterator[tuple[Members, Generator]]:
     """A relay with this many bound pairs."""
-    all_members = Members(folder, pairs)
+    privates = [os.urandom(c.KEY_BYTES) for _ in range(2 * pairs)]
+    relay = RelayProcess(folder, (KeyPair(private).public for private in privates))
+    all_members = Members(relay, privates)
     generator = Generator(all_members)
     try:
         all_members.bind(generator)
         yield all_members, generator
     finally:
-        all_members.end_relay()
+        relay.end()
         all_members.hosts.close()
+
+
+# In processes of their own.
+
+
+class Found(NamedTuple):
+    """What members needed to be bound."""
+
+    after_s: list[float]
+    """Of each, since the order."""
+    initiations: int
+    envelopes: int
+    """Sent by all."""
+    cpu_s: float
+    """Of their processes."""
+    relay_cpu_s: float = 0.0
+
+
+Doing = Callable[[Members, Generator], None]
+
+
+def _run(orders: Connection, relay: RelayProcess, privates: Sequence[bytes], first: int) -> None:
+    crew = Members(relay, privates, first)
+    generator = Generator(crew)
+    while True:
+        while not orders.poll():
+            generator.turn(0.001)
+        began, do = orders.recv()
+        cpu_s = time.process_time()
+        do(crew, generator)
+        these = crew.members
+        sent = sum(member.initiations for member in these), sum(member.envelopes for member in these)
+        orders.send(Found([member.bound_at - began for member in these], *sent, time.process_time() - cpu_s))
+
+
+class Crews:
+    """A relay, and pairs of members in several processes."""
+
+    def __init__(self, folder: FilePath, pairs: int, processes: int) -> None:
+        size = 2 * (pairs // processes)
+        privates = [os.urandom(c.KEY_BYTES) for _ in range(size * processes)]
+        self.relay = RelayProcess(folder, [KeyPair(private).public for private in privates])
+        self._orders: list[Connection] = []
+        self._processes: list[ForkProcess] = []
+        for first in range(0, len(privates), size):
+            ours, theirs = _FORK.Pipe()
+            arguments = theirs, self.relay, privates[first : first + size], first
+            self._processes.append(_FORK.Process(target=_run, args=arguments))
+            self._processes[-1].start()
+            theirs.close()
+            self._orders.append(ours)
+
+    def end(self) -> None:
+        self.relay.end()
+        for process, orders in zip(self._processes, self._orders, strict=True):
+            process.kill()
+            process.join()
+            process.close()
+            orders.close()
+
+    def do(self, what: Doing, began: float | None = None) -> Found:
+        """Have all members do this, which binds them."""
+        for orders in self._orders:
+            orders.send((began or time.monotonic(), what))
+        found: list[Found] = [orders.recv() for orders in self._orders]
+        after_s = sorted(after_s for one in found for after_s in one.after_s)
+        initiations, envelopes = (sum(getattr(one, name) for one in found) for name in ("initiations", "envelopes"))
+        return Found(after_s, initiations, envelopes, sum(one.cpu_s for one in found), cpu_seconds(self.relay.pid))
+
+    def restart(self) -> Found:
+        """Kill the relay and start it again."""
+        self.relay.end()
+        began = time.monotonic()
+        self.relay.start()
+        return self.do(Members.find_again, began)
+
+
+@contextmanager
+def crews(folder: FilePath, pairs: int, processes: int) -> Iterator[Crews]:
+    """A relay and pairs of members that do nothing yet."""
+    all_crews = Crews(folder, pairs, processes)
+    try:
+        yield all_crews
+    finally:
+        all_crews.end()
