@@ -213,7 +213,8 @@ def test_loss_of_the_other_direction_is_counted_from_the_peers_reports() -> None
         state.receive_report(Probe(1, 0, 10 * (second + 1), 0), float(second))
         if second == 9:
             assert state.loss_in == pytest.approx(0.5)
-            assert state.recent_losses() == ((40, 20), (0, 0))
+            assert state.recent_losses(9.0) == [(40, 20), (0, 0)]
+            assert state.recent_losses(9.0 + 2 * c.PROBE_INTERVAL_S) == [(0, 0), (0, 0)]
     assert state.loss_in == 0.0
     state.receive_report(Probe(1, 0, 10, 0), 20.0)
     assert state.loss_in == 0.0

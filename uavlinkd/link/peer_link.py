@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from operator import sub
+from operator import itemgetter, sub
 from typing import NamedTuple
 
 from uavlinkd.config import PeerConfig
@@ -302,7 +302,7 @@ class PeerLink:
         loss_in = loss_out = 0.0
         best = peer.paths.best
         missing = peer.missing(now)
-        self.losses = self._recent_losses(missing)
+        self.losses = self._recent_losses(missing, now)
         if best is not None and peer.paths.has_several:
             loss_in, loss_out = best.loss_in, best.loss_out  # gaps in the counters say nothing about one path
         elif self._sample is not None and before is not None and before[0] == self._sample[0]:
@@ -322,7 +322,7 @@ class PeerLink:
         )
         return self.figures
 
-    def _recent_losses(self, missing: int) -> tuple[tuple[int, int], ...]:
+    def _recent_losses(self, missing: int, now: float) -> tuple[tuple[int, int], ...]:
         """``missing``: all that ever did not arrive."""
         best, session = self.peer.paths.best, self.peer.sessions.current
         if best is None or session is None:
@@ -330,9 +330,10 @@ class PeerLink:
         if self._missing and self._missing[-1][0] != session.local_index:
             self._missing.clear()
         self._missing.append((session.local_index, session.expected, missing))
-        into, out = best.recent_losses()
-        if not self.peer.paths.has_several:  # then the peer may send no reports
-            into = session.expected - self._missing[0][1], missing - self._missing[0][2]
+        into, out = best.recent_losses(now)
+        if not self.peer.paths.has_several:  # then the peer may send few reports
+            counted = session.expected - self._missing[0][1], missing - self._missing[0][2]
+            into = max(into, counted, key=itemgetter(1))
         return into, out
 
     @property
