@@ -18,6 +18,7 @@ from uavlinkd.core.path import Path, relayed
 from uavlinkd.core.path_state import PathCondition
 from uavlinkd.core.settings import PeerSettings
 from uavlinkd.link import diagnosis
+from uavlinkd.link.daemon import netcheck
 from uavlinkd.link.peer_link import NOT_ANSWERING_S, PeerLink
 from uavlinkd.link.relay_link import RelayHandles, RelayLink
 from uavlinkd.link.traffic_problems import LOSSES
@@ -126,6 +127,17 @@ def test_an_answer_elsewhere_shows_that_it_is_this_relay(member: Member) -> None
     assert all("UDP gets out here (drone1 at 192.168.1.7" in one.text for one in diagnosis.find(member.parts, LATER))
 
 
+def test_netcheck_names_a_peer_that_answers_as_far_away(member: Member) -> None:
+    """One in the local network does not show that UDP gets out to the relay, here as in ``status``."""
+    member.add_relay("one", FIRST)
+    member.parts.relays.places = lambda: ([], [])
+    member.parts.relays.filter_tests = SimpleNamespace(results=())
+    member.answers(member.link, ("192.168.1.7", 5790))
+    assert netcheck(member.parts, LATER)["other"] == ""
+    member.answers(member.link, SECOND)
+    assert netcheck(member.parts, LATER)["other"] == "drone1 at 203.0.113.2:5790"
+
+
 def test_an_answer_of_the_same_host_shows_that_it_is_the_port(member: Member) -> None:
     """Another port of the relay, or another relay or peer there."""
     relay = member.add_relay("one", FIRST, (FIRST[0], 5791))
@@ -199,6 +211,19 @@ def test_a_partner_that_closes_may_start_again(member: Member) -> None:
     assert member.only(13.0).cause == "relay_not_answering"
 
 
+def test_a_relay_that_closes_shows_nothing_about_keys(member: Member, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A peer may be down already. While its relay answers, its keys may be wrong."""
+    relay = member.add_relay("one", FIRST)
+    monkeypatch.setattr(relay, "state_for", lambda _: "bound")
+    member.answers(relay, FIRST)
+    assert "keys or PSKs differ" in member.only(9.0).text
+    relay.peer.is_up = False
+    relay.on_event(PeerClosed(relay.peer), 9.0)
+    finding = member.only(9.0)
+    assert finding.text == "no answer through a relay (one): no session with a relay now, which may be starting again"
+    assert member.only(9.0 + LATER).cause == "relay_not_answering"
+
+
 def test_a_silent_peer_with_addresses_is_compared_with_others() -> None:
     """The text says whether UDP gets out here."""
     daemon = Daemon()
@@ -246,6 +271,7 @@ def test_responses_that_do_not_arrive(is_up: bool, begun: tuple[float, ...], is_
     assert ("member_not_confirmed" in findings) is is_found
     assert ("not_confirmed" in findings) is (is_found and not is_up)
     if is_found:
+        assert all("an attacker replays old initiations" in one.text for one in findings.values())
         text = findings["member_not_confirmed"].text
         assert text.startswith(
             "initiations of member at 192.0.2.2:5790 arrive, and it does not confirm the responses"

@@ -52,7 +52,7 @@ def answer(*views: dict[str, Any], state: str = "up", filtering: tuple[dict[str,
         "views": list(views),
         "filtering": list(filtering),
         "candidates": [PUBLIC, PRIVATE],
-        "others": [],
+        "other": "",
         "is_udp_blocked": False,
         "is_relay": False,
         "own": [PRIVATE],
@@ -131,16 +131,26 @@ CHECK = "`nc -zvw3 {} 22`"
             *(f"one: waiting; no answer at {ONE}", (BLOCKED, CHECK.format("198.51.100.1"))),
         ),
         (
-            *("one two", {"one": [silent(ONE, "ECONNREFUSED")]}, {}, "gets no answer: 0 of 2 relays answer"),
+            *(
+                "one two",
+                {"one": [silent(ONE, "ECONNREFUSED")], "two": [silent(TWO, "EACCES")]},
+                {},
+                "gets no answer: 0 of 2 relays answer",
+            ),
             *(f"one: waiting; no answer at {ONE} (ICMP: no process listens there)", (NO_RELAY,)),
         ),
         (
-            *("one two", {"two": [silent(TWO, "EACCES")]}, {"others": ["drone1"]}),
-            "gets out: drone1 answers directly, no relay does",
-            *(f"two: waiting; no answer at {TWO} (ICMP: not reachable)", (ONE_RELAY, CHECK.format("2001:db8::2"))),
+            *("one two", {"two": [silent(TWO)]}, {"other": "drone1 at 203.0.113.9:5790"}),
+            "gets out: drone1 at 203.0.113.9:5790 answers directly, no relay does",
+            *(f"two: waiting; no answer at {TWO}", (ONE_RELAY, CHECK.format("2001:db8::2"))),
         ),
         (
-            *("two", {"two": [silent(TWO)]}, {}, "gets out: 1 of 2 relays answer; two alone does not"),
+            *(
+                "two",
+                {"one": [silent(ONE)], "two": [silent(TWO)]},
+                {},
+                "gets out: 1 of 2 relays answer; two alone does not",
+            ),
             *(f"two: waiting; no answer at {TWO}", (ONE_RELAY, CHECK.format("2001:db8::2"))),
         ),
         (
@@ -173,6 +183,17 @@ def test_headline_and_advice_name_the_case(
     given = [text for text in (BLOCKED, NO_RELAY, ONE_RELAY, ONE_PORT) if text in said]
     assert len(given) == len(advice[:1])
     assert max(len(part) for line in lines for part in folded(line).splitlines()) <= 80
+
+
+def test_a_name_without_an_address_is_no_relay_that_is_off() -> None:
+    """Its line names the cause. Advice about firewalls would contradict it."""
+    result = answer()
+    result["relays"]["one"] |= {"state": "waiting", "unresolved": ["one.example.org"]}
+    lines = list(report(result))
+    assert (
+        "relay        one: waiting; one.example.org has no address now: see `getent hosts one.example.org`" in lines
+    )
+    assert lines[-1].startswith("candidates")
 
 
 DIRECT: dict[str, Any] = {

@@ -103,7 +103,7 @@ def member_problems(moment: Moment) -> Iterator[Found]:
         yield warning(
             "member_not_confirmed",
             f"initiations of {listed(map(_initiator, deaf))} arrive, and it does not confirm the responses of this"
-            " relay: these do not reach it, or the PSKs differ",
+            " relay: these do not reach it, the PSKs differ, or an attacker replays old initiations",
             "let UDP from this relay through the firewalls here, there and between; compare the PSKs",
         )
     if twins := [one for one in members if traffic.has_twin(one.peers, Twin.PEERS, now)]:

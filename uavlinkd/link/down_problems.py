@@ -52,8 +52,8 @@ def down_problems(peer: PeerFacts) -> Iterator[Found]:
     if not is_explained and is_deaf(peer.link.peers, peer.now):
         yield fault(
             "not_confirmed",
-            "its initiations arrive, and it does not confirm this daemon's responses: these do not reach it, or the"
-            " PSKs differ",
+            "its initiations arrive, and it does not confirm this daemon's responses: these do not reach it, the PSKs"
+            " differ, or an attacker replays old initiations",
             f"let UDP from this daemon through the firewall at {peer.name}; compare the PSKs",
         )
 
@@ -315,6 +315,7 @@ def silence(peer: PeerFacts) -> Iterator[Found]:
     config, ask = peer.link.config, _ASK_THERE.format(peer.name)
     if not peer.link.is_overdue(peer.now):
         return
+    by_name = peer.daemon.relays.by_name
     was_up = any(one.received_at is not None for one in peer.link.peers)
     if config.addresses and all(written.is_serial for written in config.addresses):
         yield fault(
@@ -323,7 +324,6 @@ def silence(peer: PeerFacts) -> Iterator[Found]:
             f"compare the baud rate, NETID and air speed of both modems, and set MAVLINK=0; {ask}",
         )
     elif was_up:
-        by_name = peer.daemon.relays.by_name
         through = [name for name, relay in by_name.items() if relay.state_for(peer.link) == "bound"]
         via = f" through the relay {through[0]}, which answers" if through else ""
         yield fault(
@@ -342,10 +342,10 @@ def silence(peer: PeerFacts) -> Iterator[Found]:
             f"{ask}; else open its firewall",
         )
     elif config.relays:
-        relays = ", ".join(config.relays)
-        yield fault(
-            "no_answer", f"no answer through a relay ({relays}): keys or PSKs differ, or it has just gone", ask
-        )
+        relays, text = ", ".join(config.relays), "keys or PSKs differ, or it has just gone"
+        if not any(relay.peer.is_up for relay in by_name.values() if relay.config.name in config.relays):
+            text, ask = "no session with a relay now, which may be starting again", "wait for 3 s"
+        yield fault("no_answer", f"no answer through a relay ({relays}): {text}", ask)
     else:
         yield fault(
             "not_connecting",

@@ -132,8 +132,7 @@ def report(answer: Answer) -> Iterator[str]:
         return
     up = sum(relay["state"] == "up" for relay in relays.values())
     down = [name for name, relay in relays.items() if relay["state"] != "up"]
-    silent = [one for relay in relays.values() for one in relay["silent"]]
-    ports = [one["address"] for one in silent if one["host_answers"]]
+    ports = [one["address"] for relay in relays.values() for one in relay["silent"] if one["host_answers"]]
     yield f"UDP          {_headline(answer, down, ports)}"
     for name, relay in relays.items():
         yield f"relay        {name}: {relay['state']}{_about(relay)}"
@@ -148,11 +147,12 @@ def report(answer: Answer) -> Iterator[str]:
     yield f"candidates   {', '.join(answer['candidates']) or 'none'}"
     if answer["is_udp_blocked"]:
         yield BLOCKED
-    elif down:
-        yield ONE_RELAY if up or answer["others"] else NO_RELAY
+    elif any(not relays[name]["unresolved"] for name in down):
+        yield ONE_RELAY if up or answer["other"] else NO_RELAY
     if ports:
         yield ONE_PORT
-    if down and (hosts := [_host(one["address"]).strip("[]") for one in silent if not one["host_answers"]]):
+    silent = [one for name in down for one in relays[name]["silent"]]
+    if hosts := [_host(one["address"]).strip("[]") for one in silent if not (one["host_answers"] or one["icmp"])]:
         yield REACHABLE.format(hosts[0])
 
 
@@ -163,8 +163,8 @@ def _headline(answer: Answer, down: list[str], ports: list[str]) -> str:
     if answer["is_udp_blocked"]:
         return f"is probably blocked here: none of {count} relays on different hosts answers"
     if len(down) == count:
-        others = ", ".join(answer["others"])
-        return f"gets out: {others} answers directly, no relay does" if others else f"gets no answer: {counted}"
+        other = answer["other"]
+        return f"gets out: {other} answers directly, no relay does" if other else f"gets no answer: {counted}"
     if down:
         return f"gets out: {counted}; {', '.join(down)} alone {'does' if len(down) == 1 else 'do'} not"
     if ports:
