@@ -79,6 +79,14 @@ def test_unanswered_requests_are_repeated_ever_later_where_there_is_a_budget() -
     assert not questions.was_late
 
 
+def test_requests_are_not_repeated_faster_than_the_slowest_network_carries() -> None:
+    """At 1,000 bit/s a request and its reply take longer than the longest of the other waits."""
+    questions, slowest = EchoRequests(bytes), Pace(30.0, c.LATE_AFTER_S, 3.4)
+    for number in range(3):
+        assert questions.repeat_s(slowest) == 3.4
+        questions.add(cast(Session, None), float(number))
+
+
 def test_answer_to_a_request_from_before_a_restart_answers_none_of_now() -> None:
     """An attacker held the request. The peer answers it on the new session, with a token that is not in use there."""
     session = cast(Session, None)
