@@ -97,6 +97,17 @@ def test_new_handle_hastens_the_questions_along_all_paths() -> None:
     assert route(paths, Class.CRITICAL) == [LTE, LTE_A2, LTE_A]
 
 
+def test_new_handles_cost_little_along_a_metered_standby_path() -> None:
+    """A hostile relay invents handles all the time. The best path is asked as any other, also if it is metered."""
+    paths = linked(LTE, LTE_A)
+    assert paths.best is of(paths, LTE)
+    for state in paths.states:
+        state.is_metered, state.questioned_at = True, 1.0
+    for handle, now, asked_at in ((LTE_A2, 5.9, 1.0), (LTE_B, 6.0, -c.NEVER)):
+        paths.configure([LTE, LTE_A, handle], now)
+        assert [of(paths, path).questioned_at for path in (LTE, LTE_A)] == [-c.NEVER, asked_at]
+
+
 # Envelopes.
 
 

@@ -68,7 +68,8 @@ class PathSlots:
         before = self.by_path
         if any(path.is_relayed and path not in before for path in wanted):  # the peer may have another address
             for state in before.values():
-                if now >= state.questioned_at + max(c.PROBE_FAST_S, self.facts.least_probe_s(state.path)):
+                least_s = c.PROBE_INTERVAL_S if state.is_metered and state is not self.best else c.PROBE_FAST_S
+                if now >= state.questioned_at + max(least_s, self.facts.least_probe_s(state.path)):
                     state.questioned_at = -c.NEVER  # ask at once
         self.by_path = {}
         for path in wanted:
