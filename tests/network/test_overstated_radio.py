@@ -23,7 +23,6 @@ from uavlinkd.config import NetworkConfig
 from uavlinkd.config.network_rules import SENDING_SHARE
 from uavlinkd.core.path import Path
 from uavlinkd.endpoints import serial_line
-from uavlinkd.endpoints.line_framing import LineDecoder
 from uavlinkd.endpoints.url import SerialUrl
 from uavlinkd.lab.mitm.modem import ModemEnd, ModemLink, ModemSettings
 from uavlinkd.link import serial_networks
@@ -58,7 +57,6 @@ class OverstatedRadio(Network):
         self.modems = ModemLink(modems, Random(f"modems {seed}"))
         self.serial: dict[End, SerialNetworks] = {}
         self._ends = dict(zip(ModemEnd, (self.alpha, self.bravo), strict=True))
-        self._decoders = {end: LineDecoder() for end in ModemEnd}
         self._read_at = float("inf")
         for number, (place, end) in enumerate(self._ends.items()):
             config = NetworkConfig(
@@ -113,7 +111,7 @@ class OverstatedRadio(Network):
             end = self._ends[place]
             (network,) = self.serial[end].networks
             network.line.bytes_received += len(chunk)
-            for datagram in self._decoders[place].feed(chunk):
+            for datagram in network.line.decoder.feed(chunk):
                 end.perform(end.node.receive(datagram, network.path, self.now))
         self._watch()
 

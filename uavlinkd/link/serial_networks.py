@@ -198,8 +198,9 @@ class SerialNetwork:
             self.rate.add_round_trip(state.round_trip_s, state.answered_at)
         requests, is_best = peer.echo_requests, state is peer.paths.best and not state.is_off
         if is_best and requests.was_late and len(self._seconds) > 1:
-            first, last = self._seconds[0], self._seconds[-1]
-            self._carried = now, 8 * (last[3] - first[3]) / (len(self._seconds) - 1)
+            first, before, last = self._seconds[0], self._seconds[-2], self._seconds[-1]
+            if last[1] > before[1]:  # else the peer is gone, and says nothing about the radio
+                self._carried = now, 8 * (last[3] - first[3]) / (len(self._seconds) - 1)
         is_late = requests.was_late or requests.unanswered >= UNANSWERED
         self.rate.set_late(now, is_late=is_best and is_late)  # the requests go along the best path
 
