@@ -164,8 +164,8 @@ def to_markdown(
             parts.append(f"![{section.title}]({section.figure}.svg)")
         parts += section.text
         for table in section.tables:
-            lines = [table.head, ["---"] * len(table.head), *table.rows]
-            parts.append("\n".join("| " + " | ".join(map(_safe, line)) + " |" for line in lines))
+            head, *rows = ("| " + " | ".join(map(_safe, line)) + " |" for line in (table.head, *table.rows))
+            parts.append("\n".join((head, "|" + "---|" * len(table.head), *rows)))
     return "\n\n".join(parts) + "\n"
 
 
