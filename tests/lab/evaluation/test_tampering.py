@@ -180,7 +180,7 @@ async def test_quick_run(tmp_path: Path) -> None:
     ours, paper = run.on(OURS), run.on(PAPER)
     chosen = [plan for plan in (*ALL_PLANS, *LINE_PLANS, *RELAYED_PLANS) if not plan.is_variant]
     assert {trial.attack for trial in ours} >= {plan.attack for plan in chosen}
-    assert len({trial.attack for trial in ours if trial.group == "keys"}) == 6
+    assert len({trial.attack for trial in ours if trial.group == "keys"}) == 7
     for trial in ours:
         assert trial.attempts > 0
         assert not trial.faults
