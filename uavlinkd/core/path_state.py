@@ -123,6 +123,11 @@ class PathState:
         return self.condition is PathCondition.USABLE or self.condition is PathCondition.SUSPECT
 
     @property
+    def is_silent(self) -> bool:
+        """Whether it became suspect because it did not answer, and still is."""
+        return self.condition is PathCondition.SUSPECT and self.reason == "unanswered"
+
+    @property
     def is_recovering(self) -> bool:
         """Whether a path that was down answers again."""
         return self._recovering_since != c.NEVER

@@ -222,8 +222,8 @@ class PathSet(PathSlots):
         sockets = {path.socket for path in failed if not path.is_relayed}
         changes: list[PathEvent] = [
             PathSuspected(peer, state.path)
-            for state in usable
-            if state.path.is_relayed and (state.path in failed or state.path.socket in sockets)
+            for state in self.states
+            if state.path.is_relayed and (state.is_silent or (state in usable and state.path.socket in sockets))
         ]
         if not any(state.works for state in self.by_path.values()):
             for state in self.by_path.values():

@@ -304,9 +304,11 @@ class RelayLink:
     def do_due(self, now: float) -> list[o.Output]:
         """Ask and bind. Call it at :attr:`next_at`."""
         out = self.forget_previous_key(now) if self._is_confirmed else []
-        asks, self._asks = self._asks, set()
-        failed, self._failed = self._failed, set()
-        sockets = {socket for socket in asks if now >= self._asked_at.get(socket, -NEVER) + ASK_S}
+        # What was asked a moment ago may have been answered before the path failed: ask again, a little later.
+        sockets = {socket for socket in self._asks if now >= self._ask_at(socket)}
+        failed = {path for path in self._failed if path.socket in sockets}
+        self._asks -= sockets
+        self._failed -= failed
         self._asked_at |= dict.fromkeys(sockets, now)
         for path in [state.path for state in self._states() if state.path.socket in sockets]:
             # The bind is longer than a question: the relay may ask a new address of this daemon at once.
@@ -384,4 +386,7 @@ class RelayLink:
     def _schedule(self) -> None:
         due_at = min((binding.due_at for binding in self._working()), default=NEVER) if self.keys else NEVER
         is_over = self._is_confirmed and len(self._peers) > 1
-        self.next_at = -NEVER if self._asks or is_over else due_at
+        self.next_at = -NEVER if is_over else min((due_at, *map(self._ask_at, self._asks)))
+
+    def _ask_at(self, socket: int) -> float:
+        return self._asked_at.get(socket, -NEVER) + ASK_S
