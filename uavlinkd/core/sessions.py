@@ -298,7 +298,7 @@ class EchoRequests:
         """
         if pace is FREE:
             return pace.ask_s
-        return max(pace.ask_s, min(pace.ask_s * 2.0 ** min(self.unanswered, 32), c.LATE_AFTER_S))
+        return max(pace.ask_s, min(pace.ask_s * 2.0 ** min(self.unanswered, 32), pace.hold_s))
 
     def expire(self, now: float) -> int:
         """Forget the requests that can only be answered late. Returns how many of them were not answered."""

@@ -46,7 +46,7 @@ LEAST_SHARE: Final = 1 / 16
 """The rate falls to this part of the full one at most,"""
 LEAST_BITS_S: Final = 1000
 """and not below this: heartbeats and commands still pass."""
-UNANSWERED: Final = 4
+UNANSWERED: Final = 6
 """So many echo requests in a row, each after twice the time, show a queue that is longer than answers may take. Few
 noisy radios lose so many."""
 SLOW_SHARE: Final = 0.75
