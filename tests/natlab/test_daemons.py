@@ -96,7 +96,7 @@ async def test_netcheck_reports_what_the_routers_do() -> None:
 
 
 async def test_link_is_back_soon_after_each_fault() -> None:
-    """Frames were lost meanwhile. If one of two networks dies, no critical frame is lost; if a NAT forgets, hardly any.
+    """Frames were lost meanwhile. If one of two networks dies, no critical frame is lost; if a NAT forgets, at most 2 %.
 
     The faults happen at the same time, each in a laboratory of its own: mostly they wait.
     """
@@ -113,7 +113,7 @@ async def test_link_is_back_soon_after_each_fault() -> None:
         assert outcome.back_s < (MOVED_S if "address" in fault else BACK_S) + watch.contended_s, fault
         if "critical frames" in fault:
             assert outcome.sent > 100
-            # A NAT forgets during an instant, in which a question may pass it: its answer is lost, and one more round.
+            # A question that passes a NAT in the instant in which it forgets costs one more round trip.
             assert outcome.lost <= (0.02 * outcome.sent if fault.startswith("the same") else 0)
         else:
             assert 0 < outcome.lost < outcome.sent, fault
