@@ -96,7 +96,7 @@ async def test_netcheck_reports_what_the_routers_do() -> None:
 
 
 async def test_link_is_back_soon_after_each_fault() -> None:
-    """Frames were lost meanwhile. If one of two networks dies, no critical frame is lost; if a NAT forgets, at most 2 %.
+    """Frames are lost meanwhile, but no critical one if one of two networks dies, and 2 % at most if a NAT forgets.
 
     The faults happen at the same time, each in a laboratory of its own: mostly they wait.
     """
