@@ -217,13 +217,14 @@ class PathSet(PathSlots):
         usable = [state for state in self.states if state.condition is PathCondition.USABLE]
         for state in self.states:
             state.check(now)
-        failed = [state.path for state in usable if state.condition is not PathCondition.USABLE]
+        failed = [state for state in usable if state.condition is not PathCondition.USABLE]
         # A NAT that forgot a direct path has forgotten the relay too, which is probed rarely.
-        sockets = {path.socket for path in failed if not path.is_relayed}
+        sockets = {state.path.socket for state in failed if not state.path.is_relayed}
+        beside = [state for state in usable if state.path.socket in sockets]
         changes: list[PathEvent] = [
             PathSuspected(peer, state.path)
             for state in self.states
-            if state.path.is_relayed and (state.is_silent or (state in usable and state.path.socket in sockets))
+            if state.path.is_relayed and (state.is_silent or state in failed or state in beside)
         ]
         if not any(state.works for state in self.by_path.values()):
             for state in self.by_path.values():
