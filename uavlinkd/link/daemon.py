@@ -16,7 +16,7 @@ from uavlinkd.core.path import Path
 from uavlinkd.endpoints.sockets import BindError
 from uavlinkd.link.carrier import FrameCarrier
 from uavlinkd.link.diagnosis import find
-from uavlinkd.link.facts import Moment, hosts_of
+from uavlinkd.link.facts import Moment
 from uavlinkd.link.local_endpoints import PilotNotes
 from uavlinkd.link.own_problems import own_codes
 from uavlinkd.link.parts import DaemonParts
@@ -333,7 +333,7 @@ def netcheck(parts: DaemonParts, now: float) -> dict[str, object]:
             along(test.relay, test.path, other_port_passes=test.passes) for test in relays.filter_tests.results
         ],
         "candidates": [str(Address(*place)) for place in candidates],
-        "other": moment.other_answer(set[str]().union(*map(hosts_of, moment.silent_relays))),
+        "other": moment.beside_relays,
         "is_udp_blocked": moment.is_udp_blocked,
         "is_relay": parts.relay is not None,
         "own": [str(Address(*place)) for place in own],

@@ -31,6 +31,7 @@ from uavlinkd.link.facts import (
     warning,
 )
 from uavlinkd.link.relay_link import RelayLink
+from uavlinkd.ops.findings import IS_REACHABLE
 from uavlinkd.ops.log import shown
 from uavlinkd.system.error_meanings import meaning_of
 
@@ -38,7 +39,6 @@ CONFIRM_S: Final = 2.0
 """A handshake that is not complete after this time is reported."""
 _ASK_THERE: Final = "run `uavlinkd status` at {}: it names the cause if datagrams arrive there"
 _EXPLAIN_NO_ANSWER: Final = {"firewall_here", "no_route", "wrong_psk", "no_common_suite"}
-_IS_REACHABLE: Final = "`nc -zvw3 {} 22` shows whether the host is reachable by TCP: connected and refused mean yes"
 
 _RelayProblem = tuple[str, RelayLink]
 
@@ -156,7 +156,7 @@ def silent_relays(
             "udp_blocked",
             f"UDP is probably blocked here: none of {len(names)} relays on different hosts answers ({listed(names)})",
             "try another network, or let UDP to the ports of the relays, and back, through the firewalls here."
-            f" {_IS_REACHABLE.format(min(hosts_of(relays[0])))}. If this daemon is new to the relays, it must be a"
+            f" {IS_REACHABLE.format(min(hosts_of(relays[0])))}. If this daemon is new to the relays, it must be a"
             " [[member]] there: `uavlinkd status` there shows what arrives",
         )
         return
@@ -188,7 +188,7 @@ def silent_relays(
             text += "it did before, so it is off, or UDP to it or back is blocked"
         else:
             text += "it is off, the address is wrong, a firewall drops UDP here or there, or keys or suites differ"
-            remedy += f". {_IS_REACHABLE.format(min(hosts, default=name))}"
+            remedy += f". {IS_REACHABLE.format(min(hosts, default=name))}"
         yield fault_or_warning("relay_not_answering", text, remedy)
 
 

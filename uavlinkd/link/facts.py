@@ -110,9 +110,13 @@ class Moment:
         relays = self.silent_relays
         if len(relays) < len(self.daemon.relays.by_name) or any(map(self.reported, relays)):
             return False
-        hosts = list(map(hosts_of, relays))
-        is_far = any(one.isdisjoint(other) for one, other in combinations(hosts, 2))
-        return is_far and not self.other_answer(set[str]().union(*hosts))
+        is_far = any(one.isdisjoint(other) for one, other in combinations(map(hosts_of, relays), 2))
+        return is_far and not self.beside_relays
+
+    @cached_property
+    def beside_relays(self) -> str:
+        """A partner that answers directly, as near as the silent relays."""
+        return self.other_answer(set[str]().union(*map(hosts_of, self.silent_relays)))
 
     @cached_property
     def answering(self) -> dict[str, str]:

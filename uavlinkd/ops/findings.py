@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from uavlinkd.core.drops import Reason
+
+IS_REACHABLE: Final = "`nc -zvw3 {} 22` shows whether the host is reachable by TCP: connected and refused mean yes"
+"""A remedy beside a silent relay, of ``status`` and ``netcheck``."""
 
 
 class Severity(IntEnum):

@@ -14,6 +14,7 @@ from itertools import combinations
 from textwrap import fill
 from typing import Any, Final
 
+from uavlinkd.ops.findings import IS_REACHABLE
 from uavlinkd.ops.status_screen import addresses
 from uavlinkd.system.terminal import printable
 
@@ -116,7 +117,6 @@ ONE_PORT = (
 )
 _ICMP: Final = {"": "", "ECONNREFUSED": " (ICMP: no process listens there)"}
 _UNREACHABLE: Final = " (ICMP: not reachable)"
-REACHABLE = "`nc -zvw3 {} 22` shows whether the host is reachable by TCP: connected and refused mean yes"
 
 
 def report(answer: Answer) -> Iterator[str]:
@@ -153,7 +153,7 @@ def report(answer: Answer) -> Iterator[str]:
         yield ONE_PORT
     silent = [one for name in down for one in relays[name]["silent"]]
     if hosts := [_host(one["address"]).strip("[]") for one in silent if not (one["host_answers"] or one["icmp"])]:
-        yield REACHABLE.format(hosts[0])
+        yield IS_REACHABLE.format(hosts[0])
 
 
 def _headline(answer: Answer, down: list[str], ports: list[str]) -> str:
