@@ -209,31 +209,18 @@ def test_removed_key_is_found_under_another_name(folder: Path) -> None:
     """The user renamed a peer, or added one: the error names file and section, and the command changes nothing."""
     path = folder / "drone2" / "drone2.toml"
     path.write_text(path.read_text().replace('name = "drone1"', 'name = "scout"'))
-    with refused(folder, r"drone2\.toml: peer\[0\] \(scout\) has a key of drone1"):
+    with refused(folder, r"drone2\.toml: peer\[0\] \(scout\) has the key of drone1"):
         operations.remove(folder, "drone1")
     with refused(folder, r"drone2\.toml: it has no \[\[peer\]\] with the name .drone1."):
-        operations.rotate(folder, "drone1", at_once=True)
+        operations.rotate(folder, "drone1")
     text = path.read_text().replace('name = "scout"', 'name = "drone1"')
     key = read_manifest(folder).member("drone1").public_key
     path.write_text(f'{text}\n[[peer]]\nname = "second"\npublic_key = " {key}"\nrole = "all"\nsystem_ids = [9]\n')
-    with pytest.raises(FleetError, match=r"peer\[4\] \(second\) has a key of drone1"):
-        operations.rotate(folder, "drone1", at_once=True)
+    with pytest.raises(FleetError, match=r"peer\[4\] \(second\) has the key of drone1"):
+        operations.rotate(folder, "drone1")
     path.write_text(text)
     operations.remove(folder, "drone1")
     check_fleet(folder)
-
-
-def test_interrupted_rotation_can_be_repeated(folder: Path) -> None:
-    """The power failed after the keys were written, before any other file: the old key is still the previous one."""
-    own = folder / "drone1"
-    old = (own / "drone1.key").read_text()
-    (own / "drone1.key").rename(own / "drone1.previous.key")
-    keys.write_secret_file(own / "drone1.key", keys.generate_private_key())
-    operations.rotate(folder, "drone1")
-    assert (own / "drone1.previous.key").read_text() == old
-    fleet = check_fleet(folder)
-    assert fleet.member("drone1").previous_public_key == keys.public_key_text(old)
-    assert loaded(folder, "drone2").peers[0].previous_public_key == keys.decode_key(keys.public_key_text(old))
 
 
 def test_edits_of_the_user_are_kept(folder: Path) -> None:
@@ -246,7 +233,7 @@ def test_edits_of_the_user_are_kept(folder: Path) -> None:
     path.write_text(text + "\n[log]\nlevel = 'warning'  # quiet\n")
     operations.add(folder, "scout", MemberKind.DRONE)
     operations.remove(folder, "drone3")
-    operations.rotate(folder, "drone2", at_once=True)
+    operations.rotate(folder, "drone2")
     after = path.read_text()
     assert "# our captain" in after
     assert "level = 'warning'  # quiet" in after
@@ -280,7 +267,6 @@ ACTIONS: dict[str, Callable[[Path], object]] = {
     "add": lambda folder: operations.add(folder, "scout", MemberKind.DRONE),
     "remove": lambda folder: operations.remove(folder, "drone1"),
     "rotate": lambda folder: operations.rotate(folder, "drone1"),
-    "rotate at once": lambda folder: operations.rotate(folder, "drone1", at_once=True),
 }
 
 
@@ -334,26 +320,27 @@ def test_interrupted_command_changes_nothing(folder: Path, monkeypatch: pytest.M
 
     monkeypatch.setattr(keys, "_sync_folder", interrupt)  # the longest wait of the command
     with pytest.raises(KeyboardInterrupt):
-        operations.rotate(folder, "drone1", at_once=True)
+        operations.rotate(folder, "drone1")
     assert snapshot(folder) == before
 
 
-def test_rotation_without_the_old_key_says_what_to_do(folder: Path, tmp_path: Path) -> None:
-    """The old key is on the vehicle only. After the printed command both keys are valid there."""
+def test_rotation_works_without_the_old_key(folder: Path, tmp_path: Path) -> None:
+    """It is on the vehicle only. The new files replace those there."""
     (folder / "drone1").rename(tmp_path / "drone1")
     result = operations.rotate(folder, "drone1")
-    assert any("mv drone1.key drone1.previous.key" in note for note in result.notes)
     assert any("drone1.toml was not here" in note for note in result.notes)
-    (tmp_path / "drone1" / "drone1.key").rename(tmp_path / "drone1" / "drone1.previous.key")
-    for path in (folder / "drone1").iterdir():
-        path.replace(tmp_path / "drone1" / path.name)
-    (folder / "drone1").rmdir()
-    (tmp_path / "drone1").rename(folder / "drone1")
     check_fleet(folder)
-    assert loaded(folder, "drone1").previous_private_key is not None
-    (folder / "drone1" / "drone1.previous.key").unlink()  # on the vehicle only
-    operations.add(folder, "scout", MemberKind.DRONE)
-    assert loaded(folder, "scout").peers
+
+
+def test_rotation_that_an_earlier_version_began_is_refused(folder: Path) -> None:
+    """The message says what to delete."""
+    path = folder / "fleet.toml"
+    key = read_manifest(folder).member("drone1").public_key
+    path.write_text(
+        path.read_text().replace('name = "drone1"\n', f'name = "drone1"\nprevious_public_key = "{key}"\n')
+    )
+    with refused(folder, "the key of drone1 was being rotated, .* delete previous_public_key"):
+        operations.remove(folder, "drone2")
 
 
 @pytest.mark.parametrize("address", ["0.0.0.0:5790", "10.13.0.200:14550"])
@@ -365,12 +352,11 @@ def test_member_with_a_configuration_that_is_not_valid_is_not_added(folder: Path
         operations.add(folder, "scout", MemberKind.DRONE, system_id=0)
 
 
-def test_compromised_key_is_removed_everywhere(folder: Path) -> None:
-    """`--at-once` replaces the key and the member's PSKs in all folders."""
+def test_rotated_key_is_removed_everywhere(folder: Path) -> None:
+    """A rotation replaces the key and the member's PSKs in all folders."""
     old = {path: content for path, content in snapshot(folder).items() if path.startswith("drone1/")}
-    operations.rotate(folder, "drone1", at_once=True)
-    fleet = check_fleet(folder)
-    assert fleet.member("drone1").previous_public_key is None
+    operations.rotate(folder, "drone1")
+    check_fleet(folder)
     secrets = [content for path, content in old.items() if not path.endswith(".toml")]
     public = keys.public_key_text(old["drone1/drone1.key"].decode())
     for content in snapshot(folder).values():

@@ -99,16 +99,14 @@ class Vehicles:
         peers: dict[str, dict[str, Any]] = self.status(name).get("peers", {})
         return peers
 
-    async def until_linked(self, *, by_new_keys: bool = False) -> None:
-        """Wait until both ends of every pair are linked; ``by_new_keys``: and every previous key is revoked."""
+    async def until_linked(self) -> None:
+        """Wait until both ends of every pair are linked by the keys of the fleet's folder."""
         public = {member.name: member.public_key for member in read_manifest(self.fleet).members}
 
         def is_linked(name: str) -> bool:
             peers = self.peers(name)
             return len(peers) == len(NAMES) - 1 and all(
-                status["state"] == "up"
-                and (not by_new_keys or (status["public_key"] == public[peer] and not status["accepts_previous_key"]))
-                for peer, status in peers.items()
+                status["state"] == "up" and status["public_key"] == public[peer] for peer, status in peers.items()
             )
 
         await until(lambda: all(map(is_linked, NAMES)))

@@ -247,14 +247,12 @@ _ROWS: tuple[tuple[str, str, str, Change], ...] = (
 )
 
 
-def _fleet(*arguments: str, before: tuple[str, ...] = ()) -> Make:
+def _fleet(*arguments: str) -> Make:
     """A fleet command in the folder of a fleet."""
 
     async def make(scene: Scene) -> None:
         folder = scene.stage.folder / f"fleet{scene.row}"
         said("fleet", "init", "--drones", "2", "--out", str(folder))
-        if before:
-            said("fleet", *before, "--out", str(folder))
         out = [] if "--out" in arguments else ["--out", str(folder)]
         scene.command = said("fleet", *(word.replace("FLEET", str(folder)) for word in arguments), *out)
 
@@ -309,13 +307,6 @@ _FLEET: tuple[tuple[str, str, str, Make], ...] = (
         _fleet("add", "scout", "--system-id", "1"),
     ),
     ("56k", "unknown member", r'has no "drone9": its members are', _fleet("remove", "drone9")),
-    (
-        "56l",
-        "rotation begun twice",
-        r"being rotated already: run `uavlinkd fleet rotate drone1 --finish --out .*`",
-        _fleet("rotate", "drone1", before=("rotate", "drone1")),
-    ),
-    ("56m", "finish without a rotation", r"is not being rotated", _fleet("rotate", "drone1", "--finish")),
 )
 
 

@@ -152,8 +152,8 @@ LINK_ROWS = (
     ),
     Mistake(
         "52",
-        "rotation finished before the restart",
-        scenes.finished_too_early,
+        "rotation without the restart",
+        scenes.without_restart,
         signs=(Sign("here", "wrong_key_here", r"After a change of keys, restart it with its new files"),),
     ),
     Mistake("53", "`status` as another user", scenes.other_user, command=r"use sudo"),

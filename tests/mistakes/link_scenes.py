@@ -267,14 +267,11 @@ async def reload_listen(scene: Scene) -> None:
     scene.command = await said_by_process("reload", "--config", str(scene.here.write_config()))
 
 
-async def finished_too_early(scene: Scene) -> None:
-    """`here` has its files from `rotate --finish`; `there` still runs with its old key."""
+async def without_restart(scene: Scene) -> None:
+    """`here` has its files from `fleet rotate`; `there` still runs with its old key."""
     scene.introduce()
-    section = _peer(scene.here)
-    section["previous_public_key"] = section["public_key"]
-    section["public_key"] = keys.public_key_text(keys.generate_private_key())
     await _linked(scene)
-    del section["previous_public_key"]
+    _peer(scene.here)["public_key"] = keys.public_key_text(keys.generate_private_key())
     await said_by_process("reload", "--config", str(scene.here.write_config()))
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 from dataclasses import fields
 
 from uavlinkd.fleet import operations
@@ -28,12 +27,8 @@ def _run(options: argparse.Namespace) -> Result:
         return operations.add(options.out, options.name, kind, address=address, system_id=options.system_id)
     if options.action == "remove":
         return operations.remove(options.out, options.name)
-    if options.action == "rotate" and not options.finish:
-        return operations.rotate(options.out, options.name, at_once=options.at_once)
     if options.action == "rotate":
-        if sys.stdin.isatty() and sys.stdout.isatty() and not options.yes:
-            _ask_before_finish(options.name)
-        return operations.finish_rotation(options.out, options.name)
+        return operations.rotate(options.out, options.name)
     relays = [_address("--relay", text) for text in options.relay]
     given = {key.name: getattr(options, key.name) for key in fields(FleetSettings)}
     given["address_plan"] = options.address_plan or (NO_PLAN if relays else DEFAULT_PLAN)
@@ -48,25 +43,12 @@ def _address(option: str, text: str) -> Address:
         raise FleetError(f"{option}: {error}") from None
 
 
-def _ask_before_finish(name: str) -> None:
-    """Ask a person whether the old key is no longer in use.
-
-    Raises:
-        FleetError: the answer is not yes.
-    """
-    question = (
-        f"Was {name} restarted, and do all members have its new key? `uavlinkd status` on each shows it up. [y/N] "
-    )
-    if input(question).strip().lower() not in ("y", "yes"):
-        raise FleetError(f"nothing was changed: carry the files of the rotation first, and restart {name}")
-
-
 def _print_result(options: argparse.Namespace, result: Result) -> None:
     """Print the fleet as a table, and what to do next."""
     rows = [("name", "kind", "id", "address", "public key")]
     for member in result.fleet.members:
         address = "(initiates)" if member.address is None else str(member.address)
-        key = f"{member.public_key[:8]}..." + (" (rotating)" if member.previous_public_key else "")
+        key = f"{member.public_key[:8]}..."
         rows.append((member.name, member.kind.value, str(member.system_id or "-"), address, key))
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
@@ -88,21 +70,8 @@ def _print_result(options: argparse.Namespace, result: Result) -> None:
         )
     for note in result.notes:
         _print(note)
-    if options.action == "rotate" and options.at_once:
-        _print(f"Restart {options.name}.")
-    elif options.action == "rotate" and not options.finish:
-        order = (
-            f"Carry the others' files and reload them, the relays too; then carry those of {options.name}"
-            if result.fleet.relays
-            else "Carry the files in any order"
-        )
-        _print(f"{order}, and restart {options.name}. When all members have their files:")
-        _print(operations.finish_command(options.out, options.name))
-    elif options.action == "rotate":
-        _print(
-            f"The old key of {options.name} is revoked when the files arrive. If it was not restarted since the"
-            f" rotation, its links end then: restart {options.name} with its files before the others reload."
-        )
+    if options.action == "rotate":
+        _print(f"Restart {options.name}: its links are down until it and the others have their files.")
     if options.action == "remove" and os.path.exists(folder := options.out / options.name):
         _print(f"{folder} was kept: delete it when you no longer need it.")
 

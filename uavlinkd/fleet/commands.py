@@ -76,13 +76,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     new.add_argument("--address", metavar="HOST:PORT", help="to which others initiate (default: by the address plan)")
     new.add_argument("--system-id", type=int, metavar="ID", help="1 to 255 (default: the next free one)")
     add("remove", "remove a member: its peers refuse it from then on")
-    rotate = add("rotate", "give a member a new key; the old one stays valid until the new one is confirmed")
-    how = rotate.add_mutually_exclusive_group()
-    how.add_argument("--finish", action="store_true", help="revoke the old key, once all members have their files")
-    how.add_argument(
-        "--at-once", action="store_true", help="for a compromised key: revoke it immediately, and replace the PSKs"
-    )
-    rotate.add_argument("--yes", action="store_true", help="with --finish: do not ask")
+    add("rotate", "give a member a new key and new PSKs: its peers refuse the old key from then on")
 
 
 def _act(options: argparse.Namespace) -> int:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Callable, Set
+from collections.abc import Callable
 from typing import Any
 
 from uavlinkd.fleet.manifest import ROLES, Fleet, FleetError, Member, MemberKind, fill, toml_lines
@@ -20,7 +20,6 @@ _HEADER = re.compile(r"[ \t]*\[")
 _KEY = re.compile(r"[ \t]*(?:\"([^\"]*)\"|'([^']*)'|([A-Za-z0-9_-]+))[ \t]*=")
 _LINK = re.compile(r"[ \t]*\[[ \t]*link[ \t]*\]")
 _KINDS = ("peer", "relay", "member")
-_PUBLIC = ("public_key", "previous_public_key")
 
 Table = dict[str, Any]
 
@@ -35,11 +34,6 @@ def key_file(member: Member) -> str:
     return f"{member.name}.key"
 
 
-def previous_key_file(member: Member) -> str:
-    """The name of the file with its previous private key, during a rotation."""
-    return f"{member.name}.previous.key"
-
-
 def psk_file(other: Member) -> str:
     """The name of the file with the PSK that it shares with another member."""
     return f"{other.name}.psk"
@@ -51,7 +45,7 @@ def write_config(fleet: Fleet, member: Member) -> str:
     numbered = "" if member.is_relay else f" with MAVLink system id {member.system_id}"
     top = {
         "name": member.name,
-        **private_keys(member),
+        "private_key_file": key_file(member),
         "listen": _listen(member),
         "control_socket": fill(settings.control_socket, member.system_id, member.name),
     }
@@ -88,23 +82,12 @@ def _listen(member: Member) -> list[str]:
     return both[1:] if address.ip is not None and address.ip.version == 6 else both[:1]
 
 
-def private_keys(member: Member) -> Table:
-    """The keys that name a member's private key files; None for those that it has not."""
-    previous = None if member.previous_public_key is None else previous_key_file(member)
-    return {"private_key_file": key_file(member), "previous_private_key_file": previous}
-
-
-def public_keys(peer: Member) -> Table:
-    """The keys with a peer's public keys; None for those that it has not."""
-    return {"public_key": peer.public_key, "previous_public_key": peer.previous_public_key}
-
-
 def peer_section(fleet: Fleet, member: Member, peer: Member) -> str:
     """The section about another member: ``[[peer]]``, ``[[relay]]`` or ``[[member]]``."""
     kind = member.section_of(peer)
-    values = {
+    values: Table = {
         "name": peer.name,
-        **public_keys(peer),
+        "public_key": peer.public_key,
         "addresses": None if peer.address is None or kind == "member" else [str(peer.address)],
         "psk_file": psk_file(peer) if fleet.settings.psk else None,
     }
@@ -133,8 +116,8 @@ def set_confidential(text: str) -> str:
     return _set_keys(text, place, lambda table: table["link"], CONFIDENTIAL)
 
 
-def set_public_keys(text: str, kind: str, peer: Member) -> str:
-    """Replace the public keys of a peer, relay or member by its current ones."""
+def set_public_key(text: str, kind: str, peer: Member) -> str:
+    """Replace the public key of a peer, relay or member."""
     places = [number for number, section in enumerate(_sections(text)) if _name(section, kind) == peer.name]
     if len(places) != 1:
         raise FleetError(f'it has no [[{kind}]] with the name "{peer.name}": add it, or move the file away')
@@ -142,16 +125,16 @@ def set_public_keys(text: str, kind: str, peer: Member) -> str:
     def section(table: Table) -> Table:
         return next(section for section in table[kind] if section.get("name") == peer.name)
 
-    return _set_keys(text, places[0], section, public_keys(peer))
+    return _set_keys(text, places[0], section, {"public_key": peer.public_key})
 
 
-def set_private_keys(text: str, member: Member) -> str:
-    """Replace the names of the member's own key files by the current ones."""
-    return _set_keys(text, 0, lambda table: table, private_keys(member))
+def set_private_key(text: str, member: Member) -> str:
+    """Replace the name of the member's own key file."""
+    return _set_keys(text, 0, lambda table: table, {"private_key_file": key_file(member)})
 
 
-def section_with_key(text: str, public_keys: Set[str | None]) -> str | None:
-    """The section that contains one of these keys, as current or previous key; None without one."""
+def section_with_key(text: str, public_key: str) -> str | None:
+    """The section that contains this key; None without one."""
     try:
         table = tomllib.loads(text)
     except ValueError:  # a daemon would refuse the file
@@ -160,23 +143,19 @@ def section_with_key(text: str, public_keys: Set[str | None]) -> str | None:
         peers = table.get(kind, [])
         for number, peer in enumerate(peers if isinstance(peers, list) else []):
             # A daemon ignores spaces around a key.
-            if isinstance(peer, dict) and public_keys & {str(peer.get(key)).strip() for key in _PUBLIC}:
+            if isinstance(peer, dict) and str(peer.get("public_key")).strip() == public_key:
                 return f"{kind}[{number}] ({peer.get('name')})"
     return None
 
 
 def _set_keys(text: str, place: int, table_of: Callable[[Table], Table], values: Table) -> str:
-    """Set keys in one section, whose table ``table_of`` finds in the parsed file, and delete those that are None.
+    """Set keys in one section, whose table ``table_of`` finds in the parsed file.
 
     The new lines are where the first of them was, or else at the end.
     """
 
     def change(table: Table) -> None:
-        section = table_of(table)
-        for key, value in values.items():
-            section.pop(key, None)
-            if value is not None:
-                section[key] = value
+        table_of(table).update(values)
 
     sections = _sections(text)
     kept: list[str] = []

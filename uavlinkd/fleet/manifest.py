@@ -122,7 +122,7 @@ A relay has no role: every other member has it as a ``[[relay]]``, and it has th
 
 @dataclass(frozen=True, slots=True)
 class Member:
-    """One vehicle, ground station, observer or relay. ``previous_public_key`` is also accepted during a rotation.
+    """One vehicle, ground station, observer or relay.
 
     ``system_id`` is 0 for a relay, which sends no MAVLink.
     """
@@ -133,7 +133,6 @@ class Member:
     public_key: str
     address: Address | None = None
     """The address to which others initiate; None if only this member initiates."""
-    previous_public_key: str | None = None
 
     @property
     def is_drone(self) -> bool:
@@ -300,6 +299,11 @@ def check_settings(settings: FleetSettings) -> None:
 
 def _member(section: dict[str, Any]) -> Member:
     section = dict(section)
+    if "previous_public_key" in section:
+        raise FleetError(
+            f"the key of {section.get('name')} was being rotated, and previous keys were removed: delete"
+            " previous_public_key here, and previous_public_key and previous_private_key_file in the members' files"
+        )
     address = section.pop("address", None)
     try:
         member = Member(
@@ -312,7 +316,5 @@ def _member(section: dict[str, Any]) -> Member:
     has_number = member.system_id == 0 if member.is_relay else member.system_id in SYSTEM_IDS
     if not (_NAME.fullmatch(member.name) and has_number and (member.address or not member.is_relay)):
         raise ValueError("not a member")
-    for key in (member.public_key, member.previous_public_key):
-        if key is not None:
-            decode_key(key)
+    decode_key(member.public_key)
     return member

@@ -1,4 +1,4 @@
-"""The operations on a fleet: init, add, remove, rotate, and finish a rotation.
+"""The operations on a fleet: init, add, remove and rotate.
 
 A fleet's folder contains the manifest and a folder for each member. Only that folder contains the member's private
 key. The commands do not need the key again: if a folder was moved to its vehicle, they write the changed files only.
@@ -8,7 +8,6 @@ An operation that raises FleetError changed nothing.
 from __future__ import annotations
 
 import errno
-import shlex
 import shutil
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -19,7 +18,6 @@ from itertools import combinations
 from pathlib import Path
 
 from uavlinkd.config import keys
-from uavlinkd.core.crypto import x25519_public_key
 from uavlinkd.fleet import files
 from uavlinkd.fleet.manifest import (
     Fleet,
@@ -147,66 +145,23 @@ def remove(folder: Path, name: str) -> Result:
     return _result(changes, *peers)
 
 
-def rotate(folder: Path, name: str, *, at_once: bool = False) -> Result:
-    """Give a member a new key.
-
-    The old key stays valid: the member's daemon and the others' files have both keys until a session confirms the
-    new one or the grace period ends. Therefore the files may arrive in any order; with relays, the member's own files
-    last. ``at_once`` is for a compromised key: it revokes the old key immediately and replaces the member's PSKs.
-    """
+def rotate(folder: Path, name: str) -> Result:
+    """Give a member a new key and new PSKs: the others refuse the old key once they have their files."""
     with _open_fleet(folder) as before:
-        old = before.member(name)
-        if old.previous_public_key is not None and not at_once:
-            raise FleetError(
-                f"the key of {name} is being rotated already:"
-                f" run `{finish_command(folder, name)}` when all members have their files"
-            )
-        private = keys.generate_private_key()
-        member = replace(
-            old,
-            public_key=keys.public_key_text(private),
-            previous_public_key=None if at_once else old.public_key,
-        )
+        old, private = before.member(name), keys.generate_private_key()
+        member = replace(old, public_key=keys.public_key_text(private))
         changes = FileChanges(folder, before.with_member(member))
-        own, previous = folder / name / files.key_file(member), folder / name / files.previous_key_file(member)
+        own = folder / name / files.key_file(member)
+        changes.deleted.append(own)
         changes.secrets[own] = private
-        if at_once:
-            changes.deleted += [own, previous]
-        elif _contains_key(previous, old.public_key):
-            # An earlier rotation was interrupted. No file has its key.
-            changes.deleted.append(own)
-        elif _exists_here(own):
-            changes.moved[own] = previous
-        else:
-            changes.notes.append(
-                f"The old key of {name} is not here. Before you copy the new files to its folder, run there:"
-                f" mv {own.name} {previous.name}"
-            )
-        peers = _replace_keys(changes, member)
-        if at_once:
-            for peer in peers if before.settings.psk else ():
+        _edit(changes, member, partial(files.set_private_key, member=member))
+        peers = changes.fleet.peers_of(member)
+        for peer in peers:
+            _edit(changes, peer, partial(files.set_public_key, kind=peer.section_of(member), peer=member))
+            if before.settings.psk:
                 changes.deleted += [folder / peer.name / files.psk_file(member), folder / name / files.psk_file(peer)]
-            _add_psks(changes, ((member, peer) for peer in peers))
-            _check_unused(changes, old)
-        apply(changes)
-    return _result(changes, member, *peers)
-
-
-def finish_command(folder: Path, name: str) -> str:
-    """The command that ends a rotation, as it is typed."""
-    return shlex.join(("uavlinkd", "fleet", "rotate", name, "--finish", "--out", str(folder)))
-
-
-def finish_rotation(folder: Path, name: str) -> Result:
-    """Remove a member's old key from all files."""
-    with _open_fleet(folder) as before:
-        old = before.member(name)
-        if old.previous_public_key is None:
-            raise FleetError(f"the key of {name} is not being rotated")
-        member = replace(old, previous_public_key=None)
-        changes = FileChanges(folder, before.with_member(member))
-        changes.deleted.append(folder / name / files.previous_key_file(member))
-        peers = _replace_keys(changes, member)
+        _add_psks(changes, ((member, peer) for peer in peers))
+        _check_unused(changes, old)
         apply(changes)
     return _result(changes, member, *peers)
 
@@ -236,15 +191,6 @@ def _add_psks(changes: FileChanges, pairs: Iterable[tuple[Member, Member]]) -> N
         changes.secrets[changes.folder / b.name / files.psk_file(a)] = psk
 
 
-def _replace_keys(changes: FileChanges, member: Member) -> list[Member]:
-    """Write a member's current keys into its own configuration and its peers'. Return the peers."""
-    _edit(changes, member, partial(files.set_private_keys, member=member))
-    peers = changes.fleet.peers_of(member)
-    for peer in peers:
-        _edit(changes, peer, partial(files.set_public_keys, kind=peer.section_of(member), peer=member))
-    return peers
-
-
 def _with_peer(fleet: Fleet, member: Member, peer: Member, text: str) -> str:
     """A member's configuration with another member in it. Links that may go along a relay are encrypted."""
     text = files.set_section(text, member.section_of(peer), peer.name, files.peer_section(fleet, member, peer))
@@ -270,29 +216,14 @@ def _edit(changes: FileChanges, member: Member, change: Callable[[str], str]) ->
 
 
 def _check_unused(changes: FileChanges, former: Member) -> None:
-    """Check that no member's configuration contains a key of a former member, under any peer's name."""
+    """Check that no member's configuration contains the key of a former member, under any peer's name."""
     for member in changes.fleet.members:
         path = changes.folder / member.name / files.config_file(member)
         try:
             text = changes.texts[path] if path in changes.texts else path.read_text(encoding="utf-8")
         except (OSError, ValueError):  # on its vehicle only, or not text
             continue
-        if section := files.section_with_key(text, {former.public_key, former.previous_public_key}):
+        if section := files.section_with_key(text, former.public_key):
             raise FleetError(
-                f"{path}: {section} has a key of {former.name}, which would stay valid: delete it there first"
+                f"{path}: {section} has the key of {former.name}, which would stay valid: delete it there first"
             )
-
-
-def _contains_key(path: Path, public_key: str) -> bool:
-    """Whether a file contains the private key of this public key."""
-    try:
-        return keys.encode_key(x25519_public_key(keys.read_secret_file(path).reveal())) == public_key
-    except keys.KeyFileError:
-        return False
-
-
-def _exists_here(path: Path) -> bool:
-    try:
-        return path.exists()
-    except OSError as error:
-        raise FleetFileError(f"{path} cannot be read: {error.strerror}") from None

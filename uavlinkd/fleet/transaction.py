@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import sys
 from collections.abc import Iterable, Iterator
@@ -27,8 +26,6 @@ class FileChanges:
     """New key files."""
     texts: dict[Path, str] = field(default_factory=dict)
     """Configurations, which replace existing ones."""
-    moved: dict[Path, Path] = field(default_factory=dict)
-    """Files to rename, with their new paths."""
     deleted: list[Path] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     """Sentences for the person who runs the command."""
@@ -51,8 +48,6 @@ def apply(changes: FileChanges, checked: Iterable[Member] = ()) -> None:
         for path in changes.deleted:
             rollback.keep(path)
             path.unlink(missing_ok=True)
-        for path, to in changes.moved.items():
-            rollback.move(path, to)
         for path, text in changes.secrets.items():
             rollback.make_folder(path.parent)
             keys.write_secret_file(path, text)
@@ -83,17 +78,6 @@ class Rollback:
         if not folder.exists():
             folder.mkdir(mode=0o700)
             self.steps.append((folder, None))
-
-    def move(self, path: Path, to: Path) -> None:
-        """Rename a file.
-
-        Raises:
-            FileExistsError: a file has that name already.
-        """
-        if to.exists():
-            raise FileExistsError(errno.EEXIST, "it exists: move it away", str(to))
-        path.rename(to)
-        self.steps.append((path, to))
 
     def keep(self, path: Path) -> None:
         """Keep the content of a file, if there is one, under another name; its own may be gone.
