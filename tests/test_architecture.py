@@ -11,7 +11,7 @@ import pytest
 from tests.imports import circle, graph, imports, is_inside, roots, sources
 
 ORDER = (
-    *("system", "core", "mavlink", "endpoints", "relay", "config", "ops", "fleet", "lab", "link"),
+    *("system", "core", "authority", "mavlink", "endpoints", "relay", "config", "ops", "fleet", "lab", "link"),
     *("cli", "__main__"),
 )
 """Each package may import those before it."""

@@ -11,8 +11,9 @@ import hmac
 import warnings
 from collections.abc import Callable
 
-from cryptography.exceptions import InvalidTag
+from cryptography.exceptions import InvalidSignature, InvalidTag
 from cryptography.hazmat.primitives.asymmetric import dh, mlkem
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
 from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 from cryptography.hazmat.primitives.hashes import SHA256
@@ -154,6 +155,39 @@ def is_usable_public_key(public: bytes) -> bool:
     except Drop:
         return False
     return True
+
+
+_FIELD_PRIME = 2**255 - 19
+
+
+class AuthorityKey:
+    """A public key of Ed25519 (RFC 8032). Compared by its bytes.
+
+    Raises:
+        ValueError: it is not one, or everyone can sign under it.
+    """
+
+    __slots__ = ("_key", "public")
+
+    def __init__(self, public: bytes) -> None:
+        y = int.from_bytes(public, "little") & (2**255 - 1)
+        # OpenSSL accepts signatures that no key made under points of small order. The equivalent point of Curve25519
+        # (RFC 7748, section 4.1) has the same order; the neutral point, with y = 1, has none.
+        if len(public) != KEY_BYTES or not 1 < y < _FIELD_PRIME:
+            raise ValueError("is not a public key of Ed25519")
+        u = (1 + y) * pow(1 - y, -1, _FIELD_PRIME) % _FIELD_PRIME
+        if not is_usable_public_key(u.to_bytes(KEY_BYTES, "little")):
+            raise ValueError("is a point of small order, under which everyone can sign")
+        self._key = Ed25519PublicKey.from_public_bytes(public)
+        self.public = public
+
+    def verifies(self, signature: bytes, data: bytes) -> bool:
+        """Whether the holder of the private key signed the data."""
+        try:
+            self._key.verify(signature, data)
+        except InvalidSignature:
+            return False
+        return True
 
 
 def ffdhe_power(prime: int, base: int, exponent: bytes) -> bytes:

@@ -148,6 +148,40 @@ class DropReason(Reason):
         "handshakes with an unknown key",
         Attention.SECURITY,
     )
+    BAD_CERTIFICATE = (
+        "bad_certificate",
+        "the authority of this fleet did not sign this certificate for this key",
+        "handshakes with an invalid certificate",
+        Attention.SECURITY,
+    )
+    CERTIFICATE_REVOKED = (
+        "certificate_revoked",
+        "the bulletin revokes this certificate, or this daemon's file denies its member",
+        "handshakes with a revoked certificate",
+        Attention.SECURITY,
+    )
+    MEMBER_CONFLICT = (
+        "member_conflict",
+        "the certificate has the name or a system id of this daemon, of a pinned peer or of another member",
+        "handshakes of a member with the name or id of another",
+        Attention.SECURITY,
+    )
+    ROLE_NOT_ACCEPTED = (
+        "role_not_accepted",
+        "the certificate is valid, but this daemon has no policy for a member of its role",
+        "handshakes of members whose role has no policy here",
+    )
+    BULLETIN_AWAITED = (
+        "bulletin_awaited",
+        "this daemon waits for the newest bulletin before it accepts members by certificate",
+        "handshakes before the newest bulletin arrived",
+        Attention.EVERYDAY,
+    )
+    TOO_MANY_MEMBERS = (
+        "too_many_members",
+        "this daemon has as many members by certificate as it may",
+        "handshakes above the number of members",
+    )
     SUITE_NOT_ACCEPTED = (
         "suite_not_accepted",
         "the peer offers a suite that is not in its list",

@@ -8,7 +8,7 @@ from uavlinkd.core.cookie import mac1_of
 from uavlinkd.core.drops import Drop
 from uavlinkd.core.handshake import Received
 from uavlinkd.core.initiator import Pending
-from uavlinkd.core.outputs import Output, PeerClosed, SessionEstablished
+from uavlinkd.core.outputs import Output, PeerAdmitted, PeerClosed, SessionEstablished
 from uavlinkd.core.path import Path
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.send import ask_for_echo, seal, transmit
@@ -132,9 +132,14 @@ def _transmit_answer(peer: Peer, datagram: bytes, waiting: Unconfirmed, path: Pa
 def adopt(peer: Peer, session: Session, path: Path, now: float) -> list[Output]:
     """A session is confirmed, by a datagram along this path. If it has the highest rank, traffic goes on it now."""
     is_rekey = peer.sessions.current is not None
+    admitted: list[Output] = []
+    if peer.provisional_until != c.NEVER:
+        peer.provisional_until = c.NEVER
+        admitted.append(PeerAdmitted(peer))
     peer.indices.owners[session.local_index] = peer, session
-    out = freshness.end(peer, peer.sessions.confirm(session, now))
+    out = admitted + freshness.end(peer, peer.sessions.confirm(session, now))
     peer.initiator.cancel()
+    peer.initiator.is_known = True
     peer.initiator.attempts = 0
     peer.traffic.handshakes += 1
     if peer.sessions.current is session:
@@ -162,6 +167,7 @@ def receive_close(peer: Peer, session: Session, now: float) -> list[Output]:
         peer.is_up = False
         peer.unverified_since = None
         peer.unanswered_since = None
+        peer.initiator.is_known = False  # it may restart, and forget certificates
         peer.initiator.attempts = 0
         peer.initiator.retry_at = now + c.CLOSE_HOLDOFF_S
         out.append(PeerClosed(peer))

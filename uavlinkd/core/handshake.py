@@ -27,11 +27,15 @@ class Initiated(NamedTuple):
 
 
 class Received(NamedTuple):
-    """The responder's side after a sound message 1. ``public_key`` is authenticated, its meaning not yet checked."""
+    """The responder's side after a sound message 1. ``public_key`` is authenticated, its meaning not yet checked.
+
+    ``certificate`` is empty in the short form.
+    """
 
     state: HandshakeState
     parameters: Parameters
     public_key: bytes
+    certificate: bytes
     initiation: wire.Initiation
 
 
@@ -52,13 +56,15 @@ def parameters_of(link: Link, generation: int) -> Parameters:
     return Parameters(generation, *least, link.features)
 
 
-def initiate(identity: KeyPair, peer: PeerSettings, index: int, generation: int, entropy: Entropy) -> Initiated:
+def initiate(
+    identity: KeyPair, peer: PeerSettings, index: int, generation: int, entropy: Entropy, certificate: bytes = b""
+) -> Initiated:
     """Message 1 to ``peer``: always the first suite of its list, whatever was lost or refused before."""
     suite = peer.link.suites[0]
     state = noise.initiator(suite, wire.prologue(suite), identity, peer.public_key, peer.psk or noise.NO_PSK)
     parameters = parameters_of(peer.link, generation)
     header = wire.initiation_header(suite, index)
-    state, message = state.write(header[1:] + parameters.encode(), entropy)
+    state, message = state.write(header[1:] + parameters.encode() + certificate, entropy)
     return Initiated(state, parameters, header + message)
 
 
@@ -71,8 +77,8 @@ def receive_initiation(identity: KeyPair, initiation: wire.Initiation) -> Receiv
     suite = initiation.suite
     state = noise.responder(suite, wire.prologue(suite), identity)
     state, payload = state.read(initiation.noise)
-    parameters = _open_payload(payload, initiation.header)
-    return Received(state, parameters, state.rs, initiation)
+    parameters, certificate = _open_payload(payload, initiation.header)
+    return Received(state, parameters, state.rs, certificate, initiation)
 
 
 def respond(
@@ -100,19 +106,20 @@ def receive_response(initiated: Initiated, response: wire.Response) -> Keys:
     if response.suite != initiated.state.suite:
         raise Drop(DropReason.HEADER_MISMATCH)
     state, payload = initiated.state.read(response.noise)
-    theirs = _open_payload(payload, response.header)
+    theirs, _ = _open_payload(payload, response.header)
     return _keys(state, initiated.parameters.stronger(theirs), response.sender_index)
 
 
-def _open_payload(payload: bytes, header: bytes) -> Parameters:
-    """The sender's parameters; the header in clear must be the one that it sealed in front of them.
+def _open_payload(payload: bytes, header: bytes) -> tuple[Parameters, bytes]:
+    """The sender's parameters and certificate; the header in clear must be the one that it sealed in front of them.
 
     Without this an altered index would leave two ends that agree on keys and never receive each other's envelopes.
     """
-    repeated, parameters = payload[: len(header) - 1], payload[len(header) - 1 :]
+    repeated, rest = payload[: len(header) - 1], payload[len(header) - 1 :]
     if repeated != header[1:]:
         raise Drop(DropReason.HEADER_MISMATCH)
-    return wire.parse_parameters(parameters)
+    size = Parameters.SIZE
+    return wire.parse_parameters(rest[:size]), rest[size:]
 
 
 def _keys(state: HandshakeState, parameters: Parameters, remote_index: int) -> Keys:

@@ -59,6 +59,10 @@ class Initiator:
         self._entropy = entropy
         self._facts = facts
         self._mac_keys = MacKeys(settings.public_key)
+        self.certificate = b""
+        """Of this daemon: it shows it to a peer by certificate. Empty for others."""
+        self.is_known = False
+        """Whether the peer confirmed a session, and so holds the certificate, unless it restarted."""
         self.initiated_at = -c.NEVER
         """When the last initiation was sent."""
         self._began_at = now  # the first of the tries since new keys were wanted
@@ -101,8 +105,13 @@ class Initiator:
 
     def _try_interval_s(self, path: Path) -> float:
         """Between tries along a path; 0 if it carries the usual ones."""
-        interval_s = self._facts.try_interval_s(path, self.settings.link.suites[0])
+        interval_s = self._facts.try_interval_s(path, self.settings.link.suites[0], len(self._shown()))
         return interval_s if interval_s > self.settings.link.timers.retry_min_s else 0.0
+
+    def _shown(self) -> bytes:
+        """The certificate, if the present attempt shows it: two of three do to a peer that may have restarted."""
+        is_again = self.attempts > c.SHORT_TRIES and self.attempts % 3 != 2
+        return b"" if self.is_known and not is_again else self.certificate
 
     def _jitter(self) -> float:
         return 1.0 + c.RETRY_JITTER * int.from_bytes(self._entropy(2), "big") / 2**16
@@ -132,7 +141,8 @@ class Initiator:
         self, index: int, paths: Sequence[Path], generation: int, now: float
     ) -> tuple[Pending, list[tuple[bytes, Path]]]:
         """An initiation under this index, and its datagram for each path. They are equal up to mac1."""
-        initiated = handshake.initiate(self._identity, self.settings, index, generation, self._entropy)
+        shown = self._shown()
+        initiated = handshake.initiate(self._identity, self.settings, index, generation, self._entropy, shown)
         datagrams = [(self.add_macs(initiated.message, path, now), path) for path in paths]
         mac1 = mac1_of(datagrams[0][0])
         slowest_s = max(map(self._try_interval_s, paths))

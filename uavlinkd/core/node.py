@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 from uavlinkd.core import constants as c
 from uavlinkd.core import establish, probing, wire
@@ -24,11 +25,11 @@ from uavlinkd.core.probing import ask_candidates
 from uavlinkd.core.receive import receive_envelope
 from uavlinkd.core.receive_handshake import HandshakeReceiver, OwnKeys
 from uavlinkd.core.refusals import Refused
-from uavlinkd.core.relay_records import Record
+from uavlinkd.core.relay_records import FleetRecord, Record
 from uavlinkd.core.send import ask_for_echo, seal, send_frames
 from uavlinkd.core.session import Session
 from uavlinkd.core.sessions import Indices
-from uavlinkd.core.settings import Class, PeerSettings, Screen, hold_all
+from uavlinkd.core.settings import Admit, Class, PeerSettings, Screen, hold_all
 from uavlinkd.core.timeouts import handle_timeout
 from uavlinkd.core.timers import Schedule
 
@@ -45,6 +46,7 @@ class Node:
         now: monotonic seconds.
         previous_private_key: the one before, while it is being changed: peers can be added that know us by it.
         screen: splits a payload into frames that may be old and frames that must be new. By default all must be new.
+        admit: decides on certificates. Without it, none is valid.
     """
 
     def __init__(
@@ -55,6 +57,7 @@ class Node:
         previous_private_key: Secret | None = None,
         *,
         screen: Screen = hold_all,
+        admit: Admit | None = None,
     ) -> None:
         self._screen = screen
         self._entropy = entropy
@@ -68,6 +71,9 @@ class Node:
         previous = None if previous_private_key is None else OwnKeys(previous_private_key, entropy, now)
         admission = Admission(self._is_known, now)
         self._handshakes = HandshakeReceiver(own, previous, self._indices, admission, self.facts, self._schedule)
+        self._certificate = b""
+        if admit is not None:
+            self._handshakes.admit = partial(self._admit, admit)
         self.peers: dict[str, Peer] = {}
         """By name."""
         self.drops: Counter[DropReason] = Counter()
@@ -102,7 +108,27 @@ class Node:
         self.peers[settings.name] = handshakes.peers[keys] = peer
         self.facts.peers = len(self.peers)
         self._handshakes.admission.set_peers(len(self.peers))
+        if settings.is_certified:
+            peer.initiator.certificate = self._certificate
         return peer
+
+    def _admit(self, admit: Admit, public_key: bytes, certificate: bytes, now: float) -> Peer:
+        """The peer with this key that showed a certificate. A new one is provisional."""
+        settings = admit(public_key, certificate, now)
+        peer = self._handshakes.peers.get((self.public_key, public_key))
+        if peer is None:
+            peer = self.add_peer(replace(settings, initiates=False), now)
+            peer.provisional_until = now + c.UNCONFIRMED_LIFETIME_S
+            peer.set_expiry()
+            self._schedule.update(peer)
+        return peer
+
+    def set_certificate(self, certificate: bytes) -> None:
+        """Show this certificate to peers by certificate from the next initiation on."""
+        self._certificate = certificate
+        for peer in self.peers.values():
+            if peer.settings.is_certified:
+                peer.initiator.certificate = certificate
 
     def forget_previous_key(self) -> None:
         """Accept nothing for our previous key any more. Remove the peers by it first."""
@@ -202,12 +228,15 @@ class Node:
         report = peer.own_problems.take(codes, session.order_base, now)
         return [] if report is None else seal(peer, session, report.encode(), route, now, is_answer=True)
 
-    def send_record(self, peer: Peer, path: Path, record: Record, now: float) -> list[Output]:
+    def send_record(self, peer: Peer, path: Path | None, record: Record, now: float) -> list[Output]:
         """Send a record to a relay or to a member along one path, encrypted. It expects no answer from the session.
 
-        Nothing is sent if the path is unknown or does not work and is not the best, or the session has no records.
+        Without a path it goes along the best one. Nothing is sent if the path is unknown or does not work and is not
+        the best, or if the session does not have such records.
         """
-        session, state = peer.session_with(c.FEATURE_RECORDS, now), peer.paths.find(path)
+        feature = c.FEATURE_FLEET if isinstance(record, FleetRecord) else c.FEATURE_RECORDS
+        session = peer.session_with(feature, now)
+        state = peer.paths.best if path is None else peer.paths.find(path)
         if session is None or state is None or not (state.works or state is peer.paths.best):
             return []
         return seal(peer, session, session.sealed_record(record.encode()), (state,), now, is_answer=True)
@@ -256,6 +285,9 @@ class Node:
         """Do what is due, for at most :data:`PEERS_AT_ONCE`. Call it at :meth:`next_deadline`, or at any time."""
         out: list[Output] = []
         for peer in self._schedule.pop(now, PEERS_AT_ONCE):
+            if now >= peer.provisional_until:
+                out += self.remove_peer(peer, now)
+                continue
             out += handle_timeout(peer, now)
             self._schedule.update(peer)
         return out

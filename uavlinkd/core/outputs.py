@@ -60,6 +60,12 @@ class Dropped(NamedTuple):
     detail: Detail = ""
 
 
+class PeerAdmitted(NamedTuple):
+    """A peer that showed a certificate proved that it is there. Before that the shell does not know it."""
+
+    peer: LinkedPeer
+
+
 class PeerUp(NamedTuple):
     """A valid envelope or response came from a peer that was not up."""
 
@@ -138,5 +144,6 @@ class FreshnessVerified(NamedTuple):
 
 
 PathEvent = PathChanged | PathStateChanged | PathSuspected
-Event = PeerUp | PeerLost | PeerClosed | SessionEstablished | PathEvent | FreshnessUnverified | FreshnessVerified
+LinkEvent = PeerUp | PeerLost | PeerClosed | SessionEstablished | FreshnessUnverified | FreshnessVerified
+Event = PeerAdmitted | LinkEvent | PathEvent
 Output = Transmit | Deliver | RecordReceived | Dropped | Event

@@ -111,9 +111,9 @@ class SocketFacts:
         """Between questions along a path: every peer may be probed, and sends as many probes as it gets."""
         return self._share_s(path, c.PROBE_BYTES, c.PROBE_BUDGET_SHARE, self._rates)
 
-    def try_interval_s(self, path: Path, suite: Suite) -> float:
-        """Between two initiations along a path; 0 without a budget."""
-        size = wire.initiation_bytes(suite) + wire.response_bytes(suite)
+    def try_interval_s(self, path: Path, suite: Suite, added: int = 0) -> float:
+        """Between two initiations along a path, longer by ``added`` bytes; 0 without a budget."""
+        size = wire.initiation_bytes(suite) + added + wire.response_bytes(suite)
         return c.TRY_AIRTIMES * self._airtime_s(path, size, self._rates)
 
     def pace(self, path: Path) -> Pace:

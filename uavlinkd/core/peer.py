@@ -113,6 +113,8 @@ class Peer:
         """How long the last response took; 0 after a question was answered since."""
         self.set_waits()
         self.is_up = False
+        self.provisional_until = c.NEVER
+        """When it is removed: until its first envelope, if it is known by a certificate that it showed."""
         self.offered_at = -c.NEVER
         """When the features changed that this side offers."""
         self.established_at: float | None = None
@@ -261,8 +263,9 @@ class Peer:
         self.lost_after_s = max(durations.lost_after_s, c.LOST_ROUND_TRIPS * round_trip_s)
 
     def set_expiry(self) -> None:
-        """Set when a session, or an initiation, expires."""
-        self.timers.set(Timer.EXPIRY, min(self.sessions.next_expiry(), self.initiator.next_expiry()))
+        """Set when a session, an initiation or a provisional peer expires."""
+        expiries = self.sessions.next_expiry(), self.initiator.next_expiry(), self.provisional_until
+        self.timers.set(Timer.EXPIRY, min(expiries))
 
     def set_initiate(self) -> None:
         """Set when to initiate."""

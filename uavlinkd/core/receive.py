@@ -17,7 +17,7 @@ from uavlinkd.core.peer import Peer
 from uavlinkd.core.probe import ANSWER_BYTES, PROBE, QUESTION_BYTES
 from uavlinkd.core.problem_reports import ProblemReport
 from uavlinkd.core.refusals import RefusalReport
-from uavlinkd.core.relay_records import parse_record
+from uavlinkd.core.relay_records import FleetRecord, parse_record
 from uavlinkd.core.send import may_echo, send_echo
 from uavlinkd.core.session import Session
 
@@ -191,6 +191,8 @@ def _receive_record(arrived: Arrived, sealed: bytes) -> list[Output]:
         opened = parse_record(session.open_record(arrived.counter, sealed))
     except Drop as drop:
         return [peer.drop_datagram(drop.reason, path)]
+    if isinstance(opened, FleetRecord) and not session.parameters.features & c.FEATURE_FLEET:
+        return [peer.drop_datagram(DropReason.BAD_CONTROL, path)]
     if arrived.is_superseded:
         return [peer.drop_datagram(DropReason.OLD_RECORD, path)]
     return [RecordReceived(peer, path, opened, session.order_base + arrived.counter)]

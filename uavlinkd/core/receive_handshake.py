@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 
 from uavlinkd.core import constants as c
 from uavlinkd.core import establish, handshake, wire
@@ -56,6 +56,8 @@ class HandshakeReceiver:
         """By our public key and theirs."""
         self.remembered: dict[bytes, Peer] = {}
         """By the ephemeral of an authentic initiation: its sender."""
+        self.admit: Callable[[bytes, bytes, float], Peer] | None = None
+        """Returns the peer with this static key that showed this certificate. Raises Drop."""
         self._indices = indices
         self._facts = facts
         self._schedule = schedule
@@ -130,6 +132,8 @@ class HandshakeReceiver:
         self.admission.admit(message, now, is_response=False)
         received = handshake.receive_initiation(own.identity, initiation)
         peer = self.peers.get((own.identity.public, received.public_key))
+        if received.certificate and self.admit is not None and (peer is None or peer.settings.is_certified):
+            peer = self.admit(received.public_key, received.certificate, now)
         if peer is None:
             raise Drop(DropReason.UNKNOWN_PEER, received.public_key)
         # Before it is remembered: otherwise a line could use up what this peer sends along its own network.

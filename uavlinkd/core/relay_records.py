@@ -1,4 +1,7 @@
-"""Records between a member and its relay, and data along a relay. README.md, section 21. Total parsers; no keys."""
+"""Records between a member and its relay or another member, and data along a relay. Total parsers; no keys.
+
+README.md, section 21, and for the fleet's records uavlinkd/authority/README.md.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +12,19 @@ from typing import NamedTuple
 
 from uavlinkd.core import constants as c
 from uavlinkd.core.drops import Drop, DropReason
+from uavlinkd.core.wire import CERTIFICATE_BYTES
 
 BIND, BOUND, CANDIDATES, FILTER_TEST, FILTER_TESTED = 1, 2, 3, 4, 5
+HAVE, BULLETIN, CERTIFICATE, WHO = 6, 7, 8, 9
 WAITING = 0
 """The handle of a peer that cannot be reached through the relay now."""
 _BOUND_HEADER = struct.Struct(">B16sH")
 _PLACE = struct.Struct(">16sH")
 _ENTRY = struct.Struct(f">{c.KEY_BYTES}sH")
 _TOKEN_END = 1 + c.FILTER_TOKEN_BYTES
+_HAVE = struct.Struct(">BI4sII")
+_WHO = struct.Struct(">BBI")
+_CERTIFIED_BYTES = 1 + c.KEY_BYTES + CERTIFICATE_BYTES
 
 
 class Bind(NamedTuple):
@@ -116,7 +124,67 @@ class FilterTested(NamedTuple):
         return bytes((FILTER_TESTED,)) + self.token
 
 
-Record = Bind | Bound | Candidates | FilterTest | FilterTested
+class Have(NamedTuple):
+    """The bulletin that the sender has, and which certificates.
+
+    ::
+
+        offset  size  field
+        0       1     kind (6)
+        1       4     number of the bulletin
+        5       4     first bytes of its SHA-256
+        9       4     serial of the sender's certificate, or 0
+        13      4     serial of the receiver's certificate that the sender holds, or 0
+    """
+
+    number: int
+    digest: bytes
+    serial: int = 0
+    known: int = 0
+
+    def encode(self) -> bytes:
+        """The record."""
+        return _HAVE.pack(HAVE, *self)
+
+
+class BulletinRecord(NamedTuple):
+    """A bulletin: kind (7), and its bytes."""
+
+    bulletin: bytes
+
+    def encode(self) -> bytes:
+        """The record."""
+        return bytes((BULLETIN,)) + self.bulletin
+
+
+class CertificateRecord(NamedTuple):
+    """The certificate of a member: kind (8), its static public key (32), the certificate (100)."""
+
+    key: bytes
+    certificate: bytes
+
+    def encode(self) -> bytes:
+        """The record."""
+        return bytes((CERTIFICATE,)) + self.key + self.certificate
+
+
+class Who(NamedTuple):
+    """A member asks its relay for the certificates of others: kind (9), bits of their roles (1), a serial (4).
+
+    The answer has those with a higher serial.
+    """
+
+    roles: int
+    after: int = 0
+
+    def encode(self) -> bytes:
+        """The record."""
+        return _WHO.pack(WHO, *self)
+
+
+FleetRecord = Have | BulletinRecord | CertificateRecord | Who
+"""Valid on sessions of two ends with :data:`c.FEATURE_FLEET` only."""
+Record = Bind | Bound | Candidates | FilterTest | FilterTested | FleetRecord
 
 
 def _packed(host: str) -> bytes:
@@ -156,7 +224,22 @@ def parse_record(data: bytes) -> Record:
         return FilterTest(data[1:_TOKEN_END])
     elif kind == bytes((FILTER_TESTED,)) and size == _TOKEN_END:
         return FilterTested(data[1:])
+    elif (record := _fleet_record(data)) is not None:
+        return record
     raise Drop(DropReason.BAD_CONTROL)
+
+
+def _fleet_record(data: bytes) -> FleetRecord | None:
+    kind, size = data[0] if data else 0, len(data)
+    if kind == HAVE and size == _HAVE.size:
+        return Have(*_HAVE.unpack(data)[1:])
+    if kind == BULLETIN and size > 1:  # its own parser checks it
+        return BulletinRecord(data[1:])
+    if kind == CERTIFICATE and size == _CERTIFIED_BYTES:
+        return CertificateRecord(data[1 : 1 + c.KEY_BYTES], data[1 + c.KEY_BYTES :])
+    if kind == WHO and size == _WHO.size:
+        return Who(*_WHO.unpack(data)[1:])
+    return None
 
 
 def binds_of(keys: Sequence[bytes]) -> Iterator[Bind]:

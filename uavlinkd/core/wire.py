@@ -105,8 +105,12 @@ def prologue(suite: Suite) -> bytes:
     return c.PROTOCOL_NAME + bytes((suite.number,))
 
 
+CERTIFICATE_BYTES = 100
+"""Behind the parameters in the payload of an initiation, or not there: uavlinkd/authority/README.md."""
+
+
 def initiation_bytes(suite: Suite) -> int:
-    """Length of an initiation of this suite."""
+    """Length of an initiation of this suite without a certificate."""
     return _handshake_bytes(_INITIATION_HEADER, 2 * c.KEY_BYTES + c.AEAD_TAG_BYTES, suite.share_bytes)  # e, sealed s
 
 
@@ -197,11 +201,14 @@ class CookieReply(NamedTuple):
 
 
 def _cut(
-    datagram: bytes, header: struct.Struct, size: Callable[[Suite], int]
+    datagram: bytes, header: struct.Struct, size: Callable[[Suite], int], *, added: int = 0
 ) -> tuple[Suite, list[int], bytes, bytes]:
-    """Suite, indices, header and Noise message of a handshake message, whose ``size`` its suite gives."""
+    """Suite, indices, header and Noise message of a handshake message, whose ``size`` its suite gives.
+
+    ``added``: it may be longer by so many bytes.
+    """
     suite = SUITES.get(datagram[1]) if len(datagram) > header.size else None
-    if suite is None or len(datagram) != size(suite):
+    if suite is None or len(datagram) - size(suite) not in (0, added):
         raise Drop(DropReason.MALFORMED)
     _, _, *indices = header.unpack_from(datagram)
     if not all(indices):
@@ -211,7 +218,7 @@ def _cut(
 
 def parse_initiation(datagram: bytes) -> Initiation:
     """Cut message 1 into its fields. Any bytes give an Initiation, or a Drop with ``MALFORMED``."""
-    suite, (sender,), header, noise = _cut(datagram, _INITIATION_HEADER, initiation_bytes)
+    suite, (sender,), header, noise = _cut(datagram, _INITIATION_HEADER, initiation_bytes, added=CERTIFICATE_BYTES)
     return Initiation(suite, sender, header, noise)
 
 

@@ -67,7 +67,7 @@ class _LyingNode(Node):
 
     relay: HostileRelay
 
-    def send_record(self, peer: Peer, path: Path, record: Record, now: float) -> list[Output]:
+    def send_record(self, peer: Peer, path: Path | None, record: Record, now: float) -> list[Output]:
         if isinstance(record, Bound):
             record = self.relay.falsified(peer.name, record, now)
         return super().send_record(peer, path, record, now)

@@ -1,0 +1,200 @@
+"""What one daemon knows of its fleet: the newest bulletin, its own certificate, and those of others. README.md.
+
+Pure: no I/O, no clock, no randomness. Whether a certificate may be accepted depends on nothing else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from enum import Enum
+from typing import NamedTuple
+
+from uavlinkd.core.certificates import (
+    Bulletin,
+    Certificate,
+    digest_of,
+    fleet_id_of,
+    is_certified,
+    is_published,
+    parse_bulletin,
+    parse_certificate,
+)
+from uavlinkd.core.crypto import AuthorityKey
+from uavlinkd.core.drops import Drop, DropReason
+
+
+class HeldCertificate(NamedTuple):
+    """A certificate that the authority signed, and its bytes."""
+
+    certificate: Certificate
+    data: bytes
+
+
+class Pinned(NamedTuple):
+    """What the configuration reserves: no certificate may have it."""
+
+    keys: Collection[bytes] = ()
+    names: Collection[str] = ()
+    system_ids: Mapping[int, str] = {}
+    """Each with the name of the pinned peer that has it."""
+    denied: Collection[str] = ()
+    """Names of members that this daemon refuses."""
+
+
+class BulletinVerdict(Enum):
+    """About a bulletin that arrived."""
+
+    NEWER = "newer"
+    """It is the own one now."""
+    KNOWN = "known"
+    """Equal or older."""
+    INVALID = "invalid"
+    """Another fleet's, malformed, or not signed."""
+    SHRINKS = "bulletin_shrinks"
+    CONFLICT = "bulletin_conflict"
+
+
+class Trust:
+    """The certificates and the bulletin of one daemon.
+
+    Args:
+        authority: the key that signs.
+        own_key: this daemon's static public key.
+        certificate: its certificate; empty for a daemon that has none.
+        bulletin: the newest one at hand.
+
+    Raises:
+        ValueError: the certificate or the bulletin is not valid. The message says which.
+    """
+
+    def __init__(self, authority: AuthorityKey, own_key: bytes, certificate: bytes, bulletin: bytes) -> None:
+        self._authority = authority
+        self.fleet = fleet_id_of(authority.public)
+        self._own_key = own_key
+        parsed = self._verified(bulletin)
+        if parsed is None:
+            raise ValueError("is not a bulletin of this fleet")
+        self.bulletin, self.bulletin_bytes = parsed, bulletin
+        self.own: HeldCertificate | None = None
+        """The own certificate."""
+        self.held: dict[bytes, HeldCertificate] = {}
+        """By static public key, without the own one."""
+        self.pinned = Pinned()
+        if certificate and not self.replace_own(certificate):
+            raise ValueError("is not a certificate of this fleet for the key of this daemon")
+
+    @property
+    def digest(self) -> bytes:
+        """Of the bulletin."""
+        return digest_of(self.bulletin_bytes)
+
+    def replace_own(self, data: bytes) -> bool:
+        """Use a newer certificate for the own key. Returns whether it is one."""
+        try:
+            certificate = parse_certificate(data)
+        except Drop:
+            return False
+        is_newer = self.own is None or certificate.serial > self.own.certificate.serial
+        if not is_newer or not self._is_signed(certificate, self._own_key, data):
+            return False
+        self.own = HeldCertificate(certificate, data)
+        return True
+
+    # Certificates of others.
+
+    def judge(self, key: bytes, data: bytes) -> Certificate:
+        """The certificate in these bytes, if it is valid for this static key now. Changes nothing.
+
+        Raises:
+            Drop: ``BAD_CERTIFICATE``, ``CERTIFICATE_REVOKED`` or ``MEMBER_CONFLICT``.
+        """
+        certificate = parse_certificate(data)
+        if key == self._own_key or not self._is_signed(certificate, key, data):
+            raise Drop(DropReason.BAD_CERTIFICATE)
+        label = f"{certificate.name}, serial {certificate.serial}"
+        if self.bulletin.refuses(certificate.serial) or certificate.name in self.pinned.denied:
+            raise Drop(DropReason.CERTIFICATE_REVOKED, label)
+        if (other := self._conflict(key, certificate)) is not None:
+            raise Drop(DropReason.MEMBER_CONFLICT, f"{label}, and {other}")
+        return certificate
+
+    def hold(self, key: bytes, data: bytes) -> list[bytes]:
+        """Hold the certificate of another member from now on, unless a newer one for its key is held.
+
+        Returns the keys whose peers end: one that the member had before, or its own if name, role or ids changed.
+
+        Raises:
+            Drop: as :meth:`judge`; then nothing was changed.
+        """
+        certificate = self.judge(key, data)
+        before = self.held.get(key)
+        if before is not None and certificate.serial <= before.certificate.serial:
+            return []
+        ended = [other for other, held in self.held.items() if other != key and _same(held.certificate, certificate)]
+        if before is not None and not _same(before.certificate, certificate):
+            ended.append(key)
+        for other in ended:
+            del self.held[other]
+        self.held[key] = HeldCertificate(certificate, data)
+        return ended
+
+    def _conflict(self, key: bytes, certificate: Certificate) -> str | None:
+        """Which other member has the name or a system id of this one; None if it is the same member."""
+        pinned, ids = self.pinned, range(certificate.system_ids[0], certificate.system_ids[1] + 1)
+        if certificate.name in pinned.names:
+            return f"the peer {certificate.name} of the configuration"
+        for system_id, name in pinned.system_ids.items():
+            if system_id in ids and certificate.system_ids[1]:
+                return f"{name}, which has system id {system_id} in the configuration"
+        if self.own is not None and _overlap(self.own.certificate, certificate):
+            return "this daemon's own certificate"
+        for other, held in self.held.items():
+            is_newer = held.certificate.serial < certificate.serial and _same(held.certificate, certificate)
+            if other != key and not is_newer and _overlap(held.certificate, certificate):
+                return f"{held.certificate.name}, serial {held.certificate.serial}"
+        return None
+
+    def _is_signed(self, certificate: Certificate, key: bytes, data: bytes) -> bool:
+        held = self.held.get(key)
+        is_held = held is not None and held.data == data
+        return is_held or (certificate.fleet == self.fleet and is_certified(data, key, self._authority))
+
+    # Bulletins.
+
+    def receive_bulletin(self, data: bytes) -> tuple[BulletinVerdict, list[bytes]]:
+        """Take a bulletin if it is newer. Returns the keys of certificates that it ends too: forget their peers."""
+        bulletin = parse_bulletin(data)
+        if bulletin is None or bulletin.fleet != self.fleet:
+            return BulletinVerdict.INVALID, []
+        if bulletin.number == self.bulletin.number and data != self.bulletin_bytes:
+            verdict = BulletinVerdict.CONFLICT if is_published(data, self._authority) else BulletinVerdict.INVALID
+            return verdict, []
+        if bulletin.number <= self.bulletin.number:
+            return BulletinVerdict.KNOWN, []
+        if not is_published(data, self._authority):
+            return BulletinVerdict.INVALID, []
+        if self.bulletin.shrinks(bulletin):
+            return BulletinVerdict.SHRINKS, []
+        self.bulletin, self.bulletin_bytes = bulletin, data
+        ended = [key for key, held in self.held.items() if bulletin.refuses(held.certificate.serial)]
+        for key in ended:
+            del self.held[key]
+        return BulletinVerdict.NEWER, ended
+
+    def _verified(self, data: bytes) -> Bulletin | None:
+        bulletin = parse_bulletin(data)
+        is_ours = bulletin is not None and bulletin.fleet == self.fleet and is_published(data, self._authority)
+        return bulletin if is_ours else None
+
+
+def _same(one: Certificate, other: Certificate) -> bool:
+    """Whether two certificates are of the same member."""
+    return one._replace(serial=0) == other._replace(serial=0)
+
+
+def _overlap(one: Certificate, other: Certificate) -> bool:
+    """Whether two certificates have a name or a system id in common."""
+    has_ids = one.system_ids[1] and other.system_ids[1]
+    return one.name == other.name or bool(
+        has_ids and one.system_ids[0] <= other.system_ids[1] and other.system_ids[0] <= one.system_ids[1]
+    )
