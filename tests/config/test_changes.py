@@ -53,13 +53,6 @@ _ROWS = [
         relays(relay(addresses='["other.example.org:5790"]') + relay("c")),
         {"relays_removed": ["b"], "relays_added": ["c"], "relays_changed": ["vps"], "peers_changed": ["drone1"]},
     ),
-    # A relay that accepts one more key is another one, and one that accepts one less is not.
-    (
-        relays(relay()),
-        relays(relay(more=f'previous_public_key = "{KEY["c"]}"')),
-        {"relays_removed": ["vps"], "relays_added": ["vps"]},
-    ),
-    (relays(relay(more=f'previous_public_key = "{KEY["c"]}"')), relays(relay()), {"relays_changed": ["vps"]}),
     # A relay of a peer follows it. Other features need no new link.
     (relays("", _AT), relays(_AS_PEER, _AT), {"relays_added": ["vps"], "peers_changed": ["drone1"]}),
     (relays(_AS_PEER, _AT), relays("", _AT), {"relays_removed": ["vps"], "peers_changed": ["drone1"]}),
@@ -90,7 +83,6 @@ def test_changes_are_found(tmp_path: Path, before: str, after: str, changes: dic
         (GOOD, GOOD + '[metrics]\nlisten = "127.0.0.1:9790"\n', "metrics"),
         (GOOD, GOOD + '[recording]\nfolder = "a"\n', "recording"),
         (GOOD, GOOD + member("c"), "member"),
-        (GOOD, f'previous_private_key_file = "other.key"\n{GOOD}', "previous_private_key_file"),
     ],
 )
 def test_other_changes_need_a_restart(tmp_path: Path, before: str, after: str, key: str) -> None:

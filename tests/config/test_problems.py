@@ -87,6 +87,7 @@ _AT_TOP_ROWS = [
     ('folder = "flights"', "folder", "in [recording]"),
     ("tag_bits = 96", "tag_bits", "in [link] or in a [[peer]]"),
     (f'private_key = "{KEY["b"]}"', "private_key", "this file never contains a key"),
+    ('previous_private_key_file = "a.key"', "previous_private_key_file", "`uavlinkd fleet rotate NAME` writes"),
 ]
 _URLS, _SECOND = "endpoint[1].url (gcs)", "endpoint[0] (autopilot)"
 _PREVIOUS, _PSK = f'previous_public_key = "{KEY["vps"]}"', 'psk_file = "pair.psk"'
@@ -188,15 +189,8 @@ _FILE_ROWS = [
     (relays(relay() + relay("b") + relay("c") + relay("d")), "relay", "at most 3"),
     (relays(relay() + relay("vps", key=KEY["b"], addresses='["b:1"]')), "relay[1].name (vps)", "of relay[0] (vps)"),
     (relays(relay() + relay("b", key=KEY["vps"])), "relay[1].public_key (b)", "each relay has its own"),
-    (relays(relay(), _PREVIOUS), "peer[0].previous_public_key (drone1)", "is the key of relay[0] (vps)"),
-    (relays(relay(more=_PREVIOUS)), "relay[0].previous_public_key (vps)", "is its current key"),
-    (
-        relays(relay("b", more=_PREVIOUS) + relay("c", more=_PREVIOUS)),
-        "relay[1].previous_public_key (c)",
-        "of relay[0]",
-    ),
+    (relays(relay(more=_PREVIOUS)), "relay[0].previous_public_key (vps)", "was removed: to change a key, write the"),
     (relays(_AS_PEER + _PSK + "\n"), "relay[0].psk_file (vps)", "because peer[0] (drone1) has the same"),
-    (relays(_AS_PEER + _PREVIOUS + "\n"), "relay[0].previous_public_key (vps)", "write it there only"),
     (relays(relay(key=KEY["drone1"], addresses="[]")), "relay[0].addresses (vps)", "a relay never initiates"),
     (relays(_AS_PEER, 'relays = ["vps"]'), "peer[0].relays (drone1)", "which has this peer's key"),
     (relays(relay(key=KEY["b"], more=member()), head=HEAD), "relay[0].public_key (vps)", "member[0] (b) too"),
@@ -218,11 +212,6 @@ _FILE_ROWS = [
     (HEAD + _MEMBERS + "role = 'observer'\n", "member[1].role (b)", "does not belong here"),
     (GOOD + OTHER_PEER + member("drone2", KEY["c"]), "member[0].name (drone2)", "which has another key"),
     (GOOD + member("drone1", more=_PSK), "member[0].psk_file (drone1)", "write it there only"),
-    (
-        GOOD + f'previous_public_key = "{KEY["b"]}"\n' + _MEMBERS,
-        "peer[0].previous_public_key (drone1)",
-        "is the key of member[1] (b)",
-    ),
 ]
 _ROWS = [
     *((GOOD + lines + "\n", f"peer[0].{key} (drone1)", says) for lines, key, says in _PEER_ROWS),
@@ -281,14 +270,11 @@ def test_second_spelling_of_a_point_is_refused(tmp_path: Path) -> None:
     ],
     ids=["peer", "relay", "member"],
 )
-@pytest.mark.parametrize("which", ["own", "previous"])
-def test_own_keys_belong_to_no_other(tmp_path: Path, section: str, place: str, which: str) -> None:
-    """Neither this daemon's public key nor its previous one: a copied line would stop the daemon at its start."""
+def test_own_key_belongs_to_no_other(tmp_path: Path, section: str, place: str) -> None:
+    """A copied line would stop the daemon at its start."""
     load(tmp_path, GOOD)
-    keys.write_secret_file(tmp_path / "old.key", keys.generate_private_key())
-    private = (tmp_path / ("drone0.key" if which == "own" else "old.key")).read_text()
-    text = f'{HEAD}previous_private_key_file = "old.key"\n{ENDPOINT}{section}'
-    problems = refused(tmp_path, text.replace("OWN", keys.public_key_text(private)))
+    public = keys.public_key_text((tmp_path / "drone0.key").read_text())
+    problems = refused(tmp_path, f"{HEAD}{ENDPOINT}{section}".replace("OWN", public))
     assert "this daemon's own" in problems[place]
 
 

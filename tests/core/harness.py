@@ -280,10 +280,10 @@ def made_initiation(
 
 def with_cookie(side: Side, initiation: bytes, place: Path, now: float) -> bytes:
     """An initiation to a side, with the cookie that it gives to its sender at a place."""
-    own, sender_index = side.node._handshakes.own, wire.parse_initiation(initiation).sender_index
-    reply = wire.parse_cookie_reply(own.cookies.reply(initiation, sender_index, place, now))
-    cookie = own.mac_keys.open_cookie(reply, mac1_of(initiation))
-    return with_macs(initiation[: -wire.MACS_BYTES], own.identity.public, cookie)
+    cookies, sender_index = side.node._handshakes.cookies, wire.parse_initiation(initiation).sender_index
+    reply = wire.parse_cookie_reply(cookies.reply(initiation, sender_index, place, now))
+    cookie = cookies.keys.open_cookie(reply, mac1_of(initiation))
+    return with_macs(initiation[: -wire.MACS_BYTES], side.node.public_key, cookie)
 
 
 def exhaust(side: Side, now: float) -> None:

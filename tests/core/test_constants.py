@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from uavlinkd.core import constants as c
 from uavlinkd.core import wire
-from uavlinkd.core.settings import Link, PeerSettings, link_name, previous_of
 
 
 def test_numbers_fit_together() -> None:
@@ -19,13 +18,3 @@ def test_numbers_fit_together() -> None:
     assert c.MIN_ENVELOPE_LIMIT - wire.LONG_HEADER_BYTES - max(wire.TAG_LENGTHS) >= 280, "the longest frame fits"
     assert c.MIN_ENVELOPE_LIMIT <= c.DEFAULT_ENVELOPE_LIMIT <= c.MAX_ENVELOPE_LIMIT <= 65507
     assert c.COOKIE_HELD_S <= c.COOKIE_SECRET_LIFETIME_S
-
-
-def test_a_peer_by_its_previous_key_differs_in_name_and_key() -> None:
-    """It is another peer of the node, with the same link."""
-    settings = PeerSettings("alpha", bytes(32), None, Link(tag_bytes=12), initiates=False)
-    before = previous_of(settings, bytes([1]) * 32)
-    assert before.name not in ("", settings.name)
-    assert link_name(before.name) == settings.name
-    assert before.public_key == bytes([1]) * 32
-    assert (before.link, before.initiates) == (settings.link, False)

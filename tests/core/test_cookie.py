@@ -12,7 +12,6 @@ from tests.core.harness import (
     Pair,
     flipped,
     initiation_of,
-    of,
     reasons,
     seeded,
     state_of,
@@ -20,9 +19,7 @@ from tests.core.harness import (
 from uavlinkd.core import constants as c
 from uavlinkd.core import wire
 from uavlinkd.core.cookie import OTHERS, CookieJar, MacKeys, mac1_of, version_of
-from uavlinkd.core.crypto import KeyPair, Secret
 from uavlinkd.core.drops import Drop, DropReason
-from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Dropped
 from uavlinkd.core.path import SERIAL_HOST, Path
 
@@ -144,19 +141,7 @@ def test_other_version_is_named_and_not_answered(version: int, length: int) -> N
 def test_other_messages_are_of_no_version(message: bytes) -> None:
     """A drop names a version only of an initiation whose mac1 fits. No daemon answers another version."""
     assert reasons(Pair().b.receive(message, 1.0)) != [DropReason.OTHER_VERSION]
-    assert message[0] != 1 or version_of(message, [KEY_B.public]) is None
-
-
-def test_initiation_for_the_previous_key_is_named_too() -> None:
-    """While keys change, a peer may know either key; afterwards only the new one."""
-    new, old = (bytes([number]) * 32 for number in (11, 12))
-    node = Node(Secret(new), seeded(1), 0.0, Secret(old))
-    for key in (new, old):
-        (dropped,) = of(node.receive(initiation_of(1, KeyPair(key).public), AT_A, 1.0), Dropped)
-        assert (dropped.reason, dropped.detail) == (DropReason.OTHER_VERSION, 1)
-    node.forget_previous_key()
-    (dropped,) = of(node.receive(initiation_of(1, KeyPair(old).public), AT_A, 1.0), Dropped)
-    assert dropped.reason is not DropReason.OTHER_VERSION
+    assert message[0] != 1 or version_of(message, KEY_B.public) is None
 
 
 def test_flood_leaves_known_addresses_their_comparisons() -> None:

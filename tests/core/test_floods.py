@@ -115,7 +115,7 @@ def test_all_sources_together_have_a_bound(monkeypatch: pytest.MonkeyPatch, know
     """
     pair = established(PLAIN) if known_by == "its path" else Pair(link_a=PLAIN, link_b=PLAIN)
     node = pair.b.node
-    monkeypatch.setattr(node._handshakes.own.cookies, "has_valid_mac2", lambda *_: True)
+    monkeypatch.setattr(node._handshakes.cookies, "has_valid_mac2", lambda *_: True)
     spend(node._handshakes.admission._initiations, 1.0)
     fates = [
         reasons(node.receive(made_initiation(KEY_C), Path(0, (f"10.0.{number // 200}.{number % 200}", 1)), 1.0))
@@ -246,7 +246,7 @@ def test_newer_initiation_supersedes_one_for_the_same_key_along_the_same_path_on
     pair = Pair()
     node, initiation = pair.b.node, pair.initiation(0.0)
     index = wire.parse_initiation(initiation).sender_index
-    pair.a.receive(node._handshakes.own.cookies.reply(initiation, index, AT_A, 0.0), 0.0)
+    pair.a.receive(node._handshakes.cookies.reply(initiation, index, AT_A, 0.0), 0.0)
     proven = pair.initiation(pair.a.node.next_deadline())
     first, newer, with_cookie = (node.handshake_source(one, AT_A, 0.0) for one in (flooding(1), flooding(2), proven))
     assert first == newer != with_cookie

@@ -148,7 +148,7 @@ def test_third_try_at_new_keys_goes_along_every_path() -> None:
 def test_cookie_belongs_to_its_path_and_one_is_accepted_for_each_message() -> None:
     """The next initiation carries along each path the cookie that came there. Observers have to be faster."""
     radios = Radios()
-    message, jar = initiation(radios), radios.b.node._handshakes.own.cookies
+    message, jar = initiation(radios), radios.b.node._handshakes.cookies
     index = wire.parse_initiation(message[0]).sender_index
     for radio in (0, 1):
         reply = jar.reply(message[radio], index, at_a(radio), 0.0)

@@ -133,7 +133,7 @@ def test_cookie_is_used_until_it_is_too_old() -> None:
     pair = Pair()
     initiation = pair.initiation(0.0)
     index = wire.parse_initiation(initiation).sender_index
-    assert pair.a.receive(pair.b.node._handshakes.own.cookies.reply(initiation, index, pair.a.at, 0.0), 0.0) == []
+    assert pair.a.receive(pair.b.node._handshakes.cookies.reply(initiation, index, pair.a.at, 0.0), 0.0) == []
     assert pair.a.peer.traffic.cookies_taken == 1
     initiator = pair.a.peer.initiator
     assert initiator.add_macs(b"message", AT_B, c.COOKIE_HELD_S - 0.001)[-16:] != bytes(16)
@@ -144,7 +144,7 @@ def test_few_cookies_are_held() -> None:
     """Of a name with many addresses, each of which sends a cookie, only the newest few are held."""
     pair = Pair()
     many = [Path(number, (f"198.51.100.{number}", 5790)) for number in range(c.CONFIGURED_PATHS)]
-    jar = pair.b.node._handshakes.own.cookies
+    jar = pair.b.node._handshakes.cookies
     sent: dict[Path, Transmit] = {}
     for number in range(c.CONFIGURED_PATHS + 1):  # the peer moves: its first address has another port now
         paths = [Path(0, ("198.51.100.0", 5791)), *many[1:]] if number == c.CONFIGURED_PATHS else many
@@ -164,7 +164,7 @@ def test_cookies_do_not_shorten_the_first_wait() -> None:
     now = initiations(pair, 40)[-1][0]
     assert pair.a.peer.initiator.retry_at >= now + c.RETRY_MAX_S
     index, pending = list(pair.a.peer.initiator.pending.items())[-1]
-    keys = pair.b.node._handshakes.own.mac_keys
+    keys = pair.b.node._handshakes.cookies.keys
     for number in range(20):
         nonce = bytes((number,)) * 16
         forged = wire.encode_cookie_reply(index, nonce, keys.seal_cookie(bytes(16), nonce, pending.mac1))

@@ -117,7 +117,7 @@ def duplicate(pair: Pair, now: float) -> list[Output]:
 
 def wrong_network(pair: Pair, now: float) -> list[Output]:
     """An envelope of this peer arrives along a line with another peer at its end."""
-    pair.b.node.facts.set_point_to_point({1: []})
+    pair.b.node.facts.set_point_to_point({1: None})
     return pair.b.receive(pair.a.envelope(now), now, Path(1, ("serial", 0)))
 
 

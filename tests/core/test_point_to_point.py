@@ -33,7 +33,7 @@ def with_charlie_on_the_line(pair: Pair) -> Pair:
     node = pair.b.node
     charlie = node.add_peer(PeerSettings("charlie", KEY_C.public), 0.0)
     node.set_paths(charlie, [LINE], 0.0)
-    node.facts.set_point_to_point({LINE.socket: [charlie]})
+    node.facts.set_point_to_point({LINE.socket: charlie})
     return pair
 
 
@@ -43,14 +43,12 @@ def is_refused(outputs: list[Output]) -> bool:
 
 
 def test_a_session_along_a_line() -> None:
-    """Handshake, frames and probes take the path like any other. It leads to every key of the peer."""
+    """Handshake, frames and probes take the path like any other."""
     pair = Pair()
     pair.a.peer_at = pair.b.peer_at = LINE
     for side in (pair.a, pair.b):
         side.node.set_paths(side.peer, [LINE], 0.0)
-    other = pair.b.node.add_peer(PeerSettings("alpha (previous key)", KEY_C.public), 0.0)
-    pair.a.node.facts.set_point_to_point({LINE.socket: [pair.a.peer]})
-    pair.b.node.facts.set_point_to_point({LINE.socket: [other, pair.b.peer]})
+        side.node.facts.set_point_to_point({LINE.socket: side.peer})
     pair.complete(pair.initiation(0.0), 0.0)
     assert payloads(exchange(pair.b, pair.a, pair.a.send(0.1), 0.1)) == [FRAME]
     assert payloads(exchange(pair.a, pair.b, pair.b.send(0.1), 0.1)) == [FRAME]
@@ -73,7 +71,7 @@ def test_a_response_of_another_peer_is_not_read() -> None:
     """The genuine one, along the network of its sender, still makes the session."""
     pair = Pair()
     response = only(datagrams(pair.b.receive(pair.initiation(0.0), 0.0), wire.RESPONSE))
-    pair.a.node.facts.set_point_to_point({LINE.socket: []})
+    pair.a.node.facts.set_point_to_point({LINE.socket: None})
     assert is_refused(pair.a.receive(response, 0.1, LINE))
     assert pair.a.receive(response, 0.1)
     assert pair.a.peer.sessions.current is not None
@@ -106,5 +104,5 @@ def test_each_line_is_a_place_of_its_own(order: tuple[int, int]) -> None:
     both = ((node.peers["alpha"], LINE), (charlie, OTHER_LINE))
     for number in order:
         node.set_paths(both[number][0], [both[number][1]], 0.0)
-    node.facts.set_point_to_point({path.socket: [peer] for peer, path in both})
+    node.facts.set_point_to_point({path.socket: peer for peer, path in both})
     assert [hinted(node, path) for _, path in both] == [True, True]

@@ -71,7 +71,7 @@ def test_no_object_shows_a_secret(suite: Suite) -> None:
     for number, side in enumerate((pair.a, pair.b)):
         entropy = recording(50 + number, drawn)
         side.node._entropy = side.peer.entropy = side.peer.initiator._entropy = entropy
-        side.node._indices._entropy = side.node._handshakes.own.cookies._entropy = entropy
+        side.node._indices._entropy = side.node._handshakes.cookies._entropy = entropy
     printed, kinds, chaining_keys = list[str](), set[str](), list[bytes]()
 
     def look(*more: object) -> None:

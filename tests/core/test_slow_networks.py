@@ -149,7 +149,7 @@ def test_peers_share_a_budget_but_not_that_of_a_point_to_point_network() -> None
     assert three == pytest.approx(alone._replace(interval_s=3 * alone.interval_s))
     assert facts().pace(Path(LTE, PLACE.address)) is FREE
     crowded = facts(peers=6)
-    crowded.set_point_to_point({SIK: ["ground-station"]})
+    crowded.set_point_to_point({SIK: "ground-station"})
     assert crowded.pace(LINE) == facts().pace(LINE)
     assert crowded.least_probe_s(LINE) == facts().least_probe_s(LINE)
 

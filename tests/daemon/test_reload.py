@@ -18,7 +18,6 @@ from tests.daemon.process import DaemonProcess
 from tests.daemon.toml import to_toml
 from tests.daemon.udp import Client, Sockaddr, assert_same
 from tests.waiting import PATIENCE_S, until
-from uavlinkd.config import keys
 from uavlinkd.core.constants import REKEY_AFTER_S
 from uavlinkd.link.daemon import Daemon
 from uavlinkd.ops.control import ask
@@ -280,19 +279,3 @@ async def test_the_end_does_not_wait_for_a_name_server_or_a_device(stage: Stage,
     await b.start()
     await a.until(lambda status: status["peers"][b.name]["state"] == "up" and Path(f"{hook}.asked").exists())
     assert await a.stop() == 0  # within the harness's patience: the name server and the device take ten minutes
-
-
-async def test_a_key_that_was_ours_may_become_a_peers(stage: Stage) -> None:
-    """The old identity moved to another machine: taken out here and put in as a peer, in one reload."""
-    a, b = stage.pair()
-    previous = keys.generate_private_key()
-    keys.write_secret_file(a.folder / "previous.key", previous)
-    a.config["previous_private_key_file"] = "previous.key"
-    into_a = a.add_endpoint("one")
-    await stage.start(a, b)
-    del a.config["previous_private_key_file"]
-    heir = {"name": "heir", "public_key": keys.public_key_text(previous), "role": "vehicle", "system_ids": [9]}
-    a.config["peer"].append(heir)
-    assert await reload(a) == []
-    assert set((await a.status())["peers"]) == {b.name, "heir"}
-    await client_at(stage, a, "one", into_a)

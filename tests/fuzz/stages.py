@@ -14,10 +14,8 @@ from tests.core.harness import (
     AT_A,
     AT_B,
     ELSEWHERE,
-    KEY_B,
     KEY_C,
     PLAIN,
-    PRIVATE_B,
     UNUSED_INDEX,
     Pair,
     Side,
@@ -28,7 +26,6 @@ from tests.core.harness import (
 from uavlinkd.core import wire
 from uavlinkd.core.cookie import MacKeys, mac1_of
 from uavlinkd.core.crypto import AeadKey, KeyPair, MacKey, Secret
-from uavlinkd.core.node import Node
 from uavlinkd.core.path import Path
 from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.core.suites import SUITES_BY_NAME, Suite
@@ -95,12 +92,9 @@ class Stage:
     sources: tuple[Path, ...] = (ELSEWHERE, AT_A, AT_B, Path(1, ("2001:db8::7", 9, 0, 0)))
     cookies: tuple[bytes, ...] = ()
     """Matching cookie replies: an attacker that sees the datagrams and knows both public keys can make them."""
-    public_keys: tuple[bytes, ...] = ()
-    """The victim's public keys, which make ``mac1`` valid."""
 
     def __post_init__(self) -> None:
         """An envelope of no session arrives from the peer's address: the victim initiates, then waits a second."""
-        self.public_keys = self.public_keys or (self.victim.node.public_key,)
         self.victim.receive(wire.envelope_header(UNUSED_INDEX, 0) + bytes(36), self.now)
 
     @property
@@ -127,7 +121,7 @@ def _make_small(pair: Pair, seed: int) -> None:
         entropy = SeededEntropy(seed + number)
         node = side.node
         # The generator of the harness would make copies slow.
-        node._entropy = node._handshakes.own.cookies._entropy = node._indices._entropy = entropy
+        node._entropy = node._handshakes.cookies._entropy = node._indices._entropy = entropy
         for peer in node.peers.values():
             peer.entropy = peer.initiator._entropy = entropy
 
@@ -142,19 +136,6 @@ def idle(link: Link, psk: Secret | None = None) -> Stage:
     pair = pair_of(link, psk=psk)
     initiation = pair.initiation(NOW)
     return Stage(pair, False, initiation, (initiation,))
-
-
-def idle_in_key_change(link: Link) -> Stage:
-    """Bravo has a new key, and accepts its previous one as well; alpha, which initiates, knows the previous one."""
-    pair = pair_of(link)
-    alpha = pair.b.peer.settings
-    node = pair.b.node = Node(Secret(bytes([7]) * 32), SeededEntropy(2), NOW, Secret(PRIVATE_B))
-    node.add_peer(alpha, NOW, by_previous_key=True)
-    node.add_peer(replace(alpha, name="alpha by the new key"), NOW)
-    _make_small(pair, 1)
-    initiation = pair.initiation(NOW)
-    keys = node.public_key, KEY_B.public
-    return Stage(pair, False, initiation, (initiation,), public_keys=keys)
 
 
 def initiator(link: Link, psk: Secret | None = None) -> Stage:

@@ -123,8 +123,6 @@ async def test_state_of_an_older_envelope_is_dropped_and_counted(wake_ups: tuple
     assert scene.delivered == raws([COMMANDS[0], NEW, COMMANDS[1], COMMANDS[0]])
     assert scene.dropped == [("superseded", "alpha", 1)]
     assert (scene.link.frames_superseded, scene.link.counters.frames) == (1, 5)
-    other = Pair().b.peer  # of another pair of keys: its orders cannot be compared
-    assert scene.link.pick_newest(other, [OLD], 1, monotonic()) == [OLD]
 
 
 @pytest.mark.parametrize("count", [1, 2], ids=["alone", "together"])
@@ -199,17 +197,6 @@ async def test_initiation_of_a_sender_that_has_a_session_now_is_not_answered(mon
         await asyncio.sleep(0)
     assert [datagram for datagram, _ in scene.received] == HANDSHAKES[:4]
     assert len(scene.refused) == 1
-
-
-async def test_timer_follows_what_a_confirmed_key_makes_due(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The relays have other keys to bind then, at once."""
-    scene, due_at = Scene(), monotonic() + 60
-    monkeypatch.setattr(scene.carrier.peers, "confirm_keys", lambda _: setattr(scene.relays, "next_at", due_at))
-    scene.link.peers = [scene.peer]
-    scene.carrier.perform([SessionEstablished(scene.peer, AT_A, 1, "x25519", False, 16, initiator=True, rekey=False)])
-    assert scene.carrier._timer_at == due_at
-    assert scene.carrier._timer is not None
-    scene.carrier._timer.cancel()
 
 
 # Datagrams that wait: senders take turns, and what one may have waiting is bounded.

@@ -52,8 +52,8 @@ class Scene:
         """Another peer, at these addresses."""
         written = tuple(PeerAddress(Address(*address)) for address in addresses)
         config = PeerConfig(PeerSettings(name, key, None, PLAIN), written, TRUSTED)
-        link = self.links[name] = PeerLink(config, Carriage(self.node, lambda _: None), 0.0)
-        link.peers.append(self.node.add_peer(config.settings, 0.0))
+        peer = self.node.add_peer(config.settings, 0.0)
+        link = self.links[name] = PeerLink(config, peer, Carriage(self.node, lambda _: None), 0.0)
         link.set_paths([Path(0, address) for address in addresses], 0.0)
         return link
 

@@ -57,9 +57,7 @@ def recorded_initiation(entropy: random.Random) -> bytes:
 
 def link_of(side: Side, config: Peer, perform: Callable[[list[Output]], None]) -> PeerLink:
     """The link to the peer that this side's node has already."""
-    link = PeerLink(config, Carriage(side.node, perform), 0.0)
-    link.peers.append(side.peer)
-    return link
+    return PeerLink(config, side.peer, Carriage(side.node, perform), 0.0)
 
 
 def heartbeat() -> list[Frame]:
@@ -162,9 +160,9 @@ def test_only_links_with_waiting_frames_are_scheduled() -> None:
     config = Peer(
         PeerSettings("alpha", KEY_A.public, None, link), (), TRUSTED, egress=EgressSettings(coalesce_s=0.01)
     )
-    links = [PeerLink(config, Carriage(pair.b.node, lambda _: None, waiting=schedule), 0.0) for _ in range(2)]
+    carriage = Carriage(pair.b.node, lambda _: None, waiting=schedule)
+    links = [PeerLink(config, pair.b.peer, carriage, 0.0) for _ in range(2)]
     for member in links:
-        member.peers.append(pair.b.peer)
         member.follow_paths(0.0)
     assert schedule.next_at == NEVER
 

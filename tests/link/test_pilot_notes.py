@@ -25,8 +25,7 @@ class Cockpit:
         policy = {"role": "swarm-member", "system_ids": "all"} | policy
         self.pair = Pair().establish()
         config = PeerConfig(PeerSettings(name, KEY_B.public, None, quiet()), (), policy)
-        self.link = PeerLink(config, Carriage(self.pair.a.node, lambda _: None), 0.0)
-        self.link.peers.append(self.pair.a.peer)
+        self.link = PeerLink(config, self.pair.a.peer, Carriage(self.pair.a.node, lambda _: None), 0.0)
         self.addresses: list[SystemComponent] = [(1, 1)]
         self.notes = PilotNotes(lambda _: self.addresses)
         self.next(0.0)

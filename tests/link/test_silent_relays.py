@@ -181,7 +181,7 @@ def test_known_reasons_do_not_look_like_a_firewall(member: Member) -> None:
     """A refused handshake, and an error of this machine."""
     relay = member.add_relay("one", FIRST)
     other = member.add_relay("two", SECOND)
-    refused = Dropped(DropReason.BAD_HANDSHAKE, relay.peers[0], Path(0, FIRST), 1, "")
+    refused = Dropped(DropReason.BAD_HANDSHAKE, relay.peer, Path(0, FIRST), 1, "")
     member.evidence.add_dropped(refused, 1.0)
     member.evidence.add_error("EPERM", SECOND, 1.0)
     assert set(member.findings(LATER)) == {"wrong_psk", "firewall_here"}

@@ -9,7 +9,6 @@ from itertools import pairwise
 import pytest
 
 from tests.link.two_radios import End, Network, Radio
-from tests.mavlink.egress.links import CLASS_OF
 from tests.samples import attitude, blank, command, heartbeat, manual_control, read_by_name, value
 from uavlinkd.core.path_state import PathCondition, PathState
 from uavlinkd.link.copies import BEGIN_LOSS
@@ -141,12 +140,13 @@ def test_peer_that_stops_waiting_lets_others_use_the_network(is_removed: bool) -
     """Its frames waited in line for the modem. The other peer's frames are next, not behind it indefinitely."""
     pair = network(TELEMETRY_MODEM)
     budget = pair.alpha.budgets[0]
-    other = PeerOutput(EgressSettings(), pair.alpha.node, pair.alpha.budgets, CLASS_OF, lambda *_: None, pair.now)
-    other.follow(pair.alpha.peer, pair.now)
+    alpha = pair.alpha
+    other = PeerOutput(EgressSettings(), alpha.peer, alpha.node, alpha.budgets, lambda *_: None, pair.now)
+    other.follow(pair.now)
     budget.all.spend(1.1 * RADIO_BITS_S / 8, pair.now)
     pair.alpha.send(attitude(1))
-    other.send(pair.alpha.peer, [attitude(2)], pair.now, 0.0)
-    other.send_waiting(pair.alpha.peer, [], pair.now)
+    other.send([attitude(2)], pair.now, 0.0)
+    other.send_waiting(pair.now)
     assert other.egress is not None
     assert other.egress.queued_frames == 1
     if is_removed:

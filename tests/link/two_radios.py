@@ -60,11 +60,9 @@ class End:
             if radio.budget_bits_s
         }
         self.node.facts.set_budgets({number: budget.bits_s for number, budget in self.budgets.items()})
-        self.link = PeerLink(
-            config, Carriage(self.node, self.perform, budgets=self.budgets, waiting=self.schedule), 0.0
-        )
+        carriage = Carriage(self.node, self.perform, budgets=self.budgets, waiting=self.schedule)
+        self.link = PeerLink(config, self.node.add_peer(settings, 0.0), carriage, 0.0)
         self._housekeeping_at = 1.0
-        self.link.peers.append(self.node.add_peer(settings, 0.0))
         self.delivered: list[Frame] = []
         self.delivered_at: list[float] = []
         self.sent: list[Sent] = []
@@ -89,7 +87,7 @@ class End:
             elif isinstance(output, Deliver):
                 frames = split_payload(output.payload, self.link.counters)
                 if output.order:
-                    frames = self.link.pick_newest(output.peer, frames, output.order, now)
+                    frames = self.link.pick_newest(frames, output.order, now)
                 elif self.link.output.repair.is_on:
                     self.link.note_requests(frames, now)
                 self.delivered += frames

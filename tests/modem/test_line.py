@@ -129,7 +129,7 @@ class LineNetwork(Network):
         super().__init__([Radio(0.0, budget_bits_s=budget_bits_s)], link, {"alpha": egress, "bravo": egress}, seed)
         self._end_of = {self.alpha: ModemEnd.LEFT, self.bravo: ModemEnd.RIGHT}
         for end in (self.alpha, self.bravo):
-            end.node.facts.set_point_to_point({LINE.socket: [end.peer]})
+            end.node.facts.set_point_to_point({LINE.socket: end.peer})
             end.node.facts.envelope_limits = {LINE.socket: limit}
             end.budgets[LINE.socket].all.set_least_burst(limit + LINE_BYTES)
             end.link.set_paths([LINE], 0.0)

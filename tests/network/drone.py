@@ -120,9 +120,7 @@ class Drone:
         peers = self.node.peers
         self.node.facts.set_budgets(dict.fromkeys(self.lines, BUDGET_BITS_S))
         self.node.facts.envelope_limits = dict.fromkeys(self.lines, limit_at(BUDGET_BITS_S))
-        self.node.facts.set_point_to_point(
-            {socket: [peers[name]] if name in peers else [] for socket, name in self.lines.items()}
-        )
+        self.node.facts.set_point_to_point({socket: peers.get(name) for socket, name in self.lines.items()})
 
     # Its datagrams. Relays and members of relays do more.
 

@@ -170,8 +170,7 @@ class _Link(PeerLink):
     def __init__(self, config: PeerConfig, node_of: Member, peer: Peer) -> None:  # without what a daemon does more
         assert node_of.node is not None
         self.config, self.name = config, config.name
-        self._node, self.peers = node_of.node, [peer]
-        self.previous = {}
+        self._node, self.peer = node_of.node, peer
         self._direct = self.relayed = ()
 
 

@@ -96,7 +96,7 @@ def _returns_zero(*_: Any) -> int:
 
 
 def _leads_nowhere(facts: SocketFacts, _peer: Any, path: Path) -> None:
-    if path.socket in facts.peers_at:
+    if path.socket in facts.peer_at:
         raise Drop(DropReason.WRONG_NETWORK)
 
 

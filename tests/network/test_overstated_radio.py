@@ -70,7 +70,7 @@ class OverstatedRadio(Network):
             )
             end.budgets.update(serial.budgets(0.0))
             end.node.facts.envelope_limits = {0: network.envelope_limit}
-            end.node.facts.set_point_to_point({0: [end.peer]})
+            end.node.facts.set_point_to_point({0: end.peer})
             end.link.set_paths([network.path], 0.0)
             self.at(self.random(), partial(self._keep_house, end))
 

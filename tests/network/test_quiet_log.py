@@ -52,11 +52,10 @@ class LoggedDaemon:
             wrapper_class=structlog.make_filtering_bound_logger(logging.DEBUG),
         )
         self.drops, self.events = DropSummary(log, limits), EventLog(log, limits)
-        self.links = []
-        for peer in drone.node.peers.values():
-            link = PeerLink(PeerConfig(peer.settings, (), TRUSTED), Carriage(drone.node, lambda _: None), now)
-            link.peers.append(peer)
-            self.links.append(link)
+        carriage = Carriage(drone.node, lambda _: None)
+        self.links = [
+            PeerLink(PeerConfig(one.settings, (), TRUSTED), one, carriage, now) for one in drone.node.peers.values()
+        ]
 
     @property
     def lines(self) -> list[MutableMapping[str, Any]]:

@@ -53,7 +53,7 @@ class SlowRadio(Network):
             budget.all = Bucket(budget.bits_s, 0.0, limit + LINE_BYTES)
             budget.copies = Bucket(COPIES_SHARE * budget.bits_s, 0.0, limit + LINE_BYTES)
             end.node.facts.envelope_limits = {self.slow: limit}
-            end.node.facts.set_point_to_point({self.slow: [end.peer]})
+            end.node.facts.set_point_to_point({self.slow: end.peer})
             end.link.set_paths(paths, 0.0)
 
     @property

@@ -61,7 +61,7 @@ def test_keys_in_any_form_are_replaced(text: str, redacted: str) -> None:
     [
         "2026-11-22T22:27:00.123456Z",
         'private_key_file = "drone0.key"',
-        '"accepts_previous_key": false',
+        '"own_key_elsewhere": false',
         "127.0.0.1:14550 0.0.0.0:5790 [::]:5790 [::1]:5790",
         "10.13.0.1:5790 and fe80::1%wlan0",
         "Python 3.11.7, uavlinkd 0.1.0",

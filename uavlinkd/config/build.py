@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -35,7 +35,7 @@ from uavlinkd.config.schema import (
 from uavlinkd.core import constants as c
 from uavlinkd.core import wire
 from uavlinkd.core.path import RELAY_HOST
-from uavlinkd.core.settings import Link, PeerSettings, Redundancy, Timers, previous_of
+from uavlinkd.core.settings import Link, PeerSettings, Redundancy, Timers
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.relay.forwarding import MemberSettings, RelayLimits
 from uavlinkd.system.addresses import IPV6_UDP_BYTES
@@ -54,7 +54,7 @@ _HIDDEN = "…"
 
 def build(path: Path, file: Sections) -> Config:
     """The configuration in a file without problems, without its warnings."""
-    private, public = file.secret(file.top, "private_key_file"), file.own_key()
+    private, public = file.secret(file.top, "private_key_file"), file.own_key
     assert private is not None  # their absence is a problem
     assert public is not None
     top = file.top
@@ -72,7 +72,6 @@ def build(path: Path, file: Sections) -> Config:
         metrics=file.metrics.get("listen"),
         recording=_recording(file),
         log=Log(**file.log.valid),
-        previous_private_key=file.secret(top, "previous_private_key_file"),
         networks=tuple(network_of(network) for network in file.networks),
         relay_server=_relay_server(file),
         relays=tuple(_relay(file, relay) for relay in file.relays),
@@ -98,7 +97,6 @@ def _peer(file: Sections, peer: Values) -> PeerConfig:
     return PeerConfig(
         settings=PeerSettings(peer.valid["name"], peer.valid["public_key"], psk, link),
         addresses=_addresses(peer, file.relays),
-        previous_public_key=peer.get("previous_public_key"),
         relays=used,
         policy=policy_data(peer),
         egress=EgressSettings(keys.budget_bits_s, keys.coalesce_s, keys.max_age_s),
@@ -202,7 +200,6 @@ def _relay(file: Sections, section: Values) -> RelayConfig:
             link=Link(suites, timers=TIMERS, features=c.KNOWN_FEATURES),
         ),
         addresses=tuple(dict.fromkeys((*([] if peer is None else over_ip(peer)), *over_ip(section)))),
-        previous_public_key=section.get("previous_public_key"),
         peer=None if peer is None else peer.valid["name"],
     )
 
@@ -213,15 +210,11 @@ def _relay_server(file: Sections) -> RelayServer | None:
         return None
     keys = RelayServerSection.model_construct(**file.relay_server.valid)
     link = replace(link_of(LinkSection.model_construct(**file.link.valid)), features=c.FEATURE_RECORDS)
-    every = tuple(settings for section in file.members for settings in _member(file, section, link))
+    every = tuple(_member(file, section, link) for section in file.members)
     return RelayServer(every, RelayLimits(keys.datagrams_s, keys.bits_s))
 
 
-def _member(file: Sections, section: Values, link: Link) -> Iterator[MemberSettings]:
-    """One, or two while its key changes: others ask for it by the key that they know."""
+def _member(file: Sections, section: Values, link: Link) -> MemberSettings:
     keys = MemberSection.model_construct(**section.valid)
     peer = PeerSettings(keys.name, keys.public_key, file.secret(section, "psk_file"), link, initiates=False)
-    limits = RelayLimits(keys.datagrams_s, keys.bits_s)
-    yield MemberSettings(peer, keys.max_peers, limits)
-    if keys.previous_public_key is not None:
-        yield MemberSettings(previous_of(peer, keys.previous_public_key), keys.max_peers, limits)
+    return MemberSettings(peer, keys.max_peers, RelayLimits(keys.datagrams_s, keys.bits_s))

@@ -64,11 +64,9 @@ def compare(old: Config, new: Config) -> ConfigChanges:
     fixed = [key for field, key in _FIXED.items() if getattr(old, field) != getattr(new, field)]
     if (old.relay_server is None) != (new.relay_server is None):
         fixed.append("member")
-    if new.previous_private_key not in (None, old.previous_private_key):
-        fixed.append("previous_private_key_file")
     if fixed:
         raise ConfigError(tuple(Problem(str(new.path), key, _NEEDS_RESTART) for key in fixed))
-    peers = _compare(old.peers, new.peers, _is_accepted_already)
+    peers = _compare(old.peers, new.peers, _is_same_peer)
     new_peers = {peer.name for peer in peers[1]}
     return ConfigChanges(
         *peers,
@@ -95,13 +93,10 @@ def _members(config: Config) -> tuple[MemberSettings, ...]:
     return () if config.relay_server is None else config.relay_server.members
 
 
-def _is_accepted_already(before: PeerConfig, peer: PeerConfig) -> bool:
-    """Whether a link made for ``before`` accepts this peer with every key that it may have now."""
+def _is_same_peer(before: PeerConfig, peer: PeerConfig) -> bool:
     link = replace(peer.settings.link, features=before.settings.link.features)  # new keys are enough for others
-    is_same = replace(peer.settings, link=link) == before.settings
-    return is_same and peer.previous_public_key in (None, before.previous_public_key)
+    return replace(peer.settings, link=link) == before.settings
 
 
 def _is_same_relay(before: RelayConfig, relay: RelayConfig) -> bool:
-    is_same = (relay.settings, relay.peer) == (before.settings, before.peer)
-    return is_same and relay.previous_public_key in (None, before.previous_public_key)
+    return (relay.settings, relay.peer) == (before.settings, before.peer)

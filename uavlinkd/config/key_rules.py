@@ -32,20 +32,14 @@ _EXPOSED = "it is exposed: make a new one there with `uavlinkd keygen`, and writ
 
 def check(file: Sections) -> Found:
     """Yield a problem for each key that is in the wrong place, or belongs to two daemons."""
-    previous = file.own_key("previous_private_key_file")
-    if previous is not None and previous == file.own_key():
-        yield "previous_private_key_file", "holds the key of private_key_file: leave it out"
     for what, sections in (("peer", file.peers), ("member", file.members), ("relay", file.relays)):
         yield from unique(sections, "public_key", f"the key of {{other}} too: each {what} has its own")
-    yield from unique(file.others, "previous_public_key", "the previous key of {other} too: write its own")
     yield from _public_keys(file)
-    yield from _previous_keys(file)
 
 
 def _public_keys(file: Sections) -> Found:
     """No secret key is written as a public one, and no key of this daemon as another's."""
-    private, own = file.secret(file.top, "private_key_file"), file.own_key()
-    previous, files = file.own_key("previous_private_key_file"), _key_files(file.folder)
+    private, own, files = file.secret(file.top, "private_key_file"), file.own_key, _key_files(file.folder)
     owners = {section.get("public_key"): section.at() for section in file.others}
     psks = {psk.reveal() for section in file.others if (psk := file.secret(section, "psk_file"))}
     for section in file.others:
@@ -58,10 +52,9 @@ def _public_keys(file: Sections) -> Found:
         if private is not None and key == private.reveal() and not looks_private(key):
             text = f"holds the public key of {section.at()}, not a private key: make this daemon's own with"
             yield "private_key_file", f"{text} `uavlinkd keygen`"
-        elif key in (own, previous):
-            which, file_key = ("", "private_key_file") if key == own else ("previous ", "previous_private_key_file")
-            or_else = f"; or {file_key} is that of the {section.kind}: carry each key file to its own machine"
-            yield section.at("public_key"), f"is this daemon's own {which}key: {there}{or_else}"
+        elif key == own:
+            or_else = f"; or private_key_file is that of the {section.kind}: carry each key file to its own machine"
+            yield section.at("public_key"), f"is this daemon's own key: {there}{or_else}"
         elif half == own:
             remedy = f"move its file away, make a new one with `uavlinkd keygen`, and {there}"
             yield section.at("public_key"), f"is this daemon's private key, which must stay secret: {remedy}"
@@ -71,22 +64,6 @@ def _public_keys(file: Sections) -> Found:
         elif half in owners or key in files:
             what = f"private key of {owners[half]}" if half in owners else f"secret key in {files[key]}"
             yield section.at("public_key"), f"is the {what}, which must stay secret; {_EXPOSED}"
-
-
-def _previous_keys(file: Sections) -> Found:
-    """A previous key is another one than all current keys."""
-    own = (file.own_key(), file.own_key("previous_private_key_file"))
-    owners = {section.get("public_key"): section.at() for section in file.others}
-    for section in file.others:
-        place, key = section.at("previous_public_key"), section.get("previous_public_key")
-        if key is None:
-            continue
-        if key in own:
-            yield place, "is this daemon's own key: write the other daemon's previous key, or leave it out"
-        elif key == section.get("public_key"):
-            yield place, "is its current key: leave it out"
-        elif key in owners:
-            yield place, f"is the key of {owners[key]}: write its own, or leave it out"
 
 
 def _key_files(folder: Path) -> Mapping[bytes, str]:

@@ -54,7 +54,6 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
     file = Sections(path.absolute().parent, **sections)
     for section, key in (
         (file.top, "private_key_file"),
-        (file.top, "previous_private_key_file"),
         *((section, "psk_file") for section in file.others),
     ):
         if (secret := _secret(problems, section, key, path, environ)) is not None:
@@ -230,8 +229,6 @@ _FOR_A_SERVICE = (
 def _how_to_get(key: str, path: Path, config: Path) -> str:
     """The remedy for a key file that is not there."""
     where = shlex.quote(str(path))
-    if key == "previous_private_key_file":
-        return "it holds the previous key; if that is lost, delete this line"
     if key == "psk_file":
         remedy = f"copy it from the peer, or make it on one of the two with `uavlinkd psk --out {where}`"
     else:

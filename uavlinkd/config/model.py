@@ -6,7 +6,7 @@ import socket
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 from uavlinkd.core.crypto import Secret
 from uavlinkd.core.path import RELAY_HOST, SERIAL_HOST
@@ -22,8 +22,6 @@ SERIAL = Address(SERIAL_HOST, 0)
 """The other end of a serial network."""
 PolicyData = Mapping[str, object]
 """A policy as immutable plain data. :mod:`uavlinkd.mavlink.policy.compilation` documents its keys."""
-KEY_GRACE_S: Final = 7 * 24 * 3600.0
-"""How long previous keys stay valid after the start or reload in which the daemon read them."""
 
 
 class Problem(NamedTuple):
@@ -125,14 +123,13 @@ class PeerAddress:
 class PeerConfig:
     """Another daemon: its settings in the core, and its addresses. Without addresses, the peer initiates.
 
-    ``previous_public_key``: its old key, while the key changes. ``relays``: names of those along which it is reached.
+    ``relays``: names of those along which it is reached.
     """
 
     settings: PeerSettings
     addresses: tuple[PeerAddress, ...]
     policy: PolicyData
     egress: EgressSettings = field(default_factory=EgressSettings)
-    previous_public_key: bytes | None = None
     relays: tuple[str, ...] = ()
 
     @property
@@ -167,13 +164,11 @@ class RelayServer:
 class RelayConfig:
     """A relay: its settings in the core, where its name begins with :data:`.RELAY_HOST`, and its addresses.
 
-    ``previous_public_key``: its old key, while the key changes. ``peer``: the name of the peer with the same key.
-    Then that peer's session serves both, with that peer's settings.
+    ``peer``: the name of the peer with the same key. Then that peer's session serves both, with that peer's settings.
     """
 
     settings: PeerSettings
     addresses: tuple[PeerAddress, ...]
-    previous_public_key: bytes | None = None
     peer: str | None = None
 
     @property
@@ -227,7 +222,6 @@ class Config:
     metrics: Address | None
     recording: Recording | None
     log: Log
-    previous_private_key: Secret | None = None
     networks: tuple[NetworkConfig, ...] = ()
     relay_server: RelayServer | None = None
     relays: tuple[RelayConfig, ...] = ()
@@ -240,11 +234,9 @@ class Config:
 
     @property
     def keys_of_others(self) -> set[bytes]:
-        """The keys of the peers and relays, current and previous."""
+        """The keys of the peers and relays."""
         others: tuple[PeerConfig | RelayConfig, ...] = (*self.peers, *self.relays)
-        return {
-            key for one in others for key in (one.settings.public_key, one.previous_public_key) if key is not None
-        }
+        return {one.settings.public_key for one in others}
 
     @property
     def has_ip_networks(self) -> bool:

@@ -78,9 +78,10 @@ class Sections:
         """The content of the key file that a section names under a key."""
         return self.secrets.get(section.at(key))
 
-    def own_key(self, key: str = "private_key_file") -> bytes | None:
-        """This daemon's public key, or with ``previous_private_key_file`` the previous one."""
-        secret = self.secret(self.top, key)
+    @property
+    def own_key(self) -> bytes | None:
+        """This daemon's public key."""
+        secret = self.secret(self.top, "private_key_file")
         return None if secret is None else x25519_public_key(secret.reveal())
 
 
@@ -215,8 +216,18 @@ _OTHERS_CALL_IT: dict[type[schema.Section], dict[str, str]] = {
 """Names that WireGuard and common usage have for keys of any section or of one, where the most similar is another."""
 
 
+REMOVED = dict.fromkeys(
+    ("previous_public_key", "previous_private_key_file"),
+    "was removed: to change a key, write the new public key into the other ends' files, restart the daemon whose key"
+    " it is, and reload the others at the same time; in a fleet, `uavlinkd fleet rotate NAME` writes the files",
+)
+"""Keys that files of earlier versions may have, and what to do instead."""
+
+
 def unknown_key(key: str, model: type[schema.Section]) -> str:
     """What to write for a key that the section does not have."""
+    if key in REMOVED:
+        return REMOVED[key]
     plain = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|[ -]", "_", key).lower()
     for section in (model, schema.Section):
         if remedy := _OTHERS_CALL_IT.get(section, {}).get(plain):

@@ -38,9 +38,11 @@ def members(file: Sections) -> Found:
 
 def _of_peer(section: Values, peer: Values) -> Found:
     """A member or relay that is a peer too leaves to the peer what belongs to their one session."""
-    for key in ("psk_file", "previous_public_key"):
-        if key in section.valid:
-            yield section.at(key), f"has no effect, because {peer.at()} has the same public_key: write it there only"
+    if "psk_file" in section.valid:
+        yield (
+            section.at("psk_file"),
+            f"has no effect, because {peer.at()} has the same public_key: write it there only",
+        )
 
 
 def relays(file: Sections) -> Found:

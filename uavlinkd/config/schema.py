@@ -266,7 +266,6 @@ class KeySection(Section):
     name: Name = Field(examples=['"drone1"'])
     public_key: PublicKey = Field(examples=['"…", what `uavlinkd pubkey` prints there'])
     psk_file: FileName | None = Field(default=None, examples=['"drone0-drone1.psk"'])
-    previous_public_key: PublicKey | None = Field(default=None, examples=['"…", what its public key was'])
 
 
 class PeerSection(LinkSection, PolicySection, KeySection):
@@ -339,7 +338,6 @@ class FileSection(Section):
     name: Name = Field(examples=['"drone0"'])
     private_key_file: FileName = Field(examples=['"drone0.key"'])
     listen: list[ListenAddress] = Field(default=[], examples=['["0.0.0.0:5790"]'])
-    previous_private_key_file: FileName | None = Field(default=None, examples=['"drone0.previous.key"'])
     control_socket: FileName | None = Field(default=None, examples=['"drone0.sock"'])
 
 

@@ -6,8 +6,6 @@ the cookie is sealed with ChaCha20-Poly1305 under a key made of the responder's 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 from uavlinkd.core import constants as c
 from uavlinkd.core import wire
 from uavlinkd.core.crypto import AeadKey, Entropy, equal, hmac_sha256, sha256
@@ -73,7 +71,7 @@ class CookieJar:
     """Cookies for senders: an HMAC of the source address, so the daemon remembers nothing about a sender."""
 
     def __init__(self, keys: MacKeys, entropy: Entropy, now: float) -> None:
-        self._keys = keys
+        self.keys = keys
         self._entropy = entropy
         self._secret = self._previous = entropy(c.KEY_BYTES)
         self._changed_at = now
@@ -95,7 +93,7 @@ class CookieJar:
         """A cookie reply to the handshake message in ``datagram``; shorter than any of them."""
         self._change_secret(now)
         nonce = self._entropy(c.COOKIE_NONCE_BYTES)
-        sealed = self._keys.seal_cookie(_cookie(self._secret, path), nonce, mac1_of(datagram))
+        sealed = self.keys.seal_cookie(_cookie(self._secret, path), nonce, mac1_of(datagram))
         return wire.encode_cookie_reply(sender_index, nonce, sealed)
 
     def _change_secret(self, now: float) -> None:
@@ -117,16 +115,13 @@ OTHERS = tuple(version for version in range(1, c.LAST_KNOWN_VERSION + 1) if vers
 """The versions that are compared."""
 
 
-def version_of(initiation: bytes, public_keys: Iterable[bytes]) -> int | None:
-    """The other version in which an initiation is for the holder of one of these keys.
+def version_of(initiation: bytes, public_key: bytes) -> int | None:
+    """The other version in which an initiation is for the holder of this key.
 
-    None for any other message: its sender does not know a key, or it was altered. A match proves that its sender
+    None for any other message: its sender does not know the key, or it was altered. A match proves that its sender
     knows the public key, and no more.
     """
     if not wire.MACS_BYTES < len(initiation) <= c.VERSION_CHECK_BYTES:
         return None
-    for public_key in public_keys:
-        for version in OTHERS:
-            if fits_mac1(mac1_key(public_key, b"uavlink/%d" % version), initiation):
-                return version
-    return None
+    macs = ((version, mac1_key(public_key, b"uavlink/%d" % version)) for version in OTHERS)
+    return next((version for version, key in macs if fits_mac1(key, initiation)), None)

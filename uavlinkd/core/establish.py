@@ -66,8 +66,7 @@ def receive_response(peer: Peer, pending: Pending, response: wire.Response, path
         path = pending.paths[0]
     events = adopt(peer, session, path, now) + peer.note_received(now)
     # The confirmation; any later envelope repeats it. It asks for an echo: so it is long enough to be challenged if a
-    # relay sends it from elsewhere, and it gives the round trip at once. It goes out before the events: what those
-    # end, such as a session by a previous key, must not end before the peer has this session.
+    # relay sends it from elsewhere, and it gives the round trip at once.
     if session is not peer.sessions.current:
         state = peer.paths.find(path)
         return ask_for_echo(peer, session, now, () if state is None else (state,)) + events

@@ -15,7 +15,8 @@ from functools import partial
 from uavlinkd.core import constants as c
 from uavlinkd.core import establish, probing, wire
 from uavlinkd.core.admission import Admission, CookieRequired
-from uavlinkd.core.crypto import Entropy, Secret
+from uavlinkd.core.cookie import CookieJar, MacKeys
+from uavlinkd.core.crypto import Entropy, KeyPair, Secret
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.initiator import Pending
 from uavlinkd.core.outputs import Deliver, Dropped, Output
@@ -23,7 +24,7 @@ from uavlinkd.core.path import Path, SocketAddress, SocketFacts
 from uavlinkd.core.peer import Peer, Shared
 from uavlinkd.core.probing import ask_candidates
 from uavlinkd.core.receive import receive_envelope
-from uavlinkd.core.receive_handshake import HandshakeReceiver, OwnKeys
+from uavlinkd.core.receive_handshake import HandshakeReceiver
 from uavlinkd.core.refusals import Refused
 from uavlinkd.core.relay_records import FleetRecord, Record
 from uavlinkd.core.send import ask_for_echo, seal, send_frames
@@ -44,7 +45,6 @@ class Node:
         private_key: the static X25519 key of this daemon.
         entropy: returns unpredictable bytes.
         now: monotonic seconds.
-        previous_private_key: the one before, while it is being changed: peers can be added that know us by it.
         screen: splits a payload into frames that may be old and frames that must be new. By default all must be new.
         admit: decides on certificates. Without it, none is valid.
     """
@@ -54,7 +54,6 @@ class Node:
         private_key: Secret,
         entropy: Entropy,
         now: float,
-        previous_private_key: Secret | None = None,
         *,
         screen: Screen = hold_all,
         admit: Admit | None = None,
@@ -67,10 +66,9 @@ class Node:
         self.facts = SocketFacts()
         """About the networks behind the sockets."""
         self._schedule = Schedule[Peer]()
-        own = OwnKeys(private_key, entropy, now)
-        previous = None if previous_private_key is None else OwnKeys(previous_private_key, entropy, now)
-        admission = Admission(self._is_known, now)
-        self._handshakes = HandshakeReceiver(own, previous, self._indices, admission, self.facts, self._schedule)
+        identity, admission = KeyPair(private_key.reveal()), Admission(self._is_known, now)
+        cookies = CookieJar(MacKeys(identity.public), entropy, now)
+        self._handshakes = HandshakeReceiver(identity, cookies, self._indices, admission, self.facts, self._schedule)
         self._certificate = b""
         if admit is not None:
             self._handshakes.admit = partial(self._admit, admit)
@@ -82,30 +80,24 @@ class Node:
     @property
     def public_key(self) -> bytes:
         """This daemon's identity."""
-        return self._handshakes.own.identity.public
+        return self._handshakes.identity.public
 
     # Peers.
 
-    def add_peer(self, settings: PeerSettings, now: float, *, by_previous_key: bool = False) -> Peer:
+    def add_peer(self, settings: PeerSettings, now: float) -> Peer:
         """Accept this peer from now on. Without an address it has to initiate.
 
-        ``by_previous_key``: it knows us by our previous key. While keys change, neither end can tell which keys the
-        other has, so a peer is added once for each pair of keys that may be valid, by different names.
-
         Raises:
-            ValueError: the name or the pair of keys is there already, or the peer's key is one of ours.
+            ValueError: the name or the key is there already, or the key is ours.
         """
         handshakes = self._handshakes
-        own = handshakes.previous if by_previous_key else handshakes.own
-        assert own is not None, "there is a previous key"
-        keys = own.identity.public, settings.public_key
-        if settings.name in self.peers or keys in handshakes.peers:
+        if settings.name in self.peers or settings.public_key in handshakes.peers:
             raise ValueError(f"peer {settings.name} is there already")
-        if settings.public_key in handshakes.public_keys:
+        if settings.public_key == self.public_key:
             raise ValueError(f"peer {settings.name} has this daemon's own key")
         shared = Shared(self._indices, self._entropy, self._screen, self._last_seen, self.facts)
-        peer = Peer(settings, own.identity, shared, now)
-        self.peers[settings.name] = handshakes.peers[keys] = peer
+        peer = Peer(settings, handshakes.identity, shared, now)
+        self.peers[settings.name] = handshakes.peers[settings.public_key] = peer
         self.facts.peers = len(self.peers)
         self._handshakes.admission.set_peers(len(self.peers))
         if settings.is_certified:
@@ -115,7 +107,7 @@ class Node:
     def _admit(self, admit: Admit, public_key: bytes, certificate: bytes, now: float) -> Peer:
         """The peer with this key that showed a certificate. A new one is provisional."""
         settings = admit(public_key, certificate, now)
-        peer = self._handshakes.peers.get((self.public_key, public_key))
+        peer = self._handshakes.peers.get(public_key)
         if peer is None:
             peer = self.add_peer(replace(settings, initiates=False), now)
             peer.provisional_until = now + c.UNCONFIRMED_LIFETIME_S
@@ -129,10 +121,6 @@ class Node:
         for peer in self.peers.values():
             if peer.settings.is_certified:
                 peer.initiator.certificate = certificate
-
-    def forget_previous_key(self) -> None:
-        """Accept nothing for our previous key any more. Remove the peers by it first."""
-        self._handshakes.previous = None
 
     def remove_peer(self, peer: Peer, now: float) -> list[Output]:
         """Cut this peer off at once: its keys are forgotten, and nothing from it is accepted any more."""
@@ -270,7 +258,7 @@ class Node:
             peer, session = self._indices.owners.get(header[0], (None, None))
             if peer is None or not isinstance(session, Session):
                 return self._receive_stray(datagram, header[0], path, now)
-            if self.facts.peers_at:
+            if self.facts.peer_at:
                 self.facts.check_network(peer, path)
             out = receive_envelope(peer, session, datagram, header, path, now)
             if peer.timers.next_at < peer.timers.scheduled_at:
@@ -333,7 +321,7 @@ class Node:
     def handshake_source(self, datagram: bytes, path: Path, now: float) -> Hashable | None:
         """What tells handshake messages apart that wait in a busy shell: a newer one supersedes one that is equal.
 
-        Initiations along one path for one of our keys are equal, unless only one of them has a cookie: a forgery
+        Initiations along one path are equal, unless only one of them has a cookie: a forgery
         without it does not supersede the other one. None: the message is not for us, and costs little.
         """
         return self._handshakes.source_of(datagram, path, now)

@@ -83,7 +83,7 @@ FREE = Pace()
 class SocketFacts:
     """The facts about each socket. ``metered``: those whose network is paid by the byte."""
 
-    __slots__ = ("_budgets", "_rates", "envelope_limits", "metered", "peers", "peers_at")
+    __slots__ = ("_budgets", "_rates", "envelope_limits", "metered", "peer_at", "peers")
 
     def __init__(self, metered: Iterable[int] = ()) -> None:
         self.metered = set(metered)
@@ -93,8 +93,8 @@ class SocketFacts:
         """So many use each network."""
         self.envelope_limits: dict[int, int] = {}
         """The longest envelopes that several frames share, in bytes: :func:`.path_measures.limit_at`."""
-        self.peers_at: dict[int, frozenset[Hashable]] = {}
-        """The peers at the other end of each point-to-point network."""
+        self.peer_at: dict[int, Hashable | None] = {}
+        """The peer at the other end of each point-to-point network; None during a change."""
 
     # Budgets.
 
@@ -138,17 +138,17 @@ class SocketFacts:
         return 0.0 if rate is None else 8 * (size + carriers) / rate
 
     def _share_s(self, path: Path, size: int, share: float, rates: Mapping[int, float]) -> float:
-        peers = 1 if path.socket in self.peers_at else self.peers
+        peers = 1 if path.socket in self.peer_at else self.peers
         return peers * self._airtime_s(path, size, rates) / share
 
     # Point-to-point networks.
 
-    def set_point_to_point(self, peers: Mapping[int, Iterable[Hashable]]) -> None:
-        """The peers at the other end of these sockets: one daemon, which may have several pairs of keys.
+    def set_point_to_point(self, peers: Mapping[int, Hashable | None]) -> None:
+        """The peers at the other end of these sockets, if there is one.
 
         Datagrams of other peers that arrive there are dropped, as ``wrong_network``. Other sockets may have any peer.
         """
-        self.peers_at = {socket: frozenset(those) for socket, those in peers.items()}
+        self.peer_at = dict(peers)
 
     def check_network(self, peer: Hashable, path: Path) -> None:
         """A datagram that names this peer, or is of it, came along a path.
@@ -156,6 +156,5 @@ class SocketFacts:
         Raises:
             Drop: ``WRONG_NETWORK`` if there is another peer at the other end of this network.
         """
-        peers = self.peers_at.get(path.socket)
-        if peers is not None and peer not in peers:
+        if self.peer_at.get(path.socket, peer) is not peer:
             raise Drop(DropReason.WRONG_NETWORK)

@@ -7,8 +7,8 @@ from collections.abc import Callable, Hashable
 from uavlinkd.core import constants as c
 from uavlinkd.core import establish, handshake, wire
 from uavlinkd.core.admission import Admission, CookieRequired, Message
-from uavlinkd.core.cookie import CookieJar, MacKeys, mac1_of, version_of
-from uavlinkd.core.crypto import Entropy, KeyPair, Secret, equal
+from uavlinkd.core.cookie import CookieJar, mac1_of, version_of
+from uavlinkd.core.crypto import KeyPair, equal
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.initiator import Pending
 from uavlinkd.core.outputs import Output
@@ -23,37 +23,26 @@ _MAVLINK_STARTS = frozenset((0xFD, 0xFE))
 _NOT_OUR_VERSION = frozenset((DropReason.MALFORMED, DropReason.BAD_MAC1))
 
 
-class OwnKeys:
-    """A static key of this daemon, and what goes with it."""
-
-    __slots__ = ("cookies", "identity", "mac_keys")
-
-    def __init__(self, private_key: Secret, entropy: Entropy, now: float) -> None:
-        self.identity = KeyPair(private_key.reveal())
-        self.mac_keys = MacKeys(self.identity.public)
-        self.cookies = CookieJar(self.mac_keys, entropy, now)
-
-
 class HandshakeReceiver:
     """Decides which handshake messages are read, and passes them to the peer that sent them.
 
-    ``previous``: this daemon's previous key, while it is being changed.
+    ``identity``: the static key of this daemon.
     """
 
     def __init__(
         self,
-        own: OwnKeys,
-        previous: OwnKeys | None,
+        identity: KeyPair,
+        cookies: CookieJar,
         indices: Indices[tuple[Peer, Session | Pending]],
         admission: Admission,
         facts: SocketFacts,
         schedule: Schedule[Peer],
     ) -> None:
-        self.own = own
-        self.previous = previous
+        self.identity = identity
+        self.cookies = cookies
         self.admission = admission
-        self.peers: dict[tuple[bytes, bytes], Peer] = {}
-        """By our public key and theirs."""
+        self.peers: dict[bytes, Peer] = {}
+        """By their public key."""
         self.remembered: dict[bytes, Peer] = {}
         """By the ephemeral of an authentic initiation: its sender."""
         self.admit: Callable[[bytes, bytes, float], Peer] | None = None
@@ -61,11 +50,6 @@ class HandshakeReceiver:
         self._indices = indices
         self._facts = facts
         self._schedule = schedule
-
-    @property
-    def public_keys(self) -> list[bytes]:
-        """Our public key, and the previous one while there is one."""
-        return [own.identity.public for own in (self.own, self.previous) if own is not None]
 
     def receive(self, datagram: bytes, path: Path, now: float) -> list[Output]:
         """What to do about a datagram that is not an envelope.
@@ -87,21 +71,16 @@ class HandshakeReceiver:
         raise Drop(DropReason.RAW_MAVLINK if kind in _MAVLINK_STARTS else DropReason.MALFORMED)
 
     def source_of(self, datagram: bytes, path: Path, now: float) -> Hashable | None:
-        """Equal for initiations along one path for one of our keys with a cookie, or without. None: not for us."""
+        """Equal for initiations along one path with a cookie, or without. None: not for us."""
         kind = datagram[:1]
-        if kind not in _WAITING_KINDS:
+        if kind not in _WAITING_KINDS or not self.cookies.keys.has_valid_mac1(datagram):
             return None
-        try:
-            own = self._addressed(datagram)
-        except Drop:
-            return None
-        if kind[0] == wire.RESPONSE:
-            return path, datagram
-        return path, own.identity.public, own.cookies.has_valid_mac2(datagram, path, now)
+        is_response = kind[0] == wire.RESPONSE
+        return path, (datagram if is_response else self.cookies.has_valid_mac2(datagram, path, now))
 
     def initiations_from(self, path: Path) -> list[Hashable]:
         """All that :meth:`source_of` returns for initiations along a path."""
-        return [(path, key, has_cookie) for key in self.public_keys for has_cookie in (False, True)]
+        return [(path, has_cookie) for has_cookie in (False, True)]
 
     def remember(self, peer: Peer, ephemeral: bytes) -> None:
         """An authentic initiation of this peer came, with this ephemeral."""
@@ -113,8 +92,7 @@ class HandshakeReceiver:
 
     def forget(self, peer: Peer) -> None:
         """Accept nothing from this peer any more."""
-        for keys in [keys for keys, other in self.peers.items() if other is peer]:
-            del self.peers[keys]
+        del self.peers[peer.settings.public_key]
         for ephemeral in peer.remembered:
             self.remembered.pop(ephemeral, None)
 
@@ -123,15 +101,15 @@ class HandshakeReceiver:
     def _receive_initiation(self, datagram: bytes, path: Path, now: float) -> list[Output]:
         initiation = wire.parse_initiation(datagram)
         self.admission.read(path, now)
-        own = self._addressed(datagram)
+        self._check_mac1(datagram)
         sender = self.remembered.get(initiation.ephemeral)
         if sender is not None:  # before the budget: one recording must not use it up
             self._facts.check_network(sender, path)
             return self._answer_copy(sender, datagram, path, now)
-        message = Message(datagram, initiation.sender_index, path, own.cookies)
+        message = Message(datagram, initiation.sender_index, path, self.cookies)
         self.admission.admit(message, now, is_response=False)
-        received = handshake.receive_initiation(own.identity, initiation)
-        peer = self.peers.get((own.identity.public, received.public_key))
+        received = handshake.receive_initiation(self.identity, initiation)
+        peer = self.peers.get(received.public_key)
         if received.certificate and self.admit is not None and (peer is None or peer.settings.is_certified):
             peer = self.admit(received.public_key, received.certificate, now)
         if peer is None:
@@ -174,7 +152,8 @@ class HandshakeReceiver:
             is_copy = isinstance(pending, Session) and pending.remote_index == response.sender_index
             raise Drop(DropReason.DUPLICATE if is_copy else DropReason.UNEXPECTED_RESPONSE)
         self._facts.check_network(peer, path)
-        message = Message(datagram, response.sender_index, path, self._addressed(datagram).cookies)
+        self._check_mac1(datagram)
+        message = Message(datagram, response.sender_index, path, self.cookies)
         self.admission.admit(message, now, is_response=True)
         out = establish.receive_response(peer, pending, response, path, now)
         self._schedule.update(peer)
@@ -196,16 +175,14 @@ class HandshakeReceiver:
         self._schedule.update(peer)
         return []
 
-    def _addressed(self, datagram: bytes) -> OwnKeys:
-        """Which of our keys a handshake message is for. Raises ``BAD_MAC1`` if it is for none of them."""
-        for own in (self.own, self.previous):
-            if own is not None and own.mac_keys.has_valid_mac1(datagram):
-                return own
-        raise Drop(DropReason.BAD_MAC1)
+    def _check_mac1(self, datagram: bytes) -> None:
+        """Raise ``BAD_MAC1`` if a handshake message is not for this daemon's key."""
+        if not self.cookies.keys.has_valid_mac1(datagram):
+            raise Drop(DropReason.BAD_MAC1)
 
     def _name_version(self, reason: DropReason, datagram: bytes, path: Path, now: float) -> None:
         """Raise ``OTHER_VERSION`` if it is one: it may have other lengths, and has another label of mac1."""
         if reason not in _NOT_OUR_VERSION or not self.admission.may_compare_versions(path, now):
             return
-        if (version := version_of(datagram, self.public_keys)) is not None:
+        if (version := version_of(datagram, self.identity.public)) is not None:
             raise Drop(DropReason.OTHER_VERSION, version)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 from uavlinkd.core import constants as c
@@ -92,13 +92,3 @@ class PeerSettings:
 Admit = Callable[[bytes, bytes, float], PeerSettings]
 """Decides on a certificate that an initiation with this authentic static key shows at this moment, and returns the
 settings of its peer. Raises :class:`.drops.Drop`."""
-
-
-def previous_of(settings: PeerSettings, public_key: bytes) -> PeerSettings:
-    """The same peer by its previous key, while its key changes: another peer of the node."""
-    return replace(settings, name=f"{settings.name} (previous key)", public_key=public_key)
-
-
-def link_name(core_name: str) -> str:
-    """The peer as the configuration names it, of the name of a pair of keys: configured names have no spaces."""
-    return core_name.partition(" ")[0]

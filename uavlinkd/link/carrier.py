@@ -329,7 +329,7 @@ class FrameCarrier:
             self.arm()
 
     def _pick_newest(self, link: PeerLink, delivered: Deliver, frames: list[Frame]) -> list[Frame]:
-        picked = link.pick_newest(delivered.peer, frames, delivered.order, self._read_at)
+        picked = link.pick_newest(frames, delivered.order, self._read_at)
         if count := len(frames) - len(picked):
             self._parts.drops.add("frames_dropped", ShellReason.SUPERSEDED, link.name, count, monotonic())
         return picked
@@ -370,12 +370,9 @@ class FrameCarrier:
         parts = self._parts
         parts.events.write(event, now)
         if isinstance(event, o.PeerLost | o.PeerClosed):
-            if not link.peer.is_up:  # with any key
-                link.on_down(now, is_closed=isinstance(event, o.PeerClosed))
+            link.on_down(now, is_closed=isinstance(event, o.PeerClosed))
         elif isinstance(event, o.PathChanged | o.PathStateChanged | o.SessionEstablished):
             link.follow_paths(now)
-            if isinstance(event, o.SessionEstablished) and event.peer is link.peers[0]:
-                self.peers.confirm_keys(link)
 
     # Time.
 

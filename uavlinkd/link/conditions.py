@@ -117,12 +117,12 @@ class LineLimits:
         """A line was omitted."""
         self._omitted[kind, name] += 1
 
-    def forget(self, is_forgotten: Callable[[str], bool]) -> None:
-        """Forget the names that the configuration no longer has."""
-        for key in [key for key in self._limits if key[1] is not None and is_forgotten(key[1])]:
+    def forget(self, name: str) -> None:
+        """Forget a name that the configuration no longer has."""
+        for key in [key for key in self._limits if key[1] == name]:
             del self._limits[key]
-        for kind, name in [key for key in self._omitted if is_forgotten(key[1])]:
-            del self._omitted[kind, name]
+        for omitted in [key for key in self._omitted if key[1] == name]:
+            del self._omitted[omitted]
 
 
 class Conditions(Generic[K]):

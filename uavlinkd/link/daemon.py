@@ -261,7 +261,6 @@ class Daemon:
             link.measure(now)
             link.report_refusals(now)
             parts.events.check_link(link, now)
-        self.carrier.peers.end_graces(now)
         parts.history.sample(links, ((one, parts.local.policies[one.name]) for one in parts.local.endpoints), now)
         parts.local.do_housekeeping(radio_figures(links), now)
         parts.local.write_note(self._notes.next(links, now), now)

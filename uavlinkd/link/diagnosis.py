@@ -38,7 +38,7 @@ def daemon_problems(moment: Moment) -> Iterator[Found]:
             f"a sender at {at} uses this daemon's private key, or an attacker replays an old recording",
             "if a card was copied, run `uavlinkd keygen` on one machine; else the key may be stolen: replace it",
         )
-    if names := [name for name, peer in daemon.node.peers.items() if traffic.has_twin([peer], Twin.OURS, now)]:
+    if names := [name for name, peer in daemon.node.peers.items() if traffic.has_twin(peer, Twin.OURS, now)]:
         yield traffic.two_machines(f"this daemon's private key: {listed(names)} states a session with another one")
     fault_if_down = fault if moment.down else warning
     if absent := daemon.peer_sockets.absent_addresses():
@@ -99,15 +99,15 @@ def member_problems(moment: Moment) -> Iterator[Found]:
     if daemon.relay is None:
         return
     members = [one for one in daemon.relay.members.values() if one.is_own]
-    if deaf := [one for one in members if is_deaf(one.peers, now)]:
+    if deaf := [one for one in members if is_deaf(one.peer, now)]:
         yield warning(
             "member_not_confirmed",
             f"initiations of {listed(map(_initiator, deaf))} arrive, and it does not confirm the responses of this"
             " relay: these do not reach it, the PSKs differ, or an attacker replays old initiations",
             "let UDP from this relay through the firewalls here, there and between; compare the PSKs",
         )
-    if twins := [one for one in members if traffic.has_twin(one.peers, Twin.PEERS, now)]:
-        facts = (f"{one.settings.name}, from {traffic.places(one.peers)}" for one in twins)
+    if twins := [one for one in members if traffic.has_twin(one.peer, Twin.PEERS, now)]:
+        facts = (f"{one.settings.name}, from {traffic.places(one.peer)}" for one in twins)
         yield traffic.two_machines(f"the private key of a member: {listed(facts)}")
     unknown = daemon.evidence.seen_at(DropReason.UNKNOWN_PEER, ELSEWHERE, now)
     if unknown is not None:
@@ -133,7 +133,7 @@ def member_problems(moment: Moment) -> Iterator[Found]:
 
 def _initiator(member: RelayMember) -> str:
     """A member, and where its last initiation came from that it has not confirmed."""
-    waiting = [one for peer in member.peers for one in peer.sessions.unconfirmed.values()]
+    waiting = list(member.peer.sessions.unconfirmed.values())
     return f"{member.settings.name} at {shown(waiting[-1].paths[0].address)}"
 
 

@@ -6,7 +6,7 @@ accepts a key, a name or an address because it arrived.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Final
 
@@ -27,7 +27,6 @@ from uavlinkd.link.facts import (
     hosts_of,
     keys_at,
     listed,
-    place,
     warning,
 )
 from uavlinkd.link.relay_link import RelayLink
@@ -49,7 +48,7 @@ def down_problems(peer: PeerFacts) -> Iterator[Found]:
     found = [*_here(peer, relays), *_at_relays(peer, relays), *_hints(peer), *_handshakes(peer, relays), *_icmp(peer)]
     yield from found
     is_explained = any(one.cause in _EXPLAIN_NO_ANSWER for one in found)
-    if not is_explained and is_deaf(peer.link.peers, peer.now):
+    if not is_explained and is_deaf(peer.link.peer, peer.now):
         yield fault(
             "not_confirmed",
             "its initiations arrive, and it does not confirm this daemon's responses: these do not reach it, the PSKs"
@@ -58,18 +57,15 @@ def down_problems(peer: PeerFacts) -> Iterator[Found]:
         )
 
 
-def is_deaf(peers: Iterable[Peer], now: float) -> bool:
+def is_deaf(peer: Peer, now: float) -> bool:
     """Whether a peer initiates, and has not confirmed the responses for :data:`CONFIRM_S`.
 
     One initiation may have become superfluous. So those of a peer that is up count only if they span this time.
     """
-    for peer in peers:
-        current = peer.sessions.current
-        since = current.created_at if peer.is_up and current is not None else peer.received_at or -c.NEVER
-        begun = [at for one in peer.sessions.unconfirmed.values() if (at := one.session.created_at) > since]
-        if begun and (max(begun) if peer.is_up else now) - min(begun) >= CONFIRM_S:
-            return True
-    return False
+    current = peer.sessions.current
+    since = current.created_at if peer.is_up and current is not None else peer.received_at or -c.NEVER
+    begun = [at for one in peer.sessions.unconfirmed.values() if (at := one.session.created_at) > since]
+    return bool(begun) and (max(begun) if peer.is_up else now) - min(begun) >= CONFIRM_S
 
 
 def _relays(peer: PeerFacts) -> Iterator[_RelayProblem]:
@@ -101,7 +97,7 @@ def _here(peer: PeerFacts, relays: Sequence[_RelayProblem]) -> Iterator[Found]:
         if names := sorted(sockets.unresolved(owner)):
             remedy = f"see `getent hosts {names[0]}`, or write an IP address; the daemon tries again each second"
             yield fault("name_not_resolved", f"{', '.join(names)} has no address now", remedy)
-    for path in peer.link.peers[0].paths.configured:
+    for path in peer.link.peer.paths.configured:
         if path.host.startswith("fe80:") and path.address[-1] == 0:
             yield fault(
                 "zone_missing",
@@ -184,7 +180,7 @@ def silent_relays(
             )
         elif moment.passes(relay):
             text += "datagrams still come through it, so the direction from here to it is blocked"
-        elif any(peer.received_at is not None for peer in relay.peers):
+        elif relay.peer.received_at is not None:
             text += "it did before, so it is off, or UDP to it or back is blocked"
         else:
             text += "it is off, the address is wrong, a firewall drops UDP here or there, or keys or suites differ"
@@ -251,19 +247,11 @@ def _icmp(peer: PeerFacts) -> Iterator[Found]:
 
 
 def _unknown_keys(peer: PeerFacts, sighting: Sighting) -> Iterator[Found]:
-    before = peer.link.config.previous_public_key
-    if before is not None and before in sighting.details:
-        yield fault(
-            "former_key",
-            f"a sender at {place(sighting.details[before])} uses the former key {encode_key(before)}, or an attacker"
-            " replays an old recording",
-            f"carry the new files to {peer.name} and restart it; if the former key was stolen, this may be the thief",
-        )
-    if count := len(sighting.details) - (before in sighting.details):
+    if count := len(sighting.details):
         which = "the key" if count == 1 else f"{count} keys, so at least one is not {peer.name}:"
         yield fault(
             "wrong_key_here",
-            f"a sender uses {which} {keys_at(sighting, but=before)}, which this file does not have",
+            f"a sender uses {which} {keys_at(sighting)}, which this file does not have",
             f"run `uavlinkd pubkey` at {peer.name}, and write into this file what that prints: a key that arrives"
             " proves nothing. After a change of keys, restart it with its new files; if the former key was stolen,"
             " this may be the thief",
@@ -316,14 +304,13 @@ def silence(peer: PeerFacts) -> Iterator[Found]:
     if not peer.link.is_overdue(peer.now):
         return
     by_name = peer.daemon.relays.by_name
-    was_up = any(one.received_at is not None for one in peer.link.peers)
     if config.addresses and all(written.is_serial for written in config.addresses):
         yield fault(
             "no_answer",
             f"no answer along {peer.addresses}: it is off or out of range, or keys or modem settings differ",
             f"compare the baud rate, NETID and air speed of both modems, and set MAVLINK=0; {ask}",
         )
-    elif was_up:
+    elif peer.link.peer.received_at is not None:
         through = [name for name, relay in by_name.items() if relay.state_for(peer.link) == "bound"]
         via = f" through the relay {through[0]}, which answers" if through else ""
         yield fault(
@@ -332,7 +319,7 @@ def silence(peer: PeerFacts) -> Iterator[Found]:
             f"{ask}; if its link is up there, look for a bad radio or a firewall in the direction from it to here",
         )
     elif config.addresses:
-        hosts = {path.host for path in peer.link.peers[0].paths.configured}
+        hosts = {path.host for path in peer.link.peer.paths.configured}
         other = peer.moment.other_answer({host for host in hosts if relay_name((host, 0)) is None})
         where = f"there, while UDP gets out here ({other} answers)" if other else "here or there"
         yield fault(

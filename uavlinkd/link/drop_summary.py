@@ -14,7 +14,6 @@ from uavlinkd.core.constants import PROTOCOL_VERSION
 from uavlinkd.core.drops import Attention, Detail, Reason
 from uavlinkd.core.outputs import Dropped
 from uavlinkd.core.path import Path
-from uavlinkd.core.settings import link_name
 from uavlinkd.endpoints.ports import failure_name
 from uavlinkd.link.conditions import Conditions, LineLimits, OpenCondition, Phase
 from uavlinkd.mavlink.dialect import name_of
@@ -149,9 +148,9 @@ class DropSummary:
         self._conditions.close()
 
     def forget(self, peer: str) -> None:
-        """Forget a peer that was removed or has other rules, under its previous keys too."""
-        self._conditions.close(lambda key: link_name(key[2]) == peer)
-        self._kinds = {key: kind for key, kind in self._kinds.items() if link_name(key[2]) != peer}
+        """Forget a peer that was removed or has other rules."""
+        self._conditions.close(lambda key: key[2] == peer)
+        self._kinds = {key: kind for key, kind in self._kinds.items() if key[2] != peer}
 
     def _write(self, key: Key, phase: Phase, condition: OpenCondition, omitted: dict[str, int]) -> None:
         if phase is Phase.BEGAN:

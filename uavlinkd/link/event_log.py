@@ -10,7 +10,6 @@ from structlog.typing import FilteringBoundLogger
 
 from uavlinkd.core import outputs as o
 from uavlinkd.core.path import Path
-from uavlinkd.core.settings import link_name
 from uavlinkd.link.conditions import Conditions, LineLimits, OpenCondition, Phase
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.ops.findings import Finding, LinkProblem, Severity, Subject
@@ -84,12 +83,12 @@ class EventLog:
             conditions.close()
 
     def forget(self, peer: str) -> None:
-        """Forget a peer that was removed, under its previous keys too."""
-        self._problem_conditions.close(lambda key: link_name(key[0]) == peer)
+        """Forget a peer that was removed."""
+        self._problem_conditions.close(lambda key: key[0] == peer)
         self._finding_conditions.close(lambda key: key[1] is Subject.PEER and key[2] == peer)
-        for name in [name for name in self._watches if link_name(name) == peer]:
-            self._forgotten += self._watches.pop(name).totals
-        self._limits.forget(lambda name: link_name(name) == peer)
+        if peer in self._watches:
+            self._forgotten += self._watches.pop(peer).totals
+        self._limits.forget(peer)
 
     # Events of the core.
 

@@ -8,7 +8,7 @@ of its own. All other places share one entry per kind, so that an attacker canno
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping
 from types import MappingProxyType
 from typing import Final, Generic, TypeVar
 
@@ -16,7 +16,6 @@ from uavlinkd.core.drops import Detail, DropReason
 from uavlinkd.core.outputs import Dropped
 from uavlinkd.core.path import RELAY_HOST, SocketAddress, relay_name
 from uavlinkd.core.peer import Peer
-from uavlinkd.core.settings import link_name
 from uavlinkd.endpoints.ports import Endpoint
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.relay_link import RelayLink
@@ -117,7 +116,7 @@ class Evidence:
 
     def seen_at_relay(self, kind: str, relay: RelayLink, now: float) -> Sighting | None:
         """The newest evidence of this kind from an address of a relay."""
-        return self._newest(kind, _addresses_of(relay.peers), now)
+        return self._newest(kind, _addresses_of(relay.peer), now)
 
     def seen_at(self, kind: str, place: Place, now: float) -> Sighting | None:
         """The newest evidence of this kind from a place: a ``relay`` by name, or :data:`ELSEWHERE`."""
@@ -157,7 +156,7 @@ class Evidence:
         """Look up where the peers are, and forget the sightings of all other places."""
         self._placed_at = now
         of_links = (place for link in self._links.values() for place in _places_of(link))
-        of_relays = (place for relay in self.relays.values() for place in _addresses_of(relay.peers))
+        of_relays = (place for relay in self.relays.values() for place in _addresses_of(relay.peer))
         self._places = frozenset((*of_links, *of_relays))
         known = {ELSEWHERE, *self._places, *(("peer", name) for name in self._links)}
         for key in [key for key in self._sightings if key[1] not in known and key[1][0] != "relay"]:
@@ -168,20 +167,20 @@ def _place_of(core_name: str) -> Place:
     """The place of a relay, or of a peer."""
     if core_name.startswith(RELAY_HOST):
         return "relay", core_name.removeprefix(RELAY_HOST)
-    return "peer", link_name(core_name)
+    return "peer", core_name
 
 
 def _places_of(link: PeerLink) -> list[Place]:
     """The addresses of a peer, and the hosts of those in the configuration."""
-    configured = [path.address for path in link.peers[0].paths.configured] if link.peers else []
+    configured = [path.address for path in link.peer.paths.configured]
     hosts = [address[0] for address in configured if relay_name(address) is None]  # a relay leads to many peers
-    return [*_addresses_of(link.peers), *(("host", host) for host in hosts)]
+    return [*_addresses_of(link.peer), *(("host", host) for host in hosts)]
 
 
-def _addresses_of(peers: Sequence[Peer]) -> list[Place]:
+def _addresses_of(peer: Peer) -> list[Place]:
     """The addresses of a peer or relay: those of the configuration, then learned ones."""
-    configured = [path.address for path in peers[0].paths.configured] if peers else []
-    learned = [state.path.address for peer in peers for state in peer.paths.states]
+    configured = [path.address for path in peer.paths.configured]
+    learned = [state.path.address for state in peer.paths.states]
     return [("address", address) for address in (*configured, *learned)]
 
 

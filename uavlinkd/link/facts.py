@@ -88,7 +88,7 @@ class Moment:
 
     def reported(self, relay: RelayLink) -> tuple[str, Path] | None:
         """The first such error at an address of a relay."""
-        errors = ((self.reported_at(path), path) for path in relay.peers[0].paths.configured)
+        errors = ((self.reported_at(path), path) for path in relay.peer.paths.configured)
         return next((found for found in errors if found[0]), None)
 
     def is_silent(self, relay: RelayLink) -> bool:
@@ -231,7 +231,7 @@ def _is_udp(path: Path) -> bool:
 
 def hosts_of(relay: RelayLink) -> set[str]:
     """Those of its addresses, as they are resolved now."""
-    return {path.host for path in relay.peers[0].paths.configured if _is_udp(path)}
+    return {path.host for path in relay.peer.paths.configured if _is_udp(path)}
 
 
 def _nearness(host: str) -> tuple[bool, bool]:
@@ -249,9 +249,9 @@ def place(address: SocketAddress | None) -> str:
     return "its address" if address is None else shown(address)
 
 
-def keys_at(sighting: Sighting, but: bytes | None = None) -> str:
+def keys_at(sighting: Sighting) -> str:
     """The public keys of senders, each with the address where it was seen last."""
-    keys = ((key, address) for key, address in sighting.details.items() if isinstance(key, bytes) and key != but)
+    keys = ((key, address) for key, address in sighting.details.items() if isinstance(key, bytes))
     return ", ".join(f"{encode_key(key)} at {place(address)}" for key, address in keys)
 
 

@@ -38,11 +38,11 @@ class DaemonParts:
         self.config = config
         """The one in force."""
         self.log = log
-        self.node = node = Node(config.private_key, os.urandom, now, config.previous_private_key, screen=screen)
+        self.node = node = Node(config.private_key, os.urandom, now, screen=screen)
         self.links: dict[str, PeerLink] = {}
         """By the peer's name."""
         self.link_of: dict[LinkedPeer, PeerLink] = {}
-        """By each peer of the core that carries frames: a link has several while keys change."""
+        """By each peer of the core that carries frames."""
         relay_links: dict[str, RelayLink] = {}
         limits = LineLimits()
         self.drops = DropSummary(log, limits)

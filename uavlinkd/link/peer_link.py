@@ -6,25 +6,23 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import itemgetter, sub
-from typing import NamedTuple
 
 from uavlinkd.config import PeerConfig
 from uavlinkd.core.constants import CONFIGURED_PATHS, LOSS_WINDOW_S, NEVER
 from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import LinkedPeer, Output, Transmit
+from uavlinkd.core.outputs import Output, Transmit
 from uavlinkd.core.path import Path
 from uavlinkd.core.path_state import PathState
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.problem_reports import LARGEST_PROBLEM_REPORT
 from uavlinkd.core.refusals import LARGEST_REPORT
-from uavlinkd.core.settings import PeerSettings, link_name
 from uavlinkd.core.timers import Deadline, Schedule
 from uavlinkd.link.networks import NetworkBudget
 from uavlinkd.link.peer_output import RAW, PeerOutput
 from uavlinkd.mavlink.flows import NewestStates
 from uavlinkd.mavlink.frames import Frame, SplitCounters
 from uavlinkd.mavlink.own_frames import LinkFigures, worst
-from uavlinkd.mavlink.payloads import REQUESTS, ParameterAnswers
+from uavlinkd.mavlink.payloads import REQUESTS
 from uavlinkd.mavlink.policy.delivery import Source
 from uavlinkd.ops.findings import LinkProblem
 from uavlinkd.ops.recorder import TO_PEER, Recorder
@@ -34,19 +32,6 @@ NOT_ANSWERING_S = 3.0
 
 RELAYED_LEAST = 3
 """Slots for configured paths that relayed ones have at least: one for each relay."""
-
-
-class KeyPairing(NamedTuple):
-    """A pair of keys for a peer of the core: one of the peer's, and one of ours that the peer knows."""
-
-    settings: PeerSettings
-    by_their_previous: bool = False
-    by_our_previous: bool = False
-
-    @property
-    def previous_key(self) -> tuple[str, bytes]:
-        """The peer and the previous key that this pair depends on; an empty key for our own."""
-        return link_name(self.settings.name), b"" if self.by_our_previous else self.settings.public_key
 
 
 class Rates:
@@ -96,8 +81,12 @@ class Carriage:
 class PeerLink:
     """Carries frames to one peer of a node. Compared by identity; times are monotonic seconds."""
 
-    def __init__(self, config: PeerConfig, carriage: Carriage, now: float, recorder: Recorder | None = None) -> None:
+    def __init__(
+        self, config: PeerConfig, peer: Peer, carriage: Carriage, now: float, recorder: Recorder | None = None
+    ) -> None:
         self.config = config
+        self.peer = peer
+        """Its object in the core."""
         self.name = config.name
         self.policy = config.make_policy()
         self.recorder = recorder
@@ -107,10 +96,6 @@ class PeerLink:
         """Frames with states older than one already delivered: see :meth:`pick_newest`."""
         self.frames_sent = 0
         """Frames for it that its policy let pass."""
-        self.peers: list[Peer] = []
-        """In the core: the one of the current keys first, then those of the pairs with a previous key."""
-        self.previous: dict[Peer, tuple[KeyPairing, float]] = {}
-        """The latter, and until when they are valid: a key is being changed, and the new one is not confirmed yet."""
         self.expected_since = now
         """When the daemon began to expect it, at first or again."""
         self.relayed: Sequence[Path] = ()
@@ -123,62 +108,40 @@ class PeerLink:
         self._carriage = carriage
         self._node = carriage.node
         self._perform = carriage.perform
-        self._answers = ParameterAnswers()
-        self._newest: dict[LinkedPeer, NewestStates] = {}
+        self._newest = NewestStates()
         self._direct: Sequence[Path] = ()
         self.losses: tuple[tuple[int, int], ...] = ()
         """In and out, how many envelopes were sent recently, and how many of them lost: by the last measurement."""
         self._missing = deque[tuple[int, int, int]](maxlen=1 + round(LOSS_WINDOW_S))  # session, expected, missing
         self._sample: tuple[int, tuple[int, int, int, int]] | None = None
         # A session, and its counters at one moment: expected and received here, and as the peer reports.
-        self.output = PeerOutput(
-            config.egress, carriage.node, carriage.budgets, self._answers.class_of, self._on_sent, now
-        )
+        self.output = PeerOutput(config.egress, peer, carriage.node, carriage.budgets, self._on_sent, now)
         """What waits for it."""
 
     def __repr__(self) -> str:
         return f"PeerLink({self.name})"
 
     @property
-    def peer(self) -> Peer:
-        """Its object in the core: that of the current keys, or of previous keys while only they work."""
-        if self.previous:
-            for peer in self.peers:
-                if peer.is_up:
-                    return peer
-        return self.peers[0]
-
-    @property
     def silent_since(self) -> float:
         """When something new came from it last, or the daemon began to expect it."""
-        return silent_since(self.peers, self.expected_since)
-
-    def forget(self, peer: Peer) -> None:
-        """A previous key is not accepted any more."""
-        self.peers.remove(peer)
-        del self.previous[peer]
-        self.output.forget(peer)
-        self._newest.pop(peer, None)
+        return silent_since(self.peer, self.expected_since)
 
     def leave(self, now: float) -> None:
         """Cut the peer off at once."""
-        for peer in self.peers:
-            self._perform(self._node.remove_peer(peer, now))
+        self._perform(self._node.remove_peer(self.peer, now))
         self.output.clear(now)
         self._carriage.waiting.remove(self)
 
     @property
-    def keys(self) -> set[bytes]:
-        """The keys by which a relay may know the peer: also the previous one, while it changes."""
-        config = self.config
-        return {key for key in (config.settings.public_key, config.previous_public_key) if key is not None}
+    def key(self) -> bytes:
+        """The static public key of the peer, by which a relay knows it."""
+        return self.config.settings.public_key
 
     def set_paths(self, paths: Sequence[Path], now: float) -> None:
         """Connect to the peer along these paths, and along the relayed ones."""
         self._direct = paths
         kept = CONFIGURED_PATHS - min(len(self.relayed), RELAYED_LEAST)
-        for peer in reversed(self.peers):  # a hint from an address is for the one that was set last
-            self._node.set_paths(peer, [*paths[:kept], *self.relayed, *paths[kept:]], now)
+        self._node.set_paths(self.peer, [*paths[:kept], *self.relayed, *paths[kept:]], now)
 
     def set_relayed(self, paths: Sequence[Path], now: float) -> bool:
         """Connect along these paths through relays too. Returns whether they changed."""
@@ -193,13 +156,12 @@ class PeerLink:
         if config.policy != self.config.policy:
             self.policy = config.make_policy()
         if config.egress != self.config.egress:
-            self.output.change(config.egress, self.peers, now)
+            self.output.change(config.egress, now)
         if config.addresses != self.config.addresses:
             self.expected_since = now
             self.set_paths((), now)  # its new names may have no address: do not connect to the old ones
-        for peer in self.peers:
-            peer.verify_interval_s = config.settings.link.verify_interval_s
-            self._node.offer(peer, config.settings.link.features, now)
+        self.peer.verify_interval_s = config.settings.link.verify_interval_s
+        self._node.offer(self.peer, config.settings.link.features, now)
         self.config = config
         self.follow_paths(now)
 
@@ -209,13 +171,12 @@ class PeerLink:
         ``source``: the port that sent them. ``waited_s``: how long the first of them has waited already.
         """
         self.frames_sent += len(frames)
-        peer = self.peer if self.previous else self.peers[0]
-        if self.output.egress is not None or peer.paths.is_multiple or self.output.repair.is_on:
-            if self.output.send(peer, frames, now, waited_s):
+        if self.output.egress is not None or self.peer.paths.is_multiple or self.output.repair.is_on:
+            if self.output.send(frames, now, waited_s):
                 self.send_waiting(now)
             return
         raws = list(map(RAW, frames))
-        outputs = self._node.send(peer, raws, now)
+        outputs = self._node.send(self.peer, raws, now)
         if self.recorder is not None:
             self._on_sent(raws, outputs, now)
         else:
@@ -229,7 +190,7 @@ class PeerLink:
 
     def send_waiting(self, now: float) -> None:
         """Send the waiting frames that are due, and schedule the next ones."""
-        self.output.send_waiting(self.peer, self.peers, now)
+        self.output.send_waiting(now)
         self._set_deadline(now)
 
     def report_refusals(self, now: float) -> None:
@@ -237,23 +198,20 @@ class PeerLink:
         if not self.peer.is_up or not self.output.has_room(LARGEST_REPORT, now):
             return  # totals lose nothing until the next call
         self._perform(self._node.report_refusals(self.peer, self.policy.incoming.changed_totals(), now))
-        self.output.charge(self.peers, now)
+        self.output.charge(now)
 
     def report_problems(self, codes: Iterable[int], now: float) -> None:
         """Report this daemon's own problems to the peer. Call it about once a second."""
         if self.peer.is_up and self.output.has_room(LARGEST_PROBLEM_REPORT, now):
             self._perform(self._node.report_problems(self.peer, codes, now))
-            self.output.charge(self.peers, now)
+            self.output.charge(now)
 
-    def pick_newest(self, peer: LinkedPeer, frames: list[Frame], order: int, now: float) -> list[Frame]:
+    def pick_newest(self, frames: list[Frame], order: int, now: float) -> list[Frame]:
         """The frames of an envelope without the states that are superseded. Call it if the peer has several paths.
 
-        ``order``: that of the envelope, among those of this peer of the core.
+        ``order``: that of the envelope.
         """
-        newest = self._newest.get(peer)
-        if newest is None:
-            newest = self._newest[peer] = NewestStates()
-        picked = newest.pick(frames, order)
+        picked = self._newest.pick(frames, order)
         self.frames_superseded += len(frames) - len(picked)
         self.note_requests(picked, now)
         return picked
@@ -262,7 +220,7 @@ class PeerLink:
         """Note requests of the peer, whose answers are critical. Call it while frames are classified."""
         for frame in frames:
             if frame.header.msgid in REQUESTS:
-                self._answers.note(frame, now)
+                self.output.answers.note(frame, now)
 
     def _on_sent(self, frames: list[bytes], outputs: list[Output], now: float) -> None:
         # Without a session no frame crosses the link.
@@ -277,7 +235,7 @@ class PeerLink:
 
     def follow_paths(self, now: float) -> None:
         """A session began, or other paths are used: envelopes may have another size and other budgets."""
-        self.output.follow(self.peer, now)
+        self.output.follow(now)
         self._set_deadline(now)
 
     def on_down(self, now: float, *, is_closed: bool) -> None:
@@ -310,7 +268,7 @@ class PeerLink:
             loss_in = _lost(expected, received)
             # The peer reports now and then. Until the next report the last one is valid.
             loss_out = _lost(expected_there, received_there) if expected_there else self.figures.loss_out
-        self.output.measure(peer, now)
+        self.output.measure(now)
         self.follow_paths(now)
         self.figures = LinkFigures(
             is_up=peer.is_up,
@@ -345,10 +303,7 @@ class PeerLink:
         return self.peer.round_trip_s
 
     def problems(self, now: float) -> dict[LinkProblem, int]:
-        """The totals of problems that no dropped datagram explains.
-
-        A total only grows for one peer of the core. Another key is another peer, whose totals start at zero.
-        """
+        """The totals of problems that no dropped datagram explains."""
         traffic = self.peer.traffic
         return {
             LinkProblem.ENVELOPES_MISSING: self.peer.missing(now),
@@ -360,9 +315,9 @@ class PeerLink:
         }
 
 
-def silent_since(peers: Iterable[Peer], expected_since: float) -> float:
-    """When something new came last with one of these pairs of keys, or ``expected_since`` if that is later."""
-    return max(expected_since, *(peer.received_at or -NEVER for peer in peers), -NEVER)
+def silent_since(peer: Peer, expected_since: float) -> float:
+    """When something new came from a peer last, or ``expected_since`` if that is later."""
+    return max(expected_since, peer.received_at or -NEVER)
 
 
 def radio_figures(links: Iterable[PeerLink]) -> LinkFigures | None:

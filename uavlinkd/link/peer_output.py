@@ -6,9 +6,9 @@ other paths wait sealed (:mod:`.copies`). Times are monotonic seconds.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from math import inf
-from operator import itemgetter
+from operator import itemgetter, sub
 from typing import Final
 
 from uavlinkd.core.constants import CRITICAL_ENVELOPE_LIMIT, NEVER
@@ -22,9 +22,10 @@ from uavlinkd.link.networks import COPIES_SHARE, NetworkBudget, carrier_bytes
 from uavlinkd.mavlink.dialect import IDS
 from uavlinkd.mavlink.egress.bucket import Bucket
 from uavlinkd.mavlink.egress.budgeted import EgressSettings, EnvelopeShape
-from uavlinkd.mavlink.egress.by_class import ClassOf, PeerEgress, split_by_class
+from uavlinkd.mavlink.egress.by_class import PeerEgress, split_by_class
 from uavlinkd.mavlink.flows import FlowKey, flow_key
 from uavlinkd.mavlink.frames import Frame
+from uavlinkd.mavlink.payloads import ParameterAnswers
 
 RAW = itemgetter(0)
 """The bytes of a frame."""
@@ -44,49 +45,52 @@ class PeerOutput:
     def __init__(
         self,
         settings: EgressSettings,
+        peer: Peer,
         node: Node,
         budgets: Mapping[int, NetworkBudget],
-        class_of: ClassOf,
         on_sent: OnSent,
         now: float,
     ) -> None:
         self._settings = settings
+        self._peer = peer
         self._node = node
         self._budgets = budgets
-        self._class_of = class_of
+        self.answers = ParameterAnswers()
+        """Requests of the peer, whose answers are critical."""
         self._on_sent = on_sent
-        self.egress = PeerEgress(settings, now, class_of) if settings.is_needed else None
+        self.egress = PeerEgress(settings, now, self.answers.class_of) if settings.is_needed else None
         """Frames that wait; None if frames never wait."""
         self.copies = Copies(budgets, now)
         self.repair = Repair()
         """Whether critical envelopes are repeated."""
-        self._charged: dict[Peer, tuple[int, int]] = {}  # datagrams and bytes that the budget was charged for
+        self._charged = 0, 0  # datagrams and bytes that the budget was charged for
         self._networks: dict[Class, list[Bucket | None]] = {}
         self._critical_limit = CRITICAL_ENVELOPE_LIMIT  # of the payload; set for each session
         self._stream_bytes = 0
         self._measured_at = now
         self._copied_at: dict[FlowKey, float] = {}  # of flows of stick positions
 
-    def send(self, peer: Peer, frames: Sequence[Frame], now: float, waited_s: float) -> bool:
+    def send(self, frames: Sequence[Frame], now: float, waited_s: float) -> bool:
         """Send frames that arrived together: at once, or when budgets and the coalescing delay allow it.
 
         Returns whether :meth:`send_waiting` has something to do.
         """
         if self.egress is not None:
-            self.egress.put(frames, now - waited_s, is_split=peer.paths.is_multiple or self.repair.is_on)
+            self.egress.put(frames, now - waited_s, is_split=self._peer.paths.is_multiple or self.repair.is_on)
             return True
-        for cls, part in split_by_class(frames, self._class_of, now):
-            self._send_class(peer, part, cls, now)
+        for cls, part in split_by_class(frames, self.answers.class_of, now):
+            self._send_class(part, cls, now)
         return bool(self.copies.waiting)
 
-    def send_waiting(self, peer: Peer, peers: Iterable[Peer], now: float) -> None:
-        """Send the waiting frames and copies that are due. ``peers``: all those that the budget is charged for."""
+    def send_waiting(self, now: float) -> None:
+        """Send the waiting frames and copies that are due."""
+        peer = self._peer
         if self.egress is not None:
-            self.charge(peers, now)
+            self.charge(now)
             cls, batch = self.egress.take(now)
             while batch:
-                self._send_class(peer, batch, cls, now)
-                self.charge(peers, now)
+                self._send_class(batch, cls, now)
+                self.charge(now)
                 cls, batch = self.egress.take(now)
         if self.copies.waiting:
             usable = {
@@ -109,36 +113,34 @@ class PeerOutput:
         """Whether an envelope with this payload may go out now."""
         return self.egress is None or self.egress.has_room(payload_bytes, now)
 
-    def charge(self, peers: Iterable[Peer], now: float) -> None:
+    def charge(self, now: float) -> None:
         """Charge the peer's own budget for all datagrams to it, handshakes and echoes too."""
         if self.egress is None:
             return
-        for peer in peers:
-            charged = self._charged.get(peer, (0, 0))
-            total = _sent(peer)
-            if total != charged:
-                self.egress.spend(total[1] - charged[1], now, datagrams=total[0] - charged[0])
-                self._charged[peer] = total
+        charged, self._charged = self._charged, self._sent()
+        if self._charged != charged:
+            datagrams, size = map(sub, self._charged, charged)
+            self.egress.spend(size, now, datagrams=datagrams)
+
+    def _sent(self) -> tuple[int, int]:
+        return self._peer.traffic.datagrams_sent, self._peer.traffic.bytes_sent
 
     # Changes.
 
-    def change(self, settings: EgressSettings, peers: Iterable[Peer], now: float) -> None:
+    def change(self, settings: EgressSettings, now: float) -> None:
         """Another budget or delay. What waits is dropped. What was sent before is not charged."""
         if self.egress is not None:
             self.egress.clear(now)  # and leave the lines of other peers
         self._settings = settings
-        self.egress = PeerEgress(settings, now, self._class_of) if settings.is_needed else None
+        self.egress = PeerEgress(settings, now, self.answers.class_of) if settings.is_needed else None
         self._networks = {}
-        self._charged = {peer: _sent(peer) for peer in peers}
+        self._charged = self._sent()
 
-    def forget(self, peer: Peer) -> None:
-        """A peer of the core is gone."""
-        self._charged.pop(peer, None)
-
-    def follow(self, peer: Peer, now: float) -> None:
+    def follow(self, now: float) -> None:
         """A session began, or other paths are used: envelopes have another size, frames wait for other networks."""
+        peer = self._peer
         if self._budgets:
-            self._follow_networks(peer, now)
+            self._follow_networks(now)
         session, path = peer.sessions.current, peer.path
         if session is None or path is None:
             return
@@ -150,8 +152,9 @@ class PeerOutput:
             seal = session.parameters.max_envelope - session.payload_limit
             self.egress.set_shape(EnvelopeShape(limit, seal, carrier_bytes(path)))
 
-    def _follow_networks(self, peer: Peer, now: float) -> None:
-        routes = {cls: [state for state in route if state.works] or route for cls, route in peer.paths.routes.items()}
+    def _follow_networks(self, now: float) -> None:
+        all_routes = self._peer.paths.routes.items()
+        routes = {cls: [state for state in route if state.works] or route for cls, route in all_routes}
         buckets = {number: budget.all for number, budget in self._budgets.items()}
         networks = {
             cls: [buckets.get(state.path.socket) for state in (route if cls is Class.CRITICAL else route[:1])]
@@ -162,17 +165,18 @@ class PeerOutput:
         self._networks = networks
         is_limited = any(None not in buckets for buckets in networks.values())
         if self.egress is None and is_limited:
-            self.egress = PeerEgress(self._settings, now, self._class_of)
+            self.egress = PeerEgress(self._settings, now, self.answers.class_of)
         if self.egress is not None:
             self.egress.set_networks(networks, now)
 
-    def measure(self, peer: Peer, now: float) -> None:
+    def measure(self, now: float) -> None:
         """Note the rate of the stream, which copies may use too, and the loss of paths. Call it once a second."""
         if now > self._measured_at:
             own_budget = self._settings.budget_bits_s
             most_bytes_s = COPIES_SHARE * own_budget / 8 if own_budget else inf
             self.copies.set_stream_rate(self._stream_bytes / (now - self._measured_at), now, most_bytes_s)
             self._stream_bytes, self._measured_at = 0, now
+        peer = self._peer
         is_allowed = peer.is_up and peer.settings.link.redundancy is not Redundancy.NONE
         self.repair.update(peer.paths.routes[Class.CRITICAL], now, is_allowed=is_allowed)
 
@@ -185,16 +189,16 @@ class PeerOutput:
 
     # Envelopes.
 
-    def _send_class(self, peer: Peer, frames: Sequence[Frame], cls: Class, now: float) -> None:
+    def _send_class(self, frames: Sequence[Frame], cls: Class, now: float) -> None:
         """Send frames of one class, in envelopes of their own."""
         if cls is Class.CRITICAL:
             # Newer states replace repeats of older ones, which must not contain events then.
             groups = _split_states(frames) if self.repair.is_on else (frames,)
             for group in groups:
                 for part in self._envelopes(group):
-                    self._send_part(peer, part, cls, now)
+                    self._send_part(part, cls, now)
         else:
-            self._send_part(peer, frames, cls, now)
+            self._send_part(frames, cls, now)
 
     def _envelopes(self, frames: Sequence[Frame]) -> Iterator[Sequence[Frame]]:
         """Frames that share an envelope, so that it is known which of them are in a copy that waits."""
@@ -208,26 +212,26 @@ class PeerOutput:
             part.append(frame)
         yield part
 
-    def _send_part(self, peer: Peer, frames: Sequence[Frame], cls: Class, now: float) -> None:
+    def _send_part(self, frames: Sequence[Frame], cls: Class, now: float) -> None:
         raws = list(map(RAW, frames))
-        if cls is Class.CRITICAL and peer.paths.is_multiple and self._is_spared(peer, frames, now):
+        if cls is Class.CRITICAL and self._peer.paths.is_multiple and self._is_spared(frames, now):
             cls = Class.STREAM
-        outputs = self._node.send(peer, raws, now, cls)
+        outputs = self._node.send(self._peer, raws, now, cls)
         if cls is not Class.CRITICAL:
             self._stream_bytes += sum(map(len, raws))
         if len(outputs) > 1:
-            outputs = self._pick_copies(peer, outputs, frames if cls is Class.CRITICAL else None, now)
+            outputs = self._pick_copies(outputs, frames if cls is Class.CRITICAL else None, now)
         if cls is Class.CRITICAL and self.repair.is_on:
             for datagram, sent in _by_datagram(outputs).items():  # along the same paths
                 paths = [transmit.path for transmit in sent]
                 self.copies.repeat(datagram, paths, frames, self.repair.transmissions, now)
         self._on_sent(raws, outputs, now)
 
-    def _is_spared(self, peer: Peer, frames: Sequence[Frame], now: float) -> bool:
+    def _is_spared(self, frames: Sequence[Frame], now: float) -> bool:
         """Whether these frames go along the best path alone: stick positions, which newer ones replace soon."""
         if self.repair.is_on or not all(frame.header.msgid in _STICKS for frame in frames):
             return False
-        best = peer.paths.best
+        best = self._peer.paths.best
         is_healthy = best is not None and best.condition is PathCondition.USABLE and best.loss_out < BEGIN_LOSS
         flows = set(map(flow_key, frames))
         self._copied_at = {flow: at for flow, at in self._copied_at.items() if now < at + STICKS_COPIED_S}
@@ -236,16 +240,14 @@ class PeerOutput:
         self._copied_at |= dict.fromkeys(flows, now)
         return False
 
-    def _pick_copies(
-        self, peer: Peer, outputs: Sequence[Output], frames: Sequence[Frame] | None, now: float
-    ) -> list[Output]:
+    def _pick_copies(self, outputs: Sequence[Output], frames: Sequence[Frame] | None, now: float) -> list[Output]:
         """The outputs without the datagrams that have to wait or are dropped."""
         left_out = set[Transmit]()
         for envelope in _by_datagram(outputs).values():
             if len(envelope) > 1:
                 left_out |= {*envelope} - {*self.copies.pick(envelope, frames, now)}
         for transmit in left_out:
-            peer.recount(transmit.path, -1, -len(transmit.datagram))
+            self._peer.recount(transmit.path, -1, -len(transmit.datagram))
         return [output for output in outputs if not isinstance(output, Transmit) or output not in left_out]
 
 
@@ -263,7 +265,3 @@ def _split_states(frames: Sequence[Frame]) -> list[Sequence[Frame]]:
     events = [frame for frame in frames if not frame.header.kind.is_state]
     states = [frame for frame in frames if frame.header.kind.is_state]
     return [group for group in (events, states) if group]
-
-
-def _sent(peer: Peer) -> tuple[int, int]:
-    return peer.traffic.datagrams_sent, peer.traffic.bytes_sent

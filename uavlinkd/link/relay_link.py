@@ -16,12 +16,9 @@ from uavlinkd.core import outputs as o
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import LinkedPeer
 from uavlinkd.core.path import Path, SocketAddress, relayed
 from uavlinkd.core.path_state import PathState
-from uavlinkd.core.peer import Peer
 from uavlinkd.core.relay_records import RELAYED, WAITING, Bind, Bound, binds_of, handle_of, wrap
-from uavlinkd.core.settings import previous_of
 from uavlinkd.link.peer_link import PeerLink, Rates, silent_since
 from uavlinkd.system.addresses import Address
 
@@ -109,10 +106,8 @@ class _Binding:
     """The keys of the last bind that no record has named since."""
     handles: dict[bytes, tuple[int, ...]] = field(default_factory=dict)
     """By key of a peer; empty while the peer is not there."""
-    sender: LinkedPeer | None = None
-    """The relay in the core, by the key of its last record."""
     orders: dict[bytes, int] = field(default_factory=dict)
-    """By key of a peer: that of the last record about it, among those of the sender."""
+    """By key of a peer: that of the last record about it."""
     bound_at: float = -NEVER
     """When the relay answered last."""
     seen_as: Address | None = None
@@ -124,15 +119,11 @@ class _Binding:
         self.due_at = now + min(c.BIND_RETRY_S, soon_s * 2.0 ** min(self.tries, 8))
         self.tries += 1
 
-    def receive(
-        self, bound: Bound, order: int, sender: LinkedPeer, wanted: Iterable[bytes], now: float
-    ) -> set[bytes] | DropReason:
+    def receive(self, bound: Bound, order: int, wanted: Iterable[bytes], now: float) -> set[bytes] | DropReason:
         """Take the handles of those peers that are wanted.
 
         Returns the keys whose handles changed, or why the record has no effect.
         """
-        if sender is not self.sender:  # the relay has another key: its sessions are counted from the beginning
-            self.sender, self.orders = sender, {}
         asked = {key for key, _ in bound.handles if key in wanted}
         named: dict[bytes, tuple[int, ...]] = {key: () for key in asked if order > self.orders.get(key, -1)}
         if not named:
@@ -175,11 +166,8 @@ class RelayLink:
         self.name = config.settings.name
         """No peer of the configuration has such a name."""
         self.link = link
-        self._peers: list[Peer] = []
-        if link is None:
-            self._peers.append(node.add_peer(config.settings, now))
-            if config.previous_public_key is not None:
-                self._peers.append(node.add_peer(previous_of(config.settings, config.previous_public_key), now))
+        self.peer = node.add_peer(config.settings, now) if link is None else link.peer
+        """Its object in the core."""
         self.rates = Rates(now)
         self.keys: tuple[bytes, ...] = ()
         """Of the peers that use it."""
@@ -190,27 +178,14 @@ class RelayLink:
         self._handles = handles
         self._on_handles = on_handles
         self._bindings: dict[Path, _Binding] = {}
-        self._is_confirmed = False
         self._asks: set[int] = set()  # sockets
         self._failed: set[Path] = set()
         self._asked_at: dict[int, float] = {}
 
     @property
-    def peers(self) -> list[Peer]:
-        """In the core: the one of its current key first, then others while a key changes."""
-        return self._peers if self.link is None else self.link.peers
-
-    @property
-    def peer(self) -> Peer:
-        """Its object in the core: that of a previous key while only that works."""
-        if self.link is not None:
-            return self.link.peer
-        return next((peer for peer in self._peers if peer.is_up), self._peers[0])
-
-    @property
     def silent_since(self) -> float:
         """When something new came from it last, or the daemon began to expect it."""
-        return silent_since(self.peers, self._expected_since)
+        return silent_since(self.peer, self._expected_since)
 
     def views(self) -> list[tuple[Path, Address]]:
         """The paths to the relay, each with this daemon's address as the relay sees it there."""
@@ -218,15 +193,13 @@ class RelayLink:
 
     def state_for(self, link: PeerLink) -> str:
         """Whether a peer is reached along the relay: ``bound``, ``waiting`` for it to ask too, or ``unanswered``."""
-        handles = [
-            binding.handles[key] for binding in self._bindings.values() for key in link.keys & binding.handles.keys()
-        ]
+        handles = [binding.handles[link.key] for binding in self._bindings.values() if link.key in binding.handles]
         return "bound" if any(handles) else "waiting" if handles and self.peer.is_up else "unanswered"
 
-    def paths_to(self, keys: Iterable[bytes]) -> list[list[Path]]:
-        """The relayed paths to a peer with one of these keys: a list for each path to the relay."""
+    def paths_to(self, key: bytes) -> list[list[Path]]:
+        """The relayed paths to the peer with this key: a list for each path to the relay."""
         return [
-            [relayed(at.socket, self.config.name, handle) for key in keys for handle in binding.handles.get(key, ())]
+            [relayed(at.socket, self.config.name, handle) for handle in binding.handles.get(key, ())]
             for at, binding in self._bindings.items()
         ]
 
@@ -234,8 +207,7 @@ class RelayLink:
 
     def set_paths(self, paths: Sequence[Path], now: float) -> None:
         """The relay is reached along these paths."""
-        for peer in reversed(self._peers):  # a hint from an address is for the one that was set last
-            self._node.set_paths(peer, paths, now)
+        self._node.set_paths(self.peer, paths, now)
         self._forget_lost(now)
 
     def follow(self, keys: Sequence[bytes]) -> None:
@@ -250,14 +222,9 @@ class RelayLink:
         self._schedule()
 
     def on_event(self, event: o.Event, now: float) -> None:
-        """A path works, or a session began, perhaps because the relay was restarted: bind immediately.
-
-        After a session with its current key, no other one is accepted.
-        """
+        """A path works, or a session began, perhaps because the relay was restarted: bind immediately."""
         if isinstance(event, o.PeerClosed):
             self._expected_since = now
-        if isinstance(event, o.SessionEstablished) and event.peer is self.peers[0]:
-            self._is_confirmed = True
         for path, binding in self._bindings.items():
             if isinstance(event, o.SessionEstablished) or (
                 isinstance(event, o.PathStateChanged) and event.is_usable and event.path == path
@@ -271,7 +238,7 @@ class RelayLink:
         binding = self._bindings.get(received.path)
         if binding is None or not isinstance(received.record, Bound):
             return DropReason.UNEXPECTED_RECORD  # a path without a bind; a bind, which is for a relay
-        changed = binding.receive(received.record, received.order, received.peer, self.keys, now)
+        changed = binding.receive(received.record, received.order, self.keys, now)
         if isinstance(changed, DropReason):
             return changed
         if changed:
@@ -303,7 +270,7 @@ class RelayLink:
 
     def do_due(self, now: float) -> list[o.Output]:
         """Ask and bind. Call it at :attr:`next_at`."""
-        out = self.forget_previous_key(now) if self._is_confirmed else []
+        out: list[o.Output] = []
         # What was asked a moment ago may have been answered before the path failed: ask again, a little later.
         sockets = {socket for socket in self._asks if now >= self._ask_at(socket)}
         failed = {path for path in self._failed if path.socket in sockets}
@@ -329,11 +296,6 @@ class RelayLink:
         self._forget_lost(now)
         self._schedule()
 
-    def forget_previous_key(self, now: float) -> list[o.Output]:
-        """Accept the current key only."""
-        gone, self._peers = self._peers[1:], self._peers[:1]
-        return [output for peer in gone for output in self._node.remove_peer(peer, now)]
-
     def leave(self, now: float) -> list[o.Output]:
         """Forget its handles, and end the session unless it is a peer's."""
         changed = set(self.keys)
@@ -341,7 +303,7 @@ class RelayLink:
         for path in list(self._bindings):
             self._forget(path)
         self._on_handles(changed, now)
-        return [output for peer in self._peers for output in self._node.remove_peer(peer, now)]
+        return [] if self.link is not None else self._node.remove_peer(self.peer, now)
 
     # Parts.
 
@@ -385,8 +347,7 @@ class RelayLink:
 
     def _schedule(self) -> None:
         due_at = min((binding.due_at for binding in self._working()), default=NEVER) if self.keys else NEVER
-        is_over = self._is_confirmed and len(self._peers) > 1
-        self.next_at = -NEVER if is_over else min((due_at, *map(self._ask_at, self._asks)))
+        self.next_at = min((due_at, *map(self._ask_at, self._asks)))
 
     def _ask_at(self, socket: int) -> float:
         return self._asked_at.get(socket, -NEVER) + ASK_S

@@ -237,24 +237,22 @@ class Relays:
         self._sockets.stop_following(relay.name)
         return relay.leave(now)
 
-    def change(self, config: RelayConfig, now: float) -> list[Output]:
-        """Its addresses changed, or its previous key is not accepted any more."""
+    def change(self, config: RelayConfig) -> None:
+        """Its addresses changed."""
         relay = self.by_name[config.name]
         relay.config = config
         if relay.link is None:
             self._sockets.stop_following(relay.name)
             self._sockets.follow(relay)
-        return relay.forget_previous_key(now) if config.previous_public_key is None else []
 
     def follow_links(self, now: float) -> None:
-        """The relays, the peers, their keys or their relays changed."""
+        """The relays, the peers or their relays changed."""
         for name, relay in self.by_name.items():
-            links = [link for link in self._links.values() if name in link.config.relays]
-            relay.follow([key for link in links for key in link.keys])
+            relay.follow([link.key for link in self._links.values() if name in link.config.relays])
         self._set_paths(self._links.values(), now)
 
     def _of_peer(self, peer: LinkedPeer) -> RelayLink | None:
-        return next((relay for relay in self.by_name.values() if peer in relay.peers), None)
+        return next((relay for relay in self.by_name.values() if relay.peer is peer), None)
 
     # Facts.
 
@@ -365,7 +363,7 @@ class Relays:
         return self.by_name.get(path.host.removeprefix(RELAY_HOST))
 
     def _on_handles(self, keys: set[bytes], now: float) -> None:
-        self._set_paths([link for link in self._links.values() if keys & link.keys], now)
+        self._set_paths([link for link in self._links.values() if link.key in keys], now)
         self._search(now)
 
     def _set_paths(self, links: Iterable[PeerLink], now: float) -> None:
@@ -378,5 +376,5 @@ class Relays:
     def _paths_to(self, link: PeerLink) -> Iterator[Path]:
         """The relayed paths to a peer: first one along each path to a relay, then the others."""
         relays = (self.by_name[name] for name in link.config.relays if name in self.by_name)
-        groups = [paths for relay in relays for paths in relay.paths_to(link.keys)]
+        groups = [paths for relay in relays for paths in relay.paths_to(link.key)]
         return (path for row in zip_longest(*groups) for path in row if path is not None)

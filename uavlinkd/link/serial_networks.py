@@ -271,17 +271,12 @@ class SerialNetworks:
         """The path along the serial network of this name."""
         return next((network.path for network in self.networks if network.name == name), None)
 
-    def peers_at(self, links: Iterable[PeerLink]) -> dict[int, list[Peer]]:
-        """The peers of the core at the other end of each line. The list is empty during a change."""
-        return {
-            network.number: [
-                peer
-                for link in links
-                if any(written.is_serial and written.network == network.name for written in link.config.addresses)
-                for peer in link.peers
-            ]
-            for network in self.networks
+    def peer_at(self, links: Iterable[PeerLink]) -> dict[int, Peer | None]:
+        """The peer of the core at the other end of each line; None during a change."""
+        peers = {
+            written.network: link.peer for link in links for written in link.config.addresses if written.is_serial
         }
+        return {network.number: peers.get(network.name) for network in self.networks}
 
     def start(self, receive: Receive, on_change: Callable[[], None]) -> None:
         """Open the devices, whenever they are present. ``on_change``: see :meth:`SerialNetwork.start`."""

@@ -39,7 +39,7 @@ def daemon_status(daemon: DaemonParts, now: float) -> dict[str, object]:
     node = daemon.node
     blocked, findings = daemon.history.blocked(now), find(daemon, now)
     is_cut_off = has_no_client(findings, len(daemon.local.endpoints))
-    contested = [name for name, link in daemon.links.items() if is_contested(link.peers, now)]
+    contested = [name for name, link in daemon.links.items() if is_contested(link.peer, now)]
     all_up = (bool(daemon.links) or daemon.config.is_only_relay) and all(
         link.peer.is_up for link in daemon.links.values()
     )
@@ -101,7 +101,6 @@ def peer_status(link: PeerLink, now: float, way_of: WayOf) -> dict[str, object]:
     return {
         "state": state_of(peer),
         "public_key": encode_key(peer.settings.public_key),
-        "accepts_previous_key": bool(link.previous),
         "path": None if peer.path is None else shown(peer.path.address),
         "last_received_s": _age(peer.received_at, now),
         "handshake_s": _age(peer.established_at, now),

@@ -54,8 +54,8 @@ _NOT_LISTENING: Final = ("ECONNREFUSED", "connect_timeout", "EHOSTUNREACH", "ENE
 
 def peer_problems(peer: PeerFacts) -> Iterator[Found]:
     """Of any peer: signs that a key is in wrong hands, and what the peer claims."""
-    if has_twin(peer.link.peers, Twin.PEERS, peer.now):
-        yield two_machines(f"{peer.name}'s private key: sessions came from {places(peer.link.peers)}")
+    if has_twin(peer.link.peer, Twin.PEERS, peer.now):
+        yield two_machines(f"{peer.name}'s private key: sessions came from {places(peer.link.peer)}")
     yield from _hidden_frames(peer)
     mixed = peer.history.mixed
     is_mixed = len(mixed) == mixed.maxlen and peer.now - mixed[0] <= SECURITY_S
@@ -74,19 +74,19 @@ def peer_problems(peer: PeerFacts) -> Iterator[Found]:
         yield problems_there(codes)
 
 
-def has_twin(peers: Iterable[Peer], twin: Twin, now: float, within_s: float = SECURITY_S) -> bool:
-    """Whether one of these pairs of keys showed a second process with a private key."""
-    return any(peer.sessions.twins and now - peer.sessions.twins.get(twin, -within_s) < within_s for peer in peers)
+def has_twin(peer: Peer, twin: Twin, now: float, within_s: float = SECURITY_S) -> bool:
+    """Whether the sessions with a peer showed a second process with a private key."""
+    return twin in peer.sessions.twins and now - peer.sessions.twins[twin] < within_s
 
 
-def is_contested(peers: Iterable[Peer], now: float) -> bool:
+def is_contested(peer: Peer, now: float) -> bool:
     """Whether two processes with one key displace each other now: each loses about half of the frames."""
-    return any(has_twin(peers, twin, now, EVIDENCE_S) for twin in Twin)
+    return any(has_twin(peer, twin, now, EVIDENCE_S) for twin in Twin)
 
 
-def places(peers: Iterable[Peer]) -> str:
+def places(peer: Peer) -> str:
     """Where a peer answered."""
-    answered = (state for peer in peers for state in peer.paths.states if state.is_validated or state.is_known)
+    answered = (state for state in peer.paths.states if state.is_validated or state.is_known)
     return listed(dict.fromkeys(shown(state.path.address) for state in answered)) or "an unknown address"
 
 

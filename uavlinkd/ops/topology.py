@@ -15,9 +15,7 @@ from rich.text import Text
 from uavlinkd.config import Config, EndpointConfig, PeerConfig, PolicyData
 from uavlinkd.config.advice import exposure
 from uavlinkd.config.keys import encode_key, looks_private
-from uavlinkd.config.model import KEY_GRACE_S
 from uavlinkd.config.network_rules import used_networks
-from uavlinkd.core.crypto import x25519_public_key
 from uavlinkd.core.settings import Link
 from uavlinkd.mavlink import dialect
 from uavlinkd.mavlink.policy.compilation import Policy, PolicyRow
@@ -63,7 +61,9 @@ def _facts(config: Config, here: Surroundings | None) -> list[RenderableType]:
         parts += [_heading("Networks"), _networks(config, here)]
     if config.peers:
         links = _table(("name", "address", "suites", "mode, at least", "PSK"), map(_peer, config.peers))
-        keys = _table(("name", "public key"), ((peer.name, _keys(peer)) for peer in config.peers))
+        keys = _table(
+            ("name", "public key"), ((peer.name, _whole(peer.settings.public_key)) for peer in config.peers)
+        )
         parts += [_heading("Peers"), links]
         if not all(peer.is_called for peer in config.peers):
             port = config.listen[0].port
@@ -122,11 +122,6 @@ def _whole(public_key: bytes) -> str:
     return "(private?)" if looks_private(public_key) else encode_key(public_key)
 
 
-def _keys(peer: PeerConfig) -> str:
-    before = peer.previous_public_key
-    return _whole(peer.settings.public_key) + ("" if before is None else f"\nor {_whole(before)}")
-
-
 def _identity(config: Config) -> Table:
     table = Table.grid(padding=(0, 2))
     table.add_column(style="dim")
@@ -134,10 +129,6 @@ def _identity(config: Config) -> Table:
     table.add_row("name", Text(config.name, style="bold"))
     # Not shortened: the user copies it into the files of the peers.
     table.add_row("public key", Text(encode_key(config.public_key)))
-    if config.previous_private_key is not None:
-        before = encode_key(x25519_public_key(config.previous_private_key.reveal()))
-        grace = f"valid until the peer confirms the new key, at most {KEY_GRACE_S / 86400:g} days from each start"
-        table.add_row("previous key", Text(f"{before}\n{grace}"))
     table.add_row("listens on", Text(_listening(config)))
     if not config.is_only_relay:
         others = ", and from peer to peer" if config.routing.relay else " only"

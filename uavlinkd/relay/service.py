@@ -33,10 +33,10 @@ LOOK_S = 0.1  # paths of binds that came before their validation are looked at s
 class RelayMember:
     """A member, and what it does."""
 
-    def __init__(self, settings: MemberSettings, peers: Sequence[Peer], now: float, *, is_own: bool) -> None:
+    def __init__(self, settings: MemberSettings, peer: Peer, now: float, *, is_own: bool) -> None:
         self.settings = settings
-        self.peers = tuple(peers)
-        """In the core: several while this daemon's key changes, and the member is a peer too."""
+        self.peer = peer
+        """Its object in the core."""
         self.is_own = is_own  # whether the relay added its peer to the core: it does not carry frames
         self.meter = Meter(settings.limits)
         self.binds = TokenBucket(BINDS_PER_S, BINDS_BURST, now)
@@ -46,12 +46,6 @@ class RelayMember:
         """Filter tests above this limit, or along a path that is not validated or does not work."""
         self.since = now  # when it was up or not for the first time, as it is now
         self.reported_over_limit = 0  # of the meter's count
-
-    @property
-    def peer(self) -> Peer:
-        """Its object in the core: one that is up, or the one of the current keys."""
-        first, *others = self.peers
-        return first if first.is_up or not others else next((peer for peer in others if peer.is_up), first)
 
     @property
     def key(self) -> bytes:
@@ -99,28 +93,25 @@ class RelayService:
 
     # Members.
 
-    def set_members(
-        self, members: Mapping[bytes, MemberSettings], peers: Mapping[bytes, Sequence[Peer]], now: float
-    ) -> None:
+    def set_members(self, members: Mapping[bytes, MemberSettings], peers: Mapping[bytes, Peer], now: float) -> None:
         """These are all members from now on, by public key. ``peers``: the daemon's peers, which carry frames, by
-        their public key. Of each key the one that knows the current key of this daemon is first.
+        their public key.
 
         A member that changes from one to the other, or that has another name or PSK, has to make a new session.
         """
         for member in list(self.members.values()):
-            peer = None if member.is_own else member.peers[0]
-            if not _is_same(member, members) or next(iter(peers.get(member.key, ())), None) is not peer:
+            peer = None if member.is_own else member.peer
+            if not _is_same(member, members) or peers.get(member.key) is not peer:
                 self._remove(member, now)
         for key, settings in members.items():
             if key not in self.members:
-                own = () if key in peers else (self._node.add_peer(settings.peer, now),)
-                self.members[key] = RelayMember(settings, own, now, is_own=bool(own))
+                peer = peers.get(key) or self._node.add_peer(settings.peer, now)
+                self.members[key] = RelayMember(settings, peer, now, is_own=key not in peers)
             member = self.members[key]
-            member.peers = tuple(peers.get(key, member.peers))
             member.settings = settings
             member.meter.set_limits(settings.limits)
             self.bindings.set_member(key, settings.most_peers)
-        self._member_of = {peer: member for member in self.members.values() for peer in member.peers}
+        self._member_of = {member.peer: member for member in self.members.values()}
 
     def release(self, members: Mapping[bytes, MemberSettings], others: Container[bytes], now: float) -> None:
         """Give up the peers in the core whose name or key another one may have now. ``others``: keys of the daemon's
@@ -135,10 +126,9 @@ class RelayService:
         del self.members[member.key]
         self._asked.pop(member.key, None)
         self._unreported += _over_limit(member)
-        for peer in member.peers:
-            self._member_of.pop(peer, None)
-            if member.is_own:
-                self._shell.perform(self._node.remove_peer(peer, now))
+        self._member_of.pop(member.peer, None)
+        if member.is_own:
+            self._shell.perform(self._node.remove_peer(member.peer, now))
 
     # From the core. Neither method sends.
 
@@ -149,7 +139,7 @@ class RelayService:
         self._look_at = now  # a path may be validated
         if isinstance(event, o.PeerUp | o.PeerLost | o.PeerClosed):
             member.since = now
-        if isinstance(event, o.PeerClosed) and not member.peer.is_up:  # with any key
+        if isinstance(event, o.PeerClosed):
             for path in self.bindings.paths_of(member.key):
                 self._apply(self.bindings.end_path(member.key, path, now))
         if member.is_own:
@@ -160,8 +150,7 @@ class RelayService:
         member, path, record = self._member_of.get(received.peer), received.path, received.record
         if member is None or path.is_serial or path.is_relayed:
             return DropReason.UNEXPECTED_RECORD
-        peer = member.peer  # of those with several keys, the one with a session
-        state = peer.paths.find(path)
+        state = member.peer.paths.find(path)
         if state is None:
             return DropReason.UNEXPECTED_RECORD
         is_proven = state.is_validated and state.works
@@ -170,7 +159,7 @@ class RelayService:
         if not isinstance(record, FilterTest):
             return DropReason.UNEXPECTED_RECORD
         if is_proven and member.filter_tests.take(now):
-            self._filter_tests.append((peer, path, record.token))
+            self._filter_tests.append((member.peer, path, record.token))
             return None
         member.filter_tests_ignored += 1
         return DropReason.RECORD_OVER_LIMIT if is_proven else DropReason.UNEXPECTED_RECORD

@@ -102,9 +102,8 @@ class Member:
     def _receive_record(self, received: o.RecordReceived, now: float) -> None:
         if self.link.on_record(received, now) is None:
             was_bound = bool(self.handle)
-            self.handle = max(
-                (path.address[1] for at in self.link.paths_to(self.link.keys) for path in at), default=0
-            )
+            paths = (path for key in self.link.keys for at in self.link.paths_to(key) for path in at)
+            self.handle = max((path.address[1] for path in paths), default=0)
             if self.handle and not was_bound:
                 self.bound_at = now
 

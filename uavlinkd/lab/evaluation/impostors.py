@@ -76,8 +76,7 @@ class ThievingNode(Node):
 
     def __init__(self, identity: KeyPair, now: float) -> None:
         super().__init__(Secret(os.urandom(32)), os.urandom, now)
-        own = self._handshakes.own
-        own.identity, own.mac_keys = identity, MacKeys(identity.public)
+        self._handshakes.identity, self._handshakes.cookies.keys = identity, MacKeys(identity.public)
 
 
 @dataclass(frozen=True, slots=True)
