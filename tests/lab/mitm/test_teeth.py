@@ -176,8 +176,8 @@ def test_receiver_with_one_key_for_both_directions_takes_its_own_frames(monkeypa
 def test_receiver_that_takes_the_header_as_it_is_never_hears_its_peer(monkeypatch: pytest.MonkeyPatch) -> None:
     """An altered index leaves two ends that agree on keys and speak past one another."""
 
-    def open_payload(payload: bytes, header: bytes) -> wire.Parameters:
-        return wire.parse_parameters(payload[len(header) - 1 :])
+    def open_payload(payload: bytes, header: bytes) -> tuple[wire.Parameters, bytes]:
+        return wire.parse_parameters(payload[len(header) - 1 :]), b""
 
     monkeypatch.setattr(handshake, "_open_payload", open_payload)
     stage = _stage()
