@@ -42,7 +42,7 @@ from uavlinkd.core.certificates import (
 from uavlinkd.core.crypto import AuthorityKey, Secret
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import PeerAdmitted, PeerUp, RecordReceived
+from uavlinkd.core.outputs import PeerAdmitted, PeerExpired, PeerUp, RecordReceived
 from uavlinkd.core.relay_records import BulletinRecord, CertificateRecord, Have, Who, parse_record
 from uavlinkd.core.settings import PeerSettings
 
@@ -246,6 +246,8 @@ def test_peer_by_certificate() -> None:
     assert len(rekey) == SHORT
     assert datagrams(fleet.b.receive(rekey, c.REKEY_AFTER_S + 1), wire.RESPONSE)
     assert fleet.shown == [signed(CERTIFICATE, KEY_A.public)]
+    assert not fleet.b.node.remove_peer(fleet.b.peer, now := c.REKEY_AFTER_S + 2, closes=False)
+    assert reasons(fleet.b.receive(fleet.a.envelope(now), now)) == [DropReason.LATE]
 
 
 def test_replayed_initiation_leaves_nothing() -> None:
@@ -254,7 +256,7 @@ def test_replayed_initiation_leaves_nothing() -> None:
     initiation = fleet.initiation(0.0)
     assert datagrams(fleet.b.receive(initiation, 0.0, ELSEWHERE))
     assert fleet.b.node.next_deadline() <= c.UNCONFIRMED_LIFETIME_S
-    fleet.b.timeout(c.UNCONFIRMED_LIFETIME_S)
+    assert of(fleet.b.timeout(c.UNCONFIRMED_LIFETIME_S), PeerExpired)
     assert not fleet.b.node.peers
     assert not fleet.b.node._indices.owners
     assert datagrams(fleet.b.receive(fleet.initiation(11.0), 11.0), wire.RESPONSE)

@@ -174,10 +174,10 @@ def receive_close(peer: Peer, session: Session, now: float) -> list[Output]:
     return out
 
 
-def close(peer: Peer, now: float) -> list[Output]:
-    """Send a close on the current session and forget every key."""
+def close(peer: Peer, now: float, *, sends: bool = True) -> list[Output]:
+    """Send a close on the current session, unless ``sends`` is false, and forget every key."""
     session, out = peer.sessions.current, list[Output]()
-    if session is not None and now < session.reject_at:
+    if sends and session is not None and now < session.reject_at:
         out += seal(peer, session, wire.Close().encode(), peer.paths.routes[Class.CRITICAL], now)
     out += freshness.end(peer, peer.sessions.clear(now))
     peer.initiator.cancel()

@@ -19,7 +19,7 @@ from uavlinkd.core.cookie import CookieJar, MacKeys
 from uavlinkd.core.crypto import Entropy, KeyPair, Secret
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.initiator import Pending
-from uavlinkd.core.outputs import Deliver, Dropped, Output
+from uavlinkd.core.outputs import Deliver, Dropped, Output, PeerExpired
 from uavlinkd.core.path import Path, SocketAddress, SocketFacts
 from uavlinkd.core.peer import Peer, Shared
 from uavlinkd.core.probing import ask_candidates
@@ -109,7 +109,7 @@ class Node:
         settings = admit(public_key, certificate, now)
         peer = self._handshakes.peers.get(public_key)
         if peer is None:
-            peer = self.add_peer(replace(settings, initiates=False), now)
+            peer = self.add_peer(settings, now)
             peer.provisional_until = now + c.UNCONFIRMED_LIFETIME_S
             peer.set_expiry()
             self._schedule.update(peer)
@@ -122,14 +122,17 @@ class Node:
             if peer.settings.is_certified:
                 peer.initiator.certificate = certificate
 
-    def remove_peer(self, peer: Peer, now: float) -> list[Output]:
-        """Cut this peer off at once: its keys are forgotten, and nothing from it is accepted any more."""
+    def remove_peer(self, peer: Peer, now: float, *, closes: bool = True) -> list[Output]:
+        """Cut this peer off at once: its keys are forgotten, and nothing from it is accepted any more.
+
+        ``closes``: it gets a close.
+        """
         del self.peers[peer.name]
         self.facts.peers = len(self.peers)
         self._handshakes.admission.set_peers(len(self.peers))
         self._handshakes.forget(peer)
         self._forget_addresses(peer)
-        out = establish.close(peer, now)
+        out = establish.close(peer, now, sends=closes)
         peer.paths.clear()
         self._schedule.remove(peer)
         return out
@@ -274,7 +277,7 @@ class Node:
         out: list[Output] = []
         for peer in self._schedule.pop(now, PEERS_AT_ONCE):
             if now >= peer.provisional_until:
-                out += self.remove_peer(peer, now)
+                out += [*self.remove_peer(peer, now), PeerExpired(peer)]
                 continue
             out += handle_timeout(peer, now)
             self._schedule.update(peer)

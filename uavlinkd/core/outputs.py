@@ -66,6 +66,12 @@ class PeerAdmitted(NamedTuple):
     peer: LinkedPeer
 
 
+class PeerExpired(NamedTuple):
+    """A peer that showed a certificate did not prove that it is there, and was removed."""
+
+    peer: LinkedPeer
+
+
 class PeerUp(NamedTuple):
     """A valid envelope or response came from a peer that was not up."""
 
@@ -145,5 +151,5 @@ class FreshnessVerified(NamedTuple):
 
 PathEvent = PathChanged | PathStateChanged | PathSuspected
 LinkEvent = PeerUp | PeerLost | PeerClosed | SessionEstablished | FreshnessUnverified | FreshnessVerified
-Event = PeerAdmitted | LinkEvent | PathEvent
+Event = PeerAdmitted | PeerExpired | LinkEvent | PathEvent
 Output = Transmit | Deliver | RecordReceived | Dropped | Event
