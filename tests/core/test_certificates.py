@@ -6,10 +6,10 @@ import struct
 from contextlib import suppress
 
 import pytest
-from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.authority.signing import AUTHORITY, CERTIFICATE, FLEET, SIGNER, published, signed
 from tests.core.harness import (
     AT_A,
     AT_B,
@@ -30,10 +30,7 @@ from uavlinkd.core import constants as c
 from uavlinkd.core import wire
 from uavlinkd.core.certificates import (
     Bulletin,
-    Certificate,
-    MemberRole,
     digest_of,
-    fleet_id_of,
     is_certified,
     is_published,
     parse_bulletin,
@@ -45,20 +42,6 @@ from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import PeerAdmitted, PeerExpired, PeerUp, RecordReceived
 from uavlinkd.core.relay_records import BulletinRecord, CertificateRecord, Have, Who, parse_record
 from uavlinkd.core.settings import PeerSettings
-
-SIGNER = Ed25519PrivateKey.from_private_bytes(bytes(32))
-AUTHORITY = AuthorityKey(SIGNER.public_key().public_bytes_raw())
-FLEET = fleet_id_of(AUTHORITY.public)
-CERTIFICATE = Certificate(FLEET, 7, MemberRole.VEHICLE, (7, 7), "v7")
-
-
-def signed(certificate: Certificate, key: bytes) -> bytes:
-    return certificate.encode() + SIGNER.sign(certificate.to_be_signed(key))
-
-
-def published(bulletin: Bulletin) -> bytes:
-    return bulletin.encode() + SIGNER.sign(bulletin.to_be_signed())
-
 
 # Formats.
 
