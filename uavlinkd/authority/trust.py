@@ -10,6 +10,7 @@ from enum import Enum
 from typing import NamedTuple
 
 from uavlinkd.core.certificates import (
+    GENERATION,
     Bulletin,
     Certificate,
     digest_of,
@@ -49,7 +50,9 @@ class BulletinVerdict(Enum):
     KNOWN = "known"
     """Equal or older."""
     INVALID = "invalid"
-    """Another fleet's, malformed, or not signed."""
+    """Another fleet's or another generation's, malformed, or not signed."""
+    UNVERIFIED = "unverified"
+    """It may be newer, and the signature was not to be verified."""
     SHRINKS = "bulletin_shrinks"
     CONFLICT = "bulletin_conflict"
 
@@ -70,7 +73,7 @@ class Trust:
     def __init__(self, authority: AuthorityKey, own_key: bytes, certificate: bytes, bulletin: bytes) -> None:
         self._authority = authority
         self.fleet = fleet_id_of(authority.public)
-        self._own_key = own_key
+        self.own_key = own_key
         parsed = self._verified(bulletin)
         if parsed is None:
             raise ValueError("is not a bulletin of this fleet")
@@ -95,7 +98,7 @@ class Trust:
         except Drop:
             return False
         is_newer = self.own is None or certificate.serial > self.own.certificate.serial
-        if not is_newer or not self._is_signed(certificate, self._own_key, data):
+        if not is_newer or not self._is_signed(certificate, self.own_key, data):
             return False
         self.own = HeldCertificate(certificate, data)
         return True
@@ -103,17 +106,26 @@ class Trust:
     # Certificates of others.
 
     def judge(self, key: bytes, data: bytes) -> Certificate:
-        """The certificate in these bytes, if it is valid for this static key now. Changes nothing.
+        """The certificate that counts for this static key now: the one in these bytes, or a newer one that is held.
+
+        Changes nothing.
 
         Raises:
             Drop: ``BAD_CERTIFICATE``, ``CERTIFICATE_REVOKED`` or ``MEMBER_CONFLICT``.
         """
         certificate = parse_certificate(data)
-        if key == self._own_key or not self._is_signed(certificate, key, data):
+        if key == self.own_key or not self._is_signed(certificate, key, data):
             raise Drop(DropReason.BAD_CERTIFICATE)
+        held = self.held.get(key)
+        if (
+            held is not None and certificate.serial < held.certificate.serial
+        ):  # the member may not have its new one yet
+            certificate = held.certificate
         label = f"{certificate.name}, serial {certificate.serial}"
         if self.bulletin.refuses(certificate.serial) or certificate.name in self.pinned.denied:
             raise Drop(DropReason.CERTIFICATE_REVOKED, label)
+        if key in self.pinned.keys:
+            raise Drop(DropReason.MEMBER_CONFLICT, f"{label}, and a key of the configuration")
         if (other := self._conflict(key, certificate)) is not None:
             raise Drop(DropReason.MEMBER_CONFLICT, f"{label}, and {other}")
         return certificate
@@ -136,6 +148,18 @@ class Trust:
         for other in ended:
             del self.held[other]
         self.held[key] = HeldCertificate(certificate, data)
+        return ended
+
+    def reserve(self, pinned: Pinned) -> list[bytes]:
+        """Apply what the configuration reserves now. Returns the keys of held certificates that it ends."""
+        self.pinned = pinned
+        ended: list[bytes] = []
+        for key, held in list(self.held.items()):
+            try:
+                self.judge(key, held.data)
+            except Drop:
+                ended.append(key)
+                del self.held[key]
         return ended
 
     def _conflict(self, key: bytes, certificate: Certificate) -> str | None:
@@ -161,19 +185,25 @@ class Trust:
 
     # Bulletins.
 
-    def receive_bulletin(self, data: bytes) -> tuple[BulletinVerdict, list[bytes]]:
-        """Take a bulletin if it is newer. Returns the keys of certificates that it ends too: forget their peers."""
-        bulletin = parse_bulletin(data)
+    def receive_bulletin(self, data: bytes, *, may_verify: bool = True) -> tuple[BulletinVerdict, list[bytes]]:
+        """Take a bulletin if it is newer. Returns the keys of certificates that it ends too: forget their peers.
+
+        Without ``may_verify``, one that may be newer or of the same number is not looked at.
+        """
+        bulletin, own = parse_bulletin(data), self.bulletin
         if bulletin is None or bulletin.fleet != self.fleet:
             return BulletinVerdict.INVALID, []
-        if bulletin.number == self.bulletin.number and data != self.bulletin_bytes:
-            verdict = BulletinVerdict.CONFLICT if is_published(data, self._authority) else BulletinVerdict.INVALID
-            return verdict, []
-        if bulletin.number <= self.bulletin.number:
+        if bulletin.number // GENERATION != own.number // GENERATION:  # only another authority's key begins one
+            return BulletinVerdict.INVALID, []
+        if bulletin.number < own.number or data == self.bulletin_bytes:
             return BulletinVerdict.KNOWN, []
+        if not may_verify:
+            return BulletinVerdict.UNVERIFIED, []
         if not is_published(data, self._authority):
             return BulletinVerdict.INVALID, []
-        if self.bulletin.shrinks(bulletin):
+        if bulletin.number == own.number:
+            return BulletinVerdict.CONFLICT, []
+        if own.shrinks(bulletin):
             return BulletinVerdict.SHRINKS, []
         self.bulletin, self.bulletin_bytes = bulletin, data
         ended = [key for key, held in self.held.items() if bulletin.refuses(held.certificate.serial)]

@@ -1,0 +1,22 @@
+"""Limits and times of a fleet with an authority. README.md has them in its table."""
+
+from __future__ import annotations
+
+from uavlinkd.core.constants import Rate
+
+CERTIFIED_PEERS = 256
+"""Peers by certificate, provisional ones included: one for each system id."""
+CONTACTS_FIRST_S = 1.0
+HAVE_INTERVAL_S = 10.0
+HAVE_LEAST_S = 0.1
+PUSH_JITTER_S = 0.1
+"""Otherwise all members that got a bulletin together send it to each other at the same moment."""
+PUSH_AGAIN_S = 0.2
+PUSH_TRIES = 10
+BULLETIN_LEAST_S = 1.0
+"""A captured member causes one signature check a second, 60 µs, for each of the two kinds of record."""
+WHO_INTERVAL_S = 20.0
+WHO = Rate(4.0, 16)
+CERTIFICATES_PER_ANSWER = 8
+CERTIFICATES = Rate(32.0, 256)
+INTRODUCTIONS = Rate(8.0, 32)
