@@ -10,9 +10,21 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 
+from tests.core.harness import seeded
 from uavlinkd.core import crypto
-from uavlinkd.core.crypto import AeadKey, KeyPair, MacKey, Secret
+from uavlinkd.core.crypto import (
+    AeadKey,
+    AuthorityKey,
+    KeyPair,
+    MacKey,
+    Secret,
+    SigningKey,
+    read_signing_key,
+    signing_key_pem,
+)
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.kem import ffdhe_prime
 
@@ -126,3 +138,35 @@ def test_ffdhe_power_is_modular_exponentiation() -> None:
         expected = pow(base, int.from_bytes(exponent, "big"), prime).to_bytes(256, "big")
         assert crypto.ffdhe_power(prime, base, exponent) == expected
     assert crypto.ffdhe_power(prime, 2, bytes(63) + b"\x05") == (32).to_bytes(256, "big")
+
+
+def test_signing_key_file() -> None:
+    """OpenSSL's format, encrypted or not; a signature by the key in it verifies."""
+    private, passphrase = Secret(bytes(range(32))), Secret(b"correct horse")
+    pem = signing_key_pem(private, passphrase, seeded(1))
+    assert pem.startswith("-----BEGIN ENCRYPTED PRIVATE KEY-----\n")
+    assert read_signing_key(pem.encode(), passphrase) == private
+    assert read_signing_key(signing_key_pem(private, None, seeded(1)).encode(), None) == private
+    key = SigningKey(read_signing_key(pem.encode(), passphrase))
+    assert AuthorityKey(key.public).verifies(key.sign(b"data"), b"data")
+    assert not AuthorityKey(key.public).verifies(key.sign(b"data"), b"other data")
+
+
+@pytest.mark.parametrize("passphrase", [None, Secret(b""), Secret(b"wrong")])
+def test_signing_key_needs_its_passphrase(passphrase: Secret | None) -> None:
+    """The error repeats nothing of it."""
+    pem = signing_key_pem(Secret(bytes(32)), Secret(b"right"), seeded(1)).encode()
+    with pytest.raises(ValueError, match=r"^is not a private key that this passphrase opens$"):
+        read_signing_key(pem, passphrase)
+
+
+@pytest.mark.parametrize(("data", "passphrase"), [(b"", None), (b"-----BEGIN PRIVATE KEY-----\n", None)])
+def test_other_file_is_no_signing_key(data: bytes, passphrase: Secret | None) -> None:
+    """Nor is a key of another kind."""
+    with pytest.raises(ValueError, match="is not a private key"):
+        read_signing_key(data, passphrase)
+    other = X25519PrivateKey.from_private_bytes(bytes(32)).private_bytes(
+        Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()
+    )
+    with pytest.raises(ValueError, match="is not a private key of Ed25519"):
+        read_signing_key(other, passphrase)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import base64
 import contextlib
 import tempfile
 import tomllib
@@ -10,10 +11,12 @@ from pathlib import Path
 from typing import Final
 
 from tests.fuzz.engine import Run, Script
+from uavlinkd.authority import enrolment
 from uavlinkd.config import Config, ConfigError
 from uavlinkd.config.keys import KeyFileError, decode_key, encode_key, read_secret_file
 from uavlinkd.config.load import load_config
 from uavlinkd.core import wire
+from uavlinkd.core.crypto import sha256
 from uavlinkd.core.suites import SUITES
 from uavlinkd.fleet.manifest import FILE_NAME, FleetError, read_manifest, write_manifest
 from uavlinkd.lab.mitm import anatomy
@@ -123,6 +126,23 @@ def make_key() -> Run:
             return
         assert encode_key(secret.reveal()) == text.strip(), "a key with two spellings"
         assert decode_key(text) == secret.reveal()
+
+    return run
+
+
+def make_enrolment() -> Run:
+    """The two lines of an enrolment, the reply also with a right checksum: one spelling, or an EnrolmentError."""
+
+    def run(data: bytes) -> None:
+        text = data.decode("latin-1")
+        whole = base64.b64encode(data + sha256(data)[: enrolment.CHECK_BYTES]).decode().rstrip("=")
+        with contextlib.suppress(enrolment.EnrolmentError):
+            assert enrolment.parse_request(text).line().split() == text.split(), "a request with two spellings"
+        for line in (text.strip(), whole):
+            with contextlib.suppress(enrolment.EnrolmentError):
+                reply = enrolment.parse_reply(line)
+                assert reply.line() == line, "a reply with two spellings"
+                enrolment.verify_reply(reply, decode_key(PUBLIC))
 
     return run
 

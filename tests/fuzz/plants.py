@@ -8,6 +8,7 @@ import tomllib
 from collections.abc import Callable
 from typing import Any, Final, NamedTuple
 
+from uavlinkd.authority import enrolment
 from uavlinkd.config import checks as config_checks
 from uavlinkd.config import keys
 from uavlinkd.config import load as config_load
@@ -220,6 +221,9 @@ PLANTS: Final = {
     "text with a brace": Plant("manifest", tomllib, "loads", _raises(AttributeError(), lambda text: "{" in text)),
     "two spellings of a key": Plant(
         "key", keys, "decode_key", lambda _: lambda text: base64.b64decode(text.strip().ljust(44, "="))[:32]
+    ),
+    "two spellings of a line": Plant(
+        "enrolment", enrolment, "_decoded", lambda _: lambda text, reason: base64.b64decode(text.encode())
     ),
     "a record of the last three bytes": Plant(
         "tlog",

@@ -1,0 +1,210 @@
+"""The two lines of an enrolment: a member's request, and the operator's reply. README.md, section Enrolment.
+
+Pure and total: any text is a line or an :class:`EnrolmentError`, whose message is for a person. Neither line has a
+secret, but the reply decides whom the new member trusts: compare the fingerprint at both ends.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import struct
+from typing import NamedTuple
+
+from uavlinkd.authority.trust import Trust
+from uavlinkd.core.certificates import BULLETIN_BYTES, NAME, MemberRole, parse_certificate
+from uavlinkd.core.constants import KEY_BYTES
+from uavlinkd.core.crypto import AuthorityKey, is_usable_public_key, sha256
+from uavlinkd.core.drops import Drop
+from uavlinkd.core.suites import SUITES, Suite
+from uavlinkd.core.wire import CERTIFICATE_BYTES
+from uavlinkd.system.addresses import AddressError, parse_address
+
+WORD = "uavlink-enroll-1"
+VERSION = 1
+CHECK_BYTES = 4
+MOST_CONTACTS = 3
+LONGEST_LINE = 4096
+"""More characters than three contacts need. A terminal accepts no longer line."""
+_HEAD = struct.Struct(f">BBBBH{KEY_BYTES}s{KEY_BYTES}s{CERTIFICATE_BYTES}sH")
+_CONTACT = struct.Struct(f">{KEY_BYTES}s{CERTIFICATE_BYTES}sBB")
+_CUT = "is not a whole line of `uavlinkd fleet sign`: it was cut or changed on its way; copy it again, or send a file"
+
+
+class EnrolmentError(ValueError):
+    """A line cannot be used. The message says why, and what to do."""
+
+
+def fingerprint_of(authority: bytes) -> str:
+    """Eight characters by which persons compare the public key of an authority."""
+    return base64.b32encode(sha256(b"uavlink fleet" + authority)[:5]).decode().lower()
+
+
+class Request(NamedTuple):
+    """What a new member asks to be signed."""
+
+    name: str
+    public_key: bytes
+
+    def line(self) -> str:
+        """The line, without its end."""
+        key = base64.b64encode(self.public_key).decode()
+        check = base64.b32encode(sha256(f"{WORD} {self.name} {key}".encode())[:5]).decode().lower()
+        return f"{WORD} {self.name} {key} {check}"
+
+
+def parse_request(line: str) -> Request:
+    """The request in a line.
+
+    Raises:
+        EnrolmentError: with the reason.
+    """
+    words = line.split()
+    if words[:1] != [WORD] or len(words) != 4:
+        raise EnrolmentError("is not a whole line of `uavlinkd enroll NAME`: copy it again")
+    check_name(words[1])
+    request = Request(words[1], _decoded(words[2], "is not a line of `uavlinkd enroll NAME`: copy it again"))
+    if len(request.public_key) != KEY_BYTES or request.line().split() != words:
+        raise EnrolmentError("was changed on its way: copy the line of `uavlinkd enroll NAME` again")
+    if not is_usable_public_key(request.public_key):
+        raise EnrolmentError("has a public key of small order, with which no session is secret")
+    return request
+
+
+def check_name(name: str) -> None:
+    """Check that a certificate can have this name.
+
+    Raises:
+        EnrolmentError: it cannot.
+    """
+    if not NAME.fullmatch(name):
+        raise EnrolmentError(f"{name!r:.80} is not a name: write 1 to 21 of a-z, 0-9 and -, first and last not -")
+
+
+class Contact(NamedTuple):
+    """A member that the others reach by address from the start."""
+
+    public_key: bytes
+    certificate: bytes
+    addresses: tuple[str, ...]
+    relays: bool
+
+    def encode(self) -> bytes:
+        """Its bytes in a reply."""
+        texts = [bytes([len(address)]) + address.encode() for address in self.addresses]
+        return _CONTACT.pack(self.public_key, self.certificate, self.relays, len(texts)) + b"".join(texts)
+
+
+class Reply(NamedTuple):
+    """All that a member needs beside its private key."""
+
+    suite: Suite
+    calls: frozenset[MemberRole]
+    """Members of these roles it connects to."""
+    relays: bool
+    """Whether it passes datagrams between members."""
+    port: int
+    """Where it listens; 0: it need not."""
+    authority: bytes
+    successor: bytes
+    """SHA-256 of the key that may follow the authority's."""
+    certificate: bytes
+    bulletin: bytes
+    contacts: tuple[Contact, ...]
+
+    def line(self) -> str:
+        """The line, without its end."""
+        calls = sum(1 << role for role in self.calls)
+        head = (VERSION, self.suite.number, calls, self.relays, self.port, self.authority, self.successor)
+        data = _HEAD.pack(*head, self.certificate, len(self.bulletin)) + self.bulletin + bytes([len(self.contacts)])
+        data += b"".join(contact.encode() for contact in self.contacts)
+        return base64.b64encode(data + sha256(data)[:CHECK_BYTES]).decode().rstrip("=")
+
+
+def parse_reply(line: str) -> Reply:
+    """The reply in a line; its signatures are not verified.
+
+    Raises:
+        EnrolmentError: with the reason.
+    """
+    text = line.strip()
+    if text.startswith(WORD):
+        raise EnrolmentError(
+            "is the request of `uavlinkd enroll`: give it to `uavlinkd fleet sign`, whose line is meant"
+        )
+    data = _decoded(text + "=" * (-len(text) % 4), _CUT)
+    if len(data) < _HEAD.size + BULLETIN_BYTES or sha256(data[:-CHECK_BYTES])[:CHECK_BYTES] != data[-CHECK_BYTES:]:
+        raise EnrolmentError(_CUT)
+    if data[0] != VERSION:
+        raise EnrolmentError("is of another version of uavlinkd: install the same one at both ends")
+    try:
+        reply = _parsed(data[:-CHECK_BYTES])
+    except (ValueError, LookupError, struct.error):
+        raise EnrolmentError(
+            "has a field that this version does not know: install the same one at both ends"
+        ) from None
+    return reply
+
+
+def _parsed(data: bytes) -> Reply:
+    _, suite, calls, relays, port, authority, successor, certificate, size = _HEAD.unpack_from(data)
+    at = _HEAD.size + size
+    count, at = data[at], at + 1
+    contacts = []
+    for _ in range(count):
+        key, signed, flag, addresses = _CONTACT.unpack_from(data, at)
+        at += _CONTACT.size
+        texts = []
+        for _ in range(addresses):
+            texts.append(data[at + 1 : at + 1 + data[at]].decode("ascii"))
+            at += 1 + data[at]
+        contacts.append(Contact(key, signed, tuple(texts), bool(flag)))
+    roles = frozenset(role for role in MemberRole if calls >> role & 1)
+    bulletin = data[_HEAD.size : _HEAD.size + size]
+    parts = (authority, successor, certificate, bulletin, tuple(contacts))
+    reply = Reply(SUITES[suite], roles, bool(relays), port, *parts)
+    is_same = base64.b64decode(reply.line() + "==")[:-CHECK_BYTES] == data  # one spelling of each reply
+    if not is_same or count > MOST_CONTACTS or not all(contact.addresses for contact in contacts):
+        raise ValueError("not canonical")
+    return reply
+
+
+def verify_reply(reply: Reply, own_key: bytes) -> Trust:
+    """Verify each signature of a reply for this static public key. The result holds the contacts' certificates.
+
+    Raises:
+        EnrolmentError: with the reason.
+    """
+    try:
+        authority = AuthorityKey(reply.authority)
+        own = parse_certificate(reply.certificate)
+        trust = Trust(authority, own_key, b"", reply.bulletin)
+        for contact in reply.contacts:
+            for address in contact.addresses:
+                parse_address(address, allow_names=True)
+    except AddressError as error:
+        raise EnrolmentError(f"names a contact whose address {error}") from None
+    except Drop:
+        raise EnrolmentError("has an invalid certificate: sign the request again") from None
+    except ValueError as error:
+        raise EnrolmentError(f"has no valid authority or bulletin: the key or bulletin {error}") from None
+    if not trust.replace_own(reply.certificate):
+        raise EnrolmentError(f"has the certificate of another key, named {own.name}: use the line of this request")
+    if trust.bulletin.refuses(own.serial):
+        raise EnrolmentError(f"has a revoked certificate, serial {own.serial}: sign the request again")
+    for contact in reply.contacts:
+        try:
+            trust.hold(contact.public_key, contact.certificate)
+        except Drop as drop:
+            raise EnrolmentError(f"has a contact with an invalid certificate ({drop.reason}): sign again") from None
+    return trust
+
+
+def _decoded(text: str, reason: str) -> bytes:
+    try:
+        data = base64.b64decode(text, validate=True)
+    except (binascii.Error, ValueError):
+        raise EnrolmentError(reason) from None
+    if base64.b64encode(data).decode() != text:
+        raise EnrolmentError(reason)
+    return data
