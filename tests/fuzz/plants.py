@@ -182,7 +182,7 @@ PLANTS: Final = {
         "handshakes",
         handshake,
         "_open_payload",
-        lambda _: lambda payload, header: wire.parse_parameters(payload[len(header) - 1 :]),
+        lambda _: lambda payload, header: (wire.parse_parameters(payload[len(header) - 1 :]), b""),
     ),
     "any checksum fits": Plant("stream", frames, "CHECKSUM_STEPS", lambda _: range(0x10000)),
     "a byte is skipped that belongs to the next frame": Plant(

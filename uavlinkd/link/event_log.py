@@ -170,9 +170,7 @@ class EventLog:
             self._log.info("repair_began", peer=link.name, transmissions=repair.transmissions)
         elif not repair.is_on and watch.repair is not None:
             (began_at, before), watch.repair = watch.repair, None
-            self._log.info(
-                "repair_ended", peer=link.name, duration_s=round(now - began_at, 3), bytes=max(0, size - before)
-            )
+            self._log.info("repair_ended", peer=link.name, duration_s=round(now - began_at, 3), bytes=size - before)
 
     def _write_problem(
         self, key: tuple[str, LinkProblem], phase: Phase, condition: OpenCondition, omitted: dict[str, int]
@@ -299,26 +297,20 @@ class LinkWatch:
         """All problems since the start."""
         self.shares: dict[LinkProblem, float] = {}
         """Of the envelopes, when a problem was noted last."""
-        self._before: dict[LinkProblem, int] = {}
-        self._received = self._received_before = 0
+        self._received = 0
         self._steps: deque[tuple[float, Counter[LinkProblem], int]] = deque()
 
     def measure(self, totals: Mapping[LinkProblem, int], received: int, now: float) -> dict[LinkProblem, Growth]:
-        """Compare with the totals of a minute ago. Call it about once a second.
-
-        A smaller total means that the counter was reset. It is the new baseline.
-        """
-        grown = {problem: max(0, total - self._before.get(problem, 0)) for problem, total in totals.items()}
+        """Compare with the totals of a minute ago. Call it about once a second."""
+        grown = {problem: total - self.totals[problem] for problem, total in totals.items()}
         self.totals.update(grown)
-        self._before = dict(totals)
         if not self._steps or now - self._steps[-1][0] >= STEP_S:
             self._steps.append((now, self.totals - Counter(grown), self._received))
-        self._received += max(0, received - self._received_before)
-        self._received_before = received
+        self._received = received
         while len(self._steps) > 1 and self._steps[1][0] <= now - WINDOW_S:
             self._steps.popleft()
         _, then, received_then = self._steps[0]
-        arrived = self._received - received_then
+        arrived = received - received_then
         missing = self.totals[LinkProblem.ENVELOPES_MISSING] - then[LinkProblem.ENVELOPES_MISSING]
         sent = max(1, arrived + missing)
         return {
