@@ -20,3 +20,7 @@ WHO = Rate(4.0, 16)
 CERTIFICATES_PER_ANSWER = 8
 CERTIFICATES = Rate(32.0, 256)
 INTRODUCTIONS = Rate(8.0, 32)
+INTRODUCED_AFTER_S = 0.5
+"""After a session a member binds those that it knows. Until then no other is introduced to it."""
+INTRODUCED_AGAIN_S = 2.5
+"""Half the interval of binds that wait: binds along several paths cause one introduction."""

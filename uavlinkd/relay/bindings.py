@@ -121,6 +121,11 @@ class Bindings:
         """The paths along which a member has wishes."""
         return list(self._members[member].paths)
 
+    def wished_at(self, member: bytes, key: bytes) -> float:
+        """When a member bound a key last; minus infinity if it has no wish for it."""
+        until = max((wish.until for wish in self._wishes_of(member, key).values()), default=-c.NEVER)
+        return until - c.BIND_LIFETIME_S
+
     def refused(self, member: bytes) -> int:
         """How many wishes of a member were ignored so far, because it had or made as many as it may."""
         return self._members[member].refused

@@ -6,10 +6,10 @@ A member is found by its public key. Its peer in the core may be one that carrie
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Container, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 
+from uavlinkd.authority.trust import HeldCertificate
 from uavlinkd.core import constants as c
 from uavlinkd.core import outputs as o
 from uavlinkd.core.crypto import Entropy
@@ -19,9 +19,10 @@ from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import LinkedPeer, Output
 from uavlinkd.core.path import Path
 from uavlinkd.core.peer import Peer
-from uavlinkd.core.relay_records import Bind, FilterTest, FilterTested, bounds_of, token_datagram
+from uavlinkd.core.relay_records import Bind, FilterTest, FilterTested, Who, bounds_of, token_datagram
 from uavlinkd.relay.bindings import Bindings, Changes
 from uavlinkd.relay.forwarding import Forwarding, MemberSettings, Meter, RelayLimits, RelayReason
+from uavlinkd.relay.introductions import Introductions
 
 BINDS_PER_S = 32  # Binds of one member a second, each of up to 16 keys. Each may cause reports to other members.
 BINDS_BURST = 256  # So many at once, after a quiet while: a ground station with 1,000 vehicles, along four paths.
@@ -53,11 +54,13 @@ class RelayMember:
         return self.settings.peer.public_key
 
 
-class _Asked(NamedTuple):
-    """Keys that a member asked for along a path that may yet be validated."""
+@dataclass(slots=True)
+class _Asked:
+    """Keys that a member asked for along a path that may yet be validated, and its last question there."""
 
-    until: float
-    keys: dict[bytes, None]
+    until: float = 0.0
+    keys: dict[bytes, None] = field(default_factory=dict)
+    who: Who | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,11 +86,13 @@ class RelayService:
         self._member_of: dict[LinkedPeer, RelayMember] = {}
         self.bindings = Bindings(shell.entropy)
         self.forwarding = Forwarding(shell.send, shell.clock, limits)
+        self.introductions = Introductions(self.bindings.wished_at)
         self._due: dict[tuple[bytes, Path], dict[bytes, None]] = {}  # reports to members
         self._asked: dict[bytes, dict[Path, _Asked]] = {}
         self._look_at = 0.0
         self._unchecked: list[bytes] = []  # keys of members whose paths are to be looked at
         self._filter_tests: list[tuple[Peer, Path, bytes]] = []  # tokens to be sent
+        self._questions: list[tuple[RelayMember, Path, Who]] = []
         self._reported = Counter[Reason]()
         self._unreported: list[tuple[Reason, str, int]] = []  # drops of removed members, and of binds that waited
 
@@ -99,27 +104,56 @@ class RelayService:
 
         A member that changes from one to the other, or that has another name or PSK, has to make a new session.
         """
-        for member in list(self.members.values()):
+        for member in self._configured_before(members):
             peer = None if member.is_own else member.peer
             if not _is_same(member, members) or peers.get(member.key) is not peer:
                 self._remove(member, now)
         for key, settings in members.items():
             if key not in self.members:
                 peer = peers.get(key) or self._node.add_peer(settings.peer, now)
-                self.members[key] = RelayMember(settings, peer, now, is_own=key not in peers)
-            member = self.members[key]
-            member.settings = settings
-            member.meter.set_limits(settings.limits)
-            self.bindings.set_member(key, settings.most_peers)
-        self._member_of = {member.peer: member for member in self.members.values()}
+                self._add(RelayMember(settings, peer, now, is_own=key not in peers))
+            self._set(self.members[key], settings)
 
-    def release(self, members: Mapping[bytes, MemberSettings], others: Container[bytes], now: float) -> None:
+    def admit(self, peer: Peer, settings: MemberSettings, held: HeldCertificate, now: float, *, is_own: bool) -> None:
+        """A peer of the core with this certificate is a member from now on, perhaps with a newer one or other limits.
+
+        ``is_own``: it carries no frames, and the relay removes it from the core. A member of the configuration with
+        the same key stays as it is.
+        """
+        key = settings.peer.public_key
+        if key in self.members and self.members[key].peer is not peer:
+            self.end(key, now)
+        if key not in self.members:
+            self._add(RelayMember(settings, peer, now, is_own=is_own))
+        elif key not in self.introductions:
+            return
+        self._set(self.members[key], settings)
+        self.introductions.set(key, held, now, is_up=peer.is_up)
+
+    def end(self, key: bytes, now: float) -> None:
+        """A member by certificate is one no more: its wishes and handles end, and it gets no close."""
+        if key in self.introductions:
+            self._remove(self.members[key], now)
+
+    def release(self, members: Mapping[bytes, MemberSettings], others: Collection[bytes], now: float) -> None:
         """Give up the peers in the core whose name or key another one may have now. ``others``: keys of the daemon's
         peers and relays.
         """
-        for member in list(self.members.values()):
+        for member in self._configured_before({*members, *others}):
             if member.is_own and (member.key in others or not _is_same(member, members)):
                 self._remove(member, now)
+
+    def _configured_before(self, keys: Collection[bytes]) -> list[RelayMember]:
+        """The members of the configuration, and those by certificate whose key it has now."""
+        return [member for key, member in self.members.items() if key not in self.introductions or key in keys]
+
+    def _add(self, member: RelayMember) -> None:
+        self.members[member.key] = self._member_of[member.peer] = member
+
+    def _set(self, member: RelayMember, settings: MemberSettings) -> None:
+        member.settings = settings
+        member.meter.set_limits(settings.limits)
+        self.bindings.set_member(member.key, settings.most_peers)
 
     def _remove(self, member: RelayMember, now: float) -> None:
         self._apply(self.bindings.remove_member(member.key, now))
@@ -127,8 +161,11 @@ class RelayService:
         self._asked.pop(member.key, None)
         self._unreported += _over_limit(member)
         self._member_of.pop(member.peer, None)
+        is_certified = member.key in self.introductions
+        if is_certified:
+            self.introductions.remove(member.key)
         if member.is_own:
-            self._shell.perform(self._node.remove_peer(member.peer, now))
+            self._shell.perform(self._node.remove_peer(member.peer, now, closes=not is_certified))
 
     # From the core. Neither method sends.
 
@@ -139,6 +176,9 @@ class RelayService:
         self._look_at = now  # a path may be validated
         if isinstance(event, o.PeerUp | o.PeerLost | o.PeerClosed):
             member.since = now
+            self.introductions.set_up(member.key, is_up=member.peer.is_up)
+        if isinstance(event, o.SessionEstablished):
+            self.introductions.on_session(member.key, now)
         if isinstance(event, o.PeerClosed):
             for path in self.bindings.paths_of(member.key):
                 self._apply(self.bindings.end_path(member.key, path, now))
@@ -156,6 +196,8 @@ class RelayService:
         is_proven = state.is_validated and state.works
         if isinstance(record, Bind):
             return self._receive_bind(member, path, record, now, is_proven=is_proven)
+        if isinstance(record, Who):
+            return self._receive_question(member, path, record, now, is_proven=is_proven)
         if not isinstance(record, FilterTest):
             return DropReason.UNEXPECTED_RECORD
         if is_proven and member.filter_tests.take(now):
@@ -172,23 +214,40 @@ class RelayService:
             return DropReason.RECORD_OVER_LIMIT
         if is_proven:
             return self._bind(member, path, bind.keys, now)
-        # The first bind comes with the first envelope of a session. Its path is validated one round trip later.
-        asked = self._asked.setdefault(member.key, {})
-        for gone in [path for path in asked if member.peer.paths.find(path) is None]:
-            del asked[gone]
-            self._count_late(DropReason.UNEXPECTED_RECORD, member)
-        keys = asked[path].keys if path in asked else {}
+        asked = self._asked_along(member, path, now)
+        keys = asked.keys
         keys |= dict.fromkeys(bind.keys)
         left_out = list(keys)[member.settings.most_peers :]
         for key in left_out:
             del keys[key]
         member.binds_ignored += len(left_out)
-        asked[path] = _Asked(now + c.QUESTION_LIFETIME_S, keys)
         return DropReason.RECORD_OVER_LIMIT if left_out else None
+
+    def _asked_along(self, member: RelayMember, path: Path, now: float) -> _Asked:
+        """What waits for a path. The first bind comes with the first envelope of a session; its path is validated one
+        round trip later.
+        """
+        asked = self._asked.setdefault(member.key, {})
+        for gone in [path for path in asked if member.peer.paths.find(path) is None]:
+            del asked[gone]
+            self._count_late(DropReason.UNEXPECTED_RECORD, member)
+        asked.setdefault(path, _Asked()).until = now + c.QUESTION_LIFETIME_S
+        return asked[path]
+
+    def _receive_question(
+        self, member: RelayMember, path: Path, who: Who, now: float, *, is_proven: bool
+    ) -> DropReason | None:
+        if (reason := self.introductions.may_ask(member.key, now)) is None:
+            if is_proven:
+                self._questions.append((member, path, who))
+            else:
+                self._asked_along(member, path, now).who = who
+        return reason
 
     def _bind(self, member: RelayMember, path: Path, keys: Sequence[bytes], now: float) -> DropReason | None:
         before = self.bindings.refused(member.key)
         self._apply(self.bindings.bind(member.key, path, keys, now))
+        self.introductions.on_bind(member.key, keys, now)
         return DropReason.RECORD_OVER_LIMIT if self.bindings.refused(member.key) > before else None
 
     # From the shell.
@@ -196,10 +255,12 @@ class RelayService:
     @property
     def is_due(self) -> bool:
         """Whether :meth:`settle` may have something to do."""
-        return bool(self._due or self._asked or self._filter_tests)
+        return bool(self._due or self._asked or self._filter_tests or self._questions or self.introductions.is_due)
 
     def settle(self, now: float) -> None:
-        """Bind along paths that are validated now, report changes to the members, and send what tests filters."""
+        """Bind along paths that are validated now, report changes to the members, and send what tests filters, and
+        certificates.
+        """
         if self._asked and now >= self._look_at:
             self._look_at = now + LOOK_S
             self._bind_validated(now)
@@ -215,6 +276,16 @@ class RelayService:
         for peer, path, token in tests:
             if self._shell.send_from_new_port(token_datagram(token), path):
                 self._shell.perform(self._node.send_record(peer, path, FilterTested(token), now))
+        questions, self._questions = self._questions, []
+        for member, path, who in questions:
+            if self.members.get(member.key) is not member:
+                continue
+            if (answer := self.introductions.answer(member.key, who, now)) is None:
+                self._count_late(DropReason.RECORD_OVER_LIMIT, member)
+            for record in answer or ():
+                self._shell.perform(self._node.send_record(member.peer, path, record, now))
+        for key, record in self.introductions.pop_due(now):
+            self._shell.perform(self._node.send_record(self.members[key].peer, None, record, now))
 
     def _bind_validated(self, now: float) -> None:
         before, self._asked = self._asked, {}
@@ -227,6 +298,8 @@ class RelayService:
                 elif state.is_validated and state.works:
                     if (reason := self._bind(member, path, list(asked.keys), now)) is not None:
                         self._count_late(reason, member)
+                    if asked.who is not None:
+                        self._questions.append((member, path, asked.who))
                 else:
                     self._asked.setdefault(key, {})[path] = asked
 
@@ -242,6 +315,7 @@ class RelayService:
             self._unchecked = list(self.members)
         checked, self._unchecked = self._unchecked[:CHECKED_PER_S], self._unchecked[CHECKED_PER_S:]
         for member in filter(None, map(self.members.get, checked)):
+            self.introductions.prune(member.key)
             for path in self.bindings.paths_of(member.key):
                 if member.peer.paths.find(path) is None:
                     self._apply(self.bindings.end_path(member.key, path, now))

@@ -1,0 +1,152 @@
+"""The certificates that a relay's members learn of each other. uavlinkd/authority/README.md.
+
+Pure: no I/O, no clock, no randomness. Only members by certificate take part. Their static public keys name them.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right, insort
+from collections.abc import Callable, Iterable
+from operator import itemgetter
+
+from uavlinkd.authority import constants as a
+from uavlinkd.authority.trust import HeldCertificate
+from uavlinkd.core import constants as c
+from uavlinkd.core.certificates import MemberRole
+from uavlinkd.core.drops import DropReason
+from uavlinkd.core.limits import TokenBucket
+from uavlinkd.core.relay_records import CertificateRecord, Who
+
+_serial = itemgetter(0)
+
+
+class _Certified:
+    def __init__(self, held: HeldCertificate, now: float) -> None:
+        self.held = held
+        self.is_up = False
+        self.session_at = now
+        self.questions = TokenBucket(*a.WHO, now)
+        self.certificates = TokenBucket(*a.CERTIFICATES, now)
+        self.introductions = TokenBucket(*a.INTRODUCTIONS, now)
+        self.seekers: dict[bytes, float] = {}
+        """Members that wish to reach it, and when each was introduced."""
+
+
+class Introductions:
+    """The certified members of a relay.
+
+    ``wished_at``: when a member bound a key last, minus infinity if it has no wish for it.
+    """
+
+    def __init__(self, wished_at: Callable[[bytes, bytes], float]) -> None:
+        self._wished_at = wished_at
+        self._members: dict[bytes, _Certified] = {}
+        self._up: dict[MemberRole, list[tuple[int, bytes]]] = {role: [] for role in MemberRole}
+        """Serials and keys, ascending."""
+        self._arrived: dict[bytes, float] = {}  # members with a new session, and when to introduce others, ascending
+        self._due: dict[tuple[bytes, bytes], None] = {}  # who is to learn of whom
+
+    def __contains__(self, key: bytes) -> bool:
+        return key in self._members
+
+    # Members.
+
+    def set(self, key: bytes, held: HeldCertificate, now: float, *, is_up: bool) -> None:
+        """A member has this certificate from now on."""
+        if (member := self._members.get(key)) is None:
+            member = self._members[key] = _Certified(held, now)
+        self.set_up(key, is_up=False)
+        member.held = held
+        self.set_up(key, is_up=is_up)
+
+    def remove(self, key: bytes) -> None:
+        """Tell others nothing more about it."""
+        self.set_up(key, is_up=False)
+        del self._members[key]
+        self._arrived.pop(key, None)
+
+    def set_up(self, key: bytes, *, is_up: bool) -> None:
+        """A member came up or went down."""
+        if (member := self._members.get(key)) is None:
+            return
+        certificate = member.held.certificate
+        entries, entry = self._up[certificate.role], (certificate.serial, key)
+        if is_up and not member.is_up:
+            insort(entries, entry)
+        elif member.is_up and not is_up:
+            del entries[bisect_left(entries, entry)]
+        member.is_up = is_up
+
+    def on_session(self, key: bytes, now: float) -> None:
+        """A member has a new session, perhaps after a restart. Then it has forgotten the others."""
+        if (member := self._members.get(key)) is not None:
+            member.session_at = now
+            self._arrived.pop(key, None)
+            self._arrived[key] = now + a.INTRODUCED_AFTER_S
+
+    def prune(self, key: bytes) -> None:
+        """Forget seekers whose wish has ended."""
+        if (member := self._members.get(key)) is not None:
+            seekers = member.seekers.items()
+            member.seekers = {seeker: at for seeker, at in seekers if self._wished_at(seeker, key) > -c.NEVER}
+
+    # Questions.
+
+    def may_ask(self, key: bytes, now: float) -> DropReason | None:
+        """Why a question of a member has no effect."""
+        if (member := self._members.get(key)) is None:
+            return DropReason.UNEXPECTED_RECORD
+        return None if member.questions.take(now) else DropReason.RECORD_OVER_LIMIT
+
+    def answer(self, key: bytes, who: Who, now: float) -> list[CertificateRecord] | None:
+        """The certificates that a member asks for; None if it got too many."""
+        found = list[tuple[int, bytes]]()
+        for role, entries in self._up.items():
+            if who.roles >> role & 1:
+                at = bisect_right(entries, who.after, key=_serial)
+                found += entries[at : at + a.CERTIFICATES_PER_ANSWER + 1]
+        keys = [other for _, other in sorted(found) if other != key][: a.CERTIFICATES_PER_ANSWER]
+        return list(map(self._record, keys)) if self._members[key].certificates.take(now, len(keys)) else None
+
+    # Introductions.
+
+    def on_bind(self, seeker: bytes, keys: Iterable[bytes], now: float) -> None:
+        """A member bound these keys."""
+        if seeker in self._members:
+            for key in keys:
+                if key in self._members and key != seeker and self._wished_at(seeker, key) > -c.NEVER:
+                    self._members[key].seekers.setdefault(seeker, -c.NEVER)
+                    self._introduce(seeker, key, now)
+
+    def _introduce(self, seeker: bytes, key: bytes, now: float) -> None:
+        """Send a seeker's certificate to the member that it wishes to reach, unless that has bound it too."""
+        sought = self._members[key]
+        introduced_at = sought.seekers[seeker]
+        if (
+            sought.is_up
+            and now >= sought.session_at + a.INTRODUCED_AFTER_S
+            and self._wished_at(key, seeker) < sought.session_at
+            and (introduced_at < sought.session_at or now >= introduced_at + a.INTRODUCED_AGAIN_S)
+            and sought.introductions.take(now)
+            and sought.certificates.take(now)
+        ):
+            sought.seekers[seeker] = now
+            self._due[key, seeker] = None
+
+    @property
+    def is_due(self) -> bool:
+        """Whether :meth:`pop_due` may have something."""
+        return bool(self._arrived or self._due)
+
+    def pop_due(self, now: float) -> list[tuple[bytes, CertificateRecord]]:
+        """The certificates to be sent now, each with its receiver."""
+        while self._arrived and self._arrived[key := next(iter(self._arrived))] <= now:
+            del self._arrived[key]
+            self.prune(key)
+            for seeker in self._members[key].seekers:
+                self._introduce(seeker, key, now)
+        due, self._due = self._due, {}
+        return [(key, self._record(seeker)) for key, seeker in due if {key, seeker} <= self._members.keys()]
+
+    def _record(self, key: bytes) -> CertificateRecord:
+        return CertificateRecord(key, self._members[key].held.data)
