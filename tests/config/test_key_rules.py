@@ -14,7 +14,7 @@ from uavlinkd.config import keys
 from uavlinkd.config.key_rules import EXAMPLE_KEYS
 
 ROOT = Path(__file__).parents[2]
-_SHOWN = re.compile(r"[A-Za-z0-9+/]{43}=")
+_SHOWN = re.compile(r"(?<![A-Za-z0-9+/])[A-Za-z0-9+/]{43}=")
 _WITH_PSK = 'psk_file = "pair.psk"\n'
 
 

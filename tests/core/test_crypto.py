@@ -150,6 +150,9 @@ def test_signing_key_file() -> None:
     key = SigningKey(read_signing_key(pem.encode(), passphrase))
     assert AuthorityKey(key.public).verifies(key.sign(b"data"), b"data")
     assert not AuthorityKey(key.public).verifies(key.sign(b"data"), b"other data")
+    other = SigningKey(Secret(bytes(32)))
+    assert {AuthorityKey(key.public), AuthorityKey(key.public)} == {AuthorityKey(key.public)}
+    assert AuthorityKey(key.public) != AuthorityKey(other.public)
 
 
 @pytest.mark.parametrize("passphrase", [None, Secret(b""), Secret(b"wrong")])

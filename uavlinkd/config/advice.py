@@ -6,8 +6,9 @@ from collections.abc import Iterator, Sequence
 from itertools import combinations
 from math import ceil
 
-from uavlinkd.config.model import Config, EndpointConfig, PeerAddress, PeerConfig, Routing
+from uavlinkd.config.model import Config, EndpointConfig, FleetConfig, PeerAddress, PeerConfig, Routing
 from uavlinkd.core import constants as c
+from uavlinkd.core.certificates import parse_bulletin, parse_certificate
 from uavlinkd.core.wire import initiation_bytes, response_bytes
 from uavlinkd.endpoints.url import EndpointKind, NetworkUrl
 from uavlinkd.mavlink.policy.settings import read_settings
@@ -19,6 +20,10 @@ IPV6_LEAST_PAYLOAD = 1280 - 40 - 8
 ETHERNET_PAYLOAD = 1500 - 40 - 8
 """Over IPv6; IPv4 has 20 bytes more."""
 _SHORT_TAG_BYTES = 8
+_READABLE = (
+    "a link through a relay is not confidential: its owner cannot alter the frames, but can read them; write"
+    " confidential = true in [link], at one end or both"
+)
 
 
 def advice(config: Config) -> Iterator[str]:
@@ -29,6 +34,10 @@ def advice(config: Config) -> Iterator[str]:
     for peer in peers:
         for warning in _of_peer(peer):
             about.setdefault(warning, []).append(f'peer "{peer.name}"')
+    if config.fleet is not None:
+        yield from _revoked(config.fleet)
+        if config.fleet.relays and config.fleet.policies and not config.fleet.link.confidential:
+            about.setdefault(_READABLE, []).append("members by certificate")
     for endpoint in endpoints:
         for warning in _of_endpoint(endpoint):
             about.setdefault(warning, []).append(f'endpoint "{endpoint.name}"')
@@ -43,7 +52,7 @@ def advice(config: Config) -> Iterator[str]:
         return
     if not endpoints and not (config.routing.relay and len(peers) > 1):
         yield "there is no [[endpoint]]: no MAVLink client can connect to this daemon"
-    if not peers:
+    if not peers and config.fleet is None:
         yield "there is no [[peer]]: this daemon makes no link"
 
 
@@ -51,10 +60,7 @@ def _of_peer(peer: PeerConfig) -> Iterator[str]:
     link, budget = peer.settings.link, peer.egress.budget_bits_s
     yield from peer.make_policy().warnings
     if peer.relays and not link.confidential:
-        yield (
-            "a link through a relay is not confidential: its owner cannot alter the frames, but can read them; write"
-            " confidential = true in [link], at one end or both"
-        )
+        yield _READABLE
     if not link.confidential and link.tag_bytes <= _SHORT_TAG_BYTES:
         yield (
             "tags of 64 bits: each forged envelope is accepted with probability 2^-64; use them on slow radios only,"
@@ -78,6 +84,20 @@ def _of_peer(peer: PeerConfig) -> Iterator[str]:
             f" next attempt starts after {link.timers.retry_max_s:g} s: write retry_max_s ="
             f" {ceil(size * 16 / budget)}"
         )
+
+
+def _revoked(fleet: FleetConfig) -> Iterator[str]:
+    """Warn of the certificates that the bulletin of the file revokes."""
+    bulletin = parse_bulletin(fleet.bulletin)
+    assert bulletin is not None  # it was checked
+    if bulletin.refuses(fleet.own.certificate.serial):
+        yield (
+            f"the bulletin of this file revokes this daemon's own certificate ({fleet.own.certificate.name}, serial"
+            f" {fleet.own.certificate.serial}): other members refuse it; run `uavlinkd enroll` again, with a new key"
+        )
+    for contact in fleet.contacts:
+        if bulletin.refuses(parse_certificate(contact.certificate).serial):
+            yield f'the bulletin of this file revokes contact "{contact.name}": delete its [[contact]]'
 
 
 def _of_endpoint(endpoint: EndpointConfig) -> Iterator[str]:

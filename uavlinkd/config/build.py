@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
 
+from uavlinkd.authority.trust import HeldCertificate
+from uavlinkd.config.members import fleet_link, member_peer, policies_of
 from uavlinkd.config.model import (
     Config,
+    ContactConfig,
     EndpointConfig,
+    FleetConfig,
     Log,
     PeerAddress,
     PeerConfig,
@@ -22,10 +26,11 @@ from uavlinkd.config.model import (
     Routing,
 )
 from uavlinkd.config.network_rules import network_of
-from uavlinkd.config.problems import Sections, Values
+from uavlinkd.config.problems import Sections, Values, role_of
 from uavlinkd.config.relay_rules import over_ip, peer_of
 from uavlinkd.config.schema import (
     EndpointSection,
+    FleetSection,
     LinkSection,
     MemberSection,
     PolicySection,
@@ -34,6 +39,7 @@ from uavlinkd.config.schema import (
 )
 from uavlinkd.core import constants as c
 from uavlinkd.core import wire
+from uavlinkd.core.certificates import Certificate, MemberRole
 from uavlinkd.core.path import RELAY_HOST
 from uavlinkd.core.settings import Link, PeerSettings, Redundancy, Timers
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
@@ -52,13 +58,14 @@ _MOST = 2**63
 _HIDDEN = "…"
 
 
-def build(path: Path, file: Sections) -> Config:
-    """The configuration in a file without problems, without its warnings."""
+def build(path: Path, file: Sections, states: Path) -> Config:
+    """The configuration in a file without problems, without its warnings. ``states``: folder of the fleet's state."""
     private, public = file.secret(file.top, "private_key_file"), file.own_key
     assert private is not None  # their absence is a problem
     assert public is not None
     top = file.top
-    socket = top.get("control_socket")
+    socket, fleet = top.get("control_socket"), _fleet(file, states) if file.has_fleet else None
+    pinned = (_peer(file, peer) for peer in file.peers)
     return Config(
         path=path,
         name=top.valid["name"],
@@ -66,7 +73,7 @@ def build(path: Path, file: Sections) -> Config:
         public_key=public,
         listen=tuple(top.get("listen", ())),
         endpoints=tuple(_endpoint(endpoint) for endpoint in file.endpoints),
-        peers=tuple(_peer(file, peer) for peer in file.peers),
+        peers=(*pinned, *(_contact_peers(file, fleet) if fleet else ())),
         routing=Routing(**file.routing.valid),
         control_socket=file.folder / socket if socket else None,
         metrics=file.metrics.get("listen"),
@@ -74,8 +81,66 @@ def build(path: Path, file: Sections) -> Config:
         log=Log(**file.log.valid),
         networks=tuple(network_of(network) for network in file.networks),
         relay_server=_relay_server(file),
-        relays=tuple(_relay(file, relay) for relay in file.relays),
+        relays=tuple(_relay(file, relay, fleet) for relay in file.used_relays),
+        fleet=fleet,
     )
+
+
+def _fleet(file: Sections, states: Path) -> FleetConfig:
+    keys = FleetSection.model_construct(**file.fleet.valid)
+    link, limits = LinkSection.model_construct(**file.link.valid), _relay_server_keys(file)
+    own = keys.certificate.certificate.role
+    policies = fleet_policies(file, own)
+    called = ["operator"] if own == MemberRole.VEHICLE and MemberRole.OPERATOR in policies else []
+    return FleetConfig(
+        authority=keys.authority,
+        own=keys.certificate,
+        bulletin=keys.bulletin,
+        contacts=tuple(_contact(file, contact) for contact in file.contacts),
+        call=frozenset(map(member_role, called if keys.call is None else keys.call)),
+        required_bulletin=keys.require_bulletin,
+        denied=frozenset(keys.deny),
+        link=fleet_link(link_of(link)),
+        egress=EgressSettings(link.budget_bits_s, link.coalesce_s, link.max_age_s),
+        policies=MappingProxyType(policies),
+        relays=tuple(relay.valid["name"] for relay in file.used_relays),
+        state_file=states / f"{file.top.valid['name']}.fleet-state",
+        member_most_peers=limits.member_max_peers,
+        member_limits=RelayLimits(limits.member_datagrams_s, limits.member_bits_s),
+    )
+
+
+def fleet_policies(file: Sections, own: MemberRole) -> dict[MemberRole, PolicyData]:
+    """What members of each role may send to this daemon."""
+    written = {
+        member_role(role.valid["name"]): policy_data(role) for role in file.fleet_roles if "name" in role.valid
+    }
+    return policies_of(own, written, pins_operators=file.fleet.get("operator") == "pinned")
+
+
+def member_role(name: str) -> MemberRole:
+    """The role with a name as the file writes it."""
+    return MemberRole[name.upper()]
+
+
+def _contact(file: Sections, section: Values) -> ContactConfig:
+    held: HeldCertificate = section.valid["certificate"]
+    return ContactConfig(
+        key=section.valid["public_key"],
+        certificate=held.data,
+        name=held.certificate.name,
+        role=held.certificate.role,
+        addresses=tuple(section.valid["addresses"]),
+        relays=section in file.used_relays,
+    )
+
+
+def _contact_peers(file: Sections, fleet: FleetConfig) -> Iterator[PeerConfig]:
+    """The contacts whose role has a policy here."""
+    for section in file.contacts:
+        certificate: Certificate = section.valid["certificate"].certificate
+        if certificate.role in fleet.policies:
+            yield member_peer(fleet, section.valid["public_key"], certificate)
 
 
 def _recording(file: Sections) -> Recording | None:
@@ -90,8 +155,10 @@ def _endpoint(section: Values) -> EndpointConfig:
 
 def _peer(file: Sections, peer: Values) -> PeerConfig:
     keys = LinkSection.model_construct(**inherited(file.link, peer))
-    link, used = link_of(keys), _relays(peer, file.relays)
-    if used or peer_of(peer, (*file.members, *file.relays)):  # they exchange records
+    link, used = link_of(keys), _relays(peer, file.used_relays)
+    if file.has_fleet:
+        link = fleet_link(link)
+    elif used or peer_of(peer, (*file.members, *file.relays)):  # they exchange records
         link = replace(link, features=link.features | c.FEATURE_RECORDS)
     psk = file.secret(peer, "psk_file")
     return PeerConfig(
@@ -188,28 +255,37 @@ def _addresses(peer: Values, sections: Sequence[Values]) -> tuple[PeerAddress, .
     return tuple(dict.fromkeys((*peer.get("addresses", ()), *of_relay)))
 
 
-def _relay(file: Sections, section: Values) -> RelayConfig:
+def _relay(file: Sections, section: Values, fleet: FleetConfig | None) -> RelayConfig:
     """A relay. It inherits the suites of ``[link]``."""
-    suites = tuple(LinkSection.model_construct(**file.link.valid).suites)
+    suites, is_contact = LinkSection.model_construct(**file.link.valid).suites, section.kind == "contact"
+    link = Link(tuple(suites), timers=TIMERS, features=c.KNOWN_FEATURES & ~c.FEATURE_FLEET)
     peer = peer_of(section, file.peers)
+    if fleet is not None and is_contact and role_of(section) in fleet.policies:
+        peer = section
     return RelayConfig(
         settings=PeerSettings(
             name=RELAY_HOST + section.valid["name"],
             public_key=section.valid["public_key"],
             psk=file.secret(section, "psk_file"),
-            link=Link(suites, timers=TIMERS, features=c.KNOWN_FEATURES),
+            link=link if fleet is None else fleet_link(link),
+            is_certified=is_contact,
         ),
         addresses=tuple(dict.fromkeys((*([] if peer is None else over_ip(peer)), *over_ip(section)))),
         peer=None if peer is None else peer.valid["name"],
     )
 
 
+def _relay_server_keys(file: Sections) -> RelayServerSection:
+    return RelayServerSection.model_construct(**file.relay_server.valid)
+
+
 def _relay_server(file: Sections) -> RelayServer | None:
     """The relay that this daemon is; None if it has no members."""
-    if not file.members:
+    if not file.is_relay:
         return None
-    keys = RelayServerSection.model_construct(**file.relay_server.valid)
+    keys = _relay_server_keys(file)
     link = replace(link_of(LinkSection.model_construct(**file.link.valid)), features=c.FEATURE_RECORDS)
+    link = fleet_link(link) if file.has_fleet else link
     every = tuple(_member(file, section, link) for section in file.members)
     return RelayServer(every, RelayLimits(keys.datagrams_s, keys.bits_s))
 

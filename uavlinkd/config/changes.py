@@ -3,10 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import TypeVar
 
-from uavlinkd.config.model import Config, ConfigError, EndpointConfig, PeerConfig, Problem, RelayConfig
+from uavlinkd.config.model import (
+    Config,
+    ConfigError,
+    EndpointConfig,
+    FleetConfig,
+    PeerConfig,
+    Problem,
+    RelayConfig,
+)
 from uavlinkd.relay.forwarding import MemberSettings
 
 _FIXED = {
@@ -44,6 +52,8 @@ class ConfigChanges:
     removed_relays: tuple[str, ...]
     added_relays: tuple[RelayConfig, ...]
     changed_relays: tuple[RelayConfig, ...]
+    changed_fleet: tuple[str, ...]
+    """Fields of :class:`.FleetConfig`."""
 
     def summary(self) -> dict[str, list[str]]:
         """Names by kind of change, for a log, without kinds that did not occur."""
@@ -64,6 +74,10 @@ def compare(old: Config, new: Config) -> ConfigChanges:
     fixed = [key for field, key in _FIXED.items() if getattr(old, field) != getattr(new, field)]
     if (old.relay_server is None) != (new.relay_server is None):
         fixed.append("member")
+    if (old.fleet and (old.fleet.authority, old.fleet.state_file)) != (
+        new.fleet and (new.fleet.authority, new.fleet.state_file)
+    ):
+        fixed.append("fleet.authority")
     if fixed:
         raise ConfigError(tuple(Problem(str(new.path), key, _NEEDS_RESTART) for key in fixed))
     peers = _compare(old.peers, new.peers, _is_same_peer)
@@ -73,7 +87,12 @@ def compare(old: Config, new: Config) -> ConfigChanges:
         *_compare(old.endpoints, new.endpoints, lambda before, endpoint: before.url == endpoint.url),
         *_compare(_members(old), _members(new), lambda before, member: True),
         *_compare(old.relays, new.relays, lambda *both: _is_same_relay(*both) and both[1].peer not in new_peers),
+        tuple(field.name for field in fields(FleetConfig) if _value(old, field.name) != _value(new, field.name)),
     )
+
+
+def _value(config: Config, field: str) -> object:
+    return getattr(config.fleet, field, None)
 
 
 def _compare(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from itertools import combinations
 
-from uavlinkd.config import key_rules, network_rules, relay_rules
+from uavlinkd.config import fleet_rules, key_rules, network_rules, relay_rules
 from uavlinkd.config.build import inherited, policy_data
 from uavlinkd.config.problems import Found, Sections, Values, unique
 from uavlinkd.config.schema import LinkSection
@@ -26,6 +26,7 @@ def check(file: Sections) -> Found:
     yield from relay_rules.members(file)
     yield from _reachability(file)
     yield from relay_rules.relays(file)
+    yield from fleet_rules.check(file)
     yield from network_rules.networks(file)
     yield from _endpoints(file)
     yield from _timers(file.link)
@@ -46,7 +47,7 @@ def _reachability(file: Sections) -> Found:
         if (
             peer.lacks("addresses")
             and file.top.lacks("listen")
-            and not relay_rules.needs_no_address(peer, file.relays)
+            and not relay_rules.needs_no_address(peer, file.used_relays)
         ):
             or_else = ", and remove relays = []" if peer.get("relays") == [] else ""
             yield (
@@ -55,7 +56,7 @@ def _reachability(file: Sections) -> Found:
                 ' or listen = ["0.0.0.0:5790"] at the top so that the peer can initiate, or a [[relay]] that both'
                 f" ends use{or_else}",
             )
-    for section in (*file.peers, *file.relays):
+    for section in (*file.peers, *file.relays, *file.contacts):
         for written in section.get("addresses", ()):
             if any(_reaches(written.address, own) for own in listen):
                 yield section.at("addresses"), f"names {written.address}, where this daemon listens: write the peer's"

@@ -25,6 +25,8 @@ from uavlinkd.config.problems import Problems, Sections, Values, example_of
 from uavlinkd.core.crypto import Secret
 from uavlinkd.system.tasks import Threads
 
+STATES = "STATE_DIRECTORY"
+"""The environment variable in which systemd names the folder of a service that stays over restarts."""
 _MAX_FILE_BYTES = 1 << 20
 _THREAD = Threads(1, "configuration")
 _AT = re.compile(r"(.*) \(at (?:line (\d+), column (\d+)|end of document)\)", re.DOTALL)
@@ -38,7 +40,7 @@ _ONCE = "write a key once in its section, and for another peer or endpoint [[pee
 
 
 def load_config(path: Path, environ: Mapping[str, str]) -> Config:
-    """The configuration in a file. Of ``environ``, only ``CREDENTIALS_DIRECTORY`` is used.
+    """The configuration in a file. Of ``environ``, only ``CREDENTIALS_DIRECTORY`` and ``STATE_DIRECTORY`` are used.
 
     Raises:
         ConfigError: with every problem of the file. An invalid value never becomes a default.
@@ -48,10 +50,16 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
     keys = {key: table[key] for key in table if key not in schema.SINGLE and key not in schema.REPEATED}
     sections: dict[str, Any] = {"top": problems.read(schema.FileSection, keys, "")}
     for key, model in schema.SINGLE.items():
-        sections[key] = problems.read(model, _table(problems, table, key), key)
+        if key in table:
+            sections[key] = problems.read(model, _table(problems, table, key), key)
+        else:
+            sections[key] = Values(key, {}, frozenset())
     for key, model in schema.REPEATED.items():
         sections[f"{key}s"] = _sections(problems, table, key, model)
-    file = Sections(path.absolute().parent, **sections)
+    file = Sections(path.absolute().parent, frozenset(table), **sections)
+    for contact in file.contacts:
+        if (held := contact.get("certificate")) is not None:
+            contact.valid["name"] = held.certificate.name
     for section, key in (
         (file.top, "private_key_file"),
         *((section, "psk_file") for section in file.others),
@@ -61,7 +69,8 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
     for place, message in checks.check(file):
         problems.add(place, message)
     problems.raise_any()
-    config = build(path, file)
+    states = environ.get(STATES, "").partition(":")[0]
+    config = build(path, file, Path(states) if states else file.folder)
     warnings = (*key_rules.advice(config.private_key.reveal(), file.others), *advice(config))
     return replace(config, warnings=warnings)
 

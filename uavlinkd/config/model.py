@@ -8,9 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-from uavlinkd.core.crypto import Secret
+from uavlinkd.authority.trust import HeldCertificate
+from uavlinkd.core.certificates import MemberRole
+from uavlinkd.core.crypto import AuthorityKey, Secret
 from uavlinkd.core.path import RELAY_HOST, SERIAL_HOST
-from uavlinkd.core.settings import PeerSettings
+from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.endpoints.url import EndpointUrl, SerialUrl
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.mavlink.policy.compilation import Policy
@@ -178,6 +180,48 @@ class RelayConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class ContactConfig:
+    """A member that this daemon knows from the start. ``relays``: whether this daemon uses it as a relay."""
+
+    key: bytes
+    certificate: bytes
+    name: str
+    role: MemberRole
+    addresses: tuple[PeerAddress, ...]
+    relays: bool
+
+
+@dataclass(frozen=True, slots=True)
+class FleetConfig:
+    """The fleet of which this daemon is a member, and what it takes from members that are not in its file.
+
+    ``policies``: what a member of a role may send here; without one it makes no link. ``call``: the roles to which
+    this daemon initiates. ``relays``: the names of all relays. ``state_file``: the newest bulletin and certificate.
+    ``member_…``: limits of each member if this daemon is a relay.
+    """
+
+    authority: AuthorityKey
+    own: HeldCertificate
+    bulletin: bytes
+    contacts: tuple[ContactConfig, ...]
+    call: frozenset[MemberRole]
+    required_bulletin: int
+    denied: frozenset[str]
+    link: Link
+    egress: EgressSettings
+    policies: Mapping[MemberRole, PolicyData]
+    relays: tuple[str, ...]
+    state_file: Path
+    member_most_peers: int
+    member_limits: RelayLimits
+
+    @property
+    def certificate(self) -> bytes:
+        """The own certificate as it is sent."""
+        return self.own.data
+
+
+@dataclass(frozen=True, slots=True)
 class Routing:
     """``relay``: whether frames from a peer may go to other peers."""
 
@@ -225,12 +269,14 @@ class Config:
     networks: tuple[NetworkConfig, ...] = ()
     relay_server: RelayServer | None = None
     relays: tuple[RelayConfig, ...] = ()
+    fleet: FleetConfig | None = None
     warnings: tuple[str, ...] = ()
 
     @property
     def is_only_relay(self) -> bool:
         """Whether this daemon carries no frames."""
-        return self.relay_server is not None and not self.peers and not self.endpoints
+        carries = self.peers or self.endpoints or (self.fleet is not None and self.fleet.policies)
+        return self.relay_server is not None and not carries
 
     @property
     def keys_of_others(self) -> set[bytes]:

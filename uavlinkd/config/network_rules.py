@@ -27,7 +27,7 @@ _FAMILIES = {socket.AF_INET: "IPv4", socket.AF_INET6: "IPv6"}
 
 def networks(file: Sections) -> Found:
     """Each network is one exit of its own, and each address of a peer can be reached along a network."""
-    sections, peers = file.networks, (*file.peers, *file.relays)
+    sections, peers = file.networks, (*file.peers, *file.relays, *file.contacts)
     yield from unique(sections, "name", "the name of {other} too: write another")
     for key in ("interface", "address"):
         yield from unique(sections, key, f"the {key} of {{other}} too: write another, or remove one network")

@@ -17,8 +17,10 @@ from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
+from uavlinkd.authority.trust import HeldCertificate
 from uavlinkd.config import schema
 from uavlinkd.config.model import ConfigError, Problem
+from uavlinkd.core.certificates import MemberRole
 from uavlinkd.core.crypto import Secret, x25519_public_key
 
 
@@ -52,9 +54,13 @@ class Values(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Sections:
-    """The values of one file in ``folder``. ``secrets``: content of its key files, by the place of the key."""
+    """The values of one file in ``folder``. ``secrets``: content of its key files, by the place of the key.
+
+    ``written``: the sections and keys at the top of the file, also those without a valid value.
+    """
 
     folder: Path
+    written: frozenset[str]
     top: Values
     link: Values
     log: Values
@@ -62,17 +68,48 @@ class Sections:
     metrics: Values
     recording: Values
     relay_server: Values
+    fleet: Values
     networks: list[Values]
     endpoints: list[Values]
     peers: list[Values]
     members: list[Values]
     relays: list[Values]
+    contacts: list[Values]
+    """Each has the name in its certificate."""
+    fleet_roles: list[Values]
     secrets: dict[str, Secret] = field(default_factory=dict)
 
     @property
     def others(self) -> list[Values]:
         """The sections with public keys."""
-        return [*self.peers, *self.members, *self.relays]
+        return [*self.peers, *self.members, *self.relays, *self.contacts]
+
+    @property
+    def has_fleet(self) -> bool:
+        """Whether the file has ``[fleet]``."""
+        return "fleet" in self.written
+
+    @property
+    def is_relay(self) -> bool:
+        """Whether this daemon relays for others."""
+        is_member_relay = role_of(self.fleet) == MemberRole.RELAY or "relay_server" in self.written
+        return bool(self.members) or (self.has_fleet and is_member_relay)
+
+    @property
+    def used_relays(self) -> list[Values]:
+        """The relays, and the contacts that this daemon uses as such.
+
+        A relay needs none. A station that relays uses no other station: two daemons cannot be relays of each other.
+        """
+        if role_of(self.fleet) == MemberRole.RELAY:
+            return self.relays
+        may_be_station = not self.is_relay
+        contacts = (
+            contact
+            for contact in self.contacts
+            if role_of(contact) == MemberRole.RELAY or (may_be_station and contact.get("relays"))
+        )
+        return [*self.relays, *contacts]
 
     def secret(self, section: Values, key: str) -> Secret | None:
         """The content of the key file that a section names under a key."""
@@ -83,6 +120,12 @@ class Sections:
         """This daemon's public key."""
         secret = self.secret(self.top, "private_key_file")
         return None if secret is None else x25519_public_key(secret.reveal())
+
+
+def role_of(section: Values) -> MemberRole | None:
+    """The role in the certificate of ``[fleet]`` or a contact, if that is valid."""
+    held: HeldCertificate | None = section.get("certificate")
+    return None if held is None else held.certificate.role
 
 
 Found = Iterator[tuple[str, str]]

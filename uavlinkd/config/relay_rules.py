@@ -26,14 +26,18 @@ def members(file: Sections) -> Found:
             yield section.at("name"), text
     if len(file.members) > MOST_MEMBERS:
         yield "member", f"has more than {MOST_MEMBERS:,} sections: run several relays, each on a port of its own"
-    if file.members and file.top.lacks("listen"):
+    if file.is_relay and file.top.lacks("listen"):
         yield "listen", 'is empty, so no member could reach this relay: write listen = ["0.0.0.0:5790", "[::]:5790"]'
-    elif file.relay_server.valid and not file.members:
+    elif file.relay_server.valid and not file.is_relay:
         yield (
             "relay_server",
             "has no effect, because the file has no [[member]]: write one with name and public_key for each daemon"
             " that may use this relay",
         )
+    for key in ("member_max_peers", "member_datagrams_s", "member_bits_s"):
+        if key in file.relay_server.valid and file.is_relay and not file.has_fleet:
+            text = "is for members by certificate, but the file has no [fleet]: write the limit in each [[member]]"
+            yield f"relay_server.{key}", text
 
 
 def _of_peer(section: Values, peer: Values) -> Found:
@@ -47,9 +51,10 @@ def _of_peer(section: Values, peer: Values) -> Found:
 
 def relays(file: Sections) -> Found:
     """Each relay has an address, and a key of its own or a peer's. Each relay that a peer names is in the file."""
-    if len(file.relays) > MOST:
-        yield "relay", f"has {len(file.relays)} sections: write at most {MOST}, the most reliable ones"
-    yield from unique(file.relays, "name", "the name of {other} too: write another")
+    if len(file.used_relays) > MOST:
+        count = f"{len(file.used_relays)} sections, with each [[contact]] that relays"
+        yield "relay", f"has {count}: write at most {MOST}, the most reliable ones"
+    yield from unique(file.used_relays, "name", "the name of {other} too: write another")
     by_member = {member.get("public_key"): member for member in file.members}
     for number, section in enumerate(file.relays):
         key, peer = section.get("public_key"), peer_of(section, file.peers)
@@ -62,9 +67,9 @@ def relays(file: Sections) -> Found:
         if peer is not None:
             yield from _of_peer(section, peer)
         yield from _addresses(section, peer, file.relays[:number])
-    known = {section.get("name"): section for section in file.relays}
+    known = {section.get("name"): section for section in file.used_relays}
     names = ", ".join(f'"{name}"' for name in sorted(name for name in known if name is not None))
-    for peer in file.peers if len(known) == len(file.relays) and None not in known else ():
+    for peer in file.peers if len(known) == len(file.used_relays) and None not in known else ():
         for name in peer.get("relays") or ():
             if name not in known:
                 remedy = f"write one of {names}" if names else "add a [[relay]] of that name"

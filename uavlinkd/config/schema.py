@@ -20,10 +20,13 @@ from pydantic import (
     field_validator,
 )
 
+from uavlinkd.authority.trust import HeldCertificate
+from uavlinkd.config import signed
 from uavlinkd.config.keys import decode_key, is_canonical_public_key
 from uavlinkd.config.model import SERIAL, PeerAddress
 from uavlinkd.core import constants as c
-from uavlinkd.core.crypto import is_usable_public_key
+from uavlinkd.core.certificates import LAST_SERIAL
+from uavlinkd.core.crypto import AuthorityKey, is_usable_public_key
 from uavlinkd.core.suites import SUITES_BY_NAME, X25519, Suite
 from uavlinkd.endpoints.url import EndpointUrl, SerialUrl, parse_line, parse_url
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
@@ -178,6 +181,12 @@ OwnAddress = Annotated[str, PlainValidator(_own_address)]
 SerialLine = Annotated[SerialUrl, PlainValidator(lambda value: parse_line(_text(value)))]
 Url = Annotated[EndpointUrl, PlainValidator(lambda value: parse_url(_text(value)))]
 Budget = Annotated[int, AfterValidator(_budget)]
+Authority = Annotated[AuthorityKey, PlainValidator(lambda value: signed.authority(_text(value)))]
+KeyHash = Annotated[bytes, PlainValidator(lambda value: signed.key_hash(_text(value)))]
+SignedCertificate = Annotated[HeldCertificate, PlainValidator(lambda value: signed.certificate(_text(value)))]
+SignedBulletin = Annotated[bytes, PlainValidator(lambda value: signed.bulletin(_text(value)))]
+MemberName = Annotated[str, PlainValidator(lambda value: signed.member_name(_text(value)))]
+FrameRole = Literal["vehicle", "operator", "observer"]
 
 
 def _seconds(default: float, least: float, most: float) -> Any:
@@ -185,6 +194,7 @@ def _seconds(default: float, least: float, most: float) -> Any:
 
 
 _MESSAGES = Field(default=None, examples=['["heartbeat", "telemetry"]'])
+_SIGNED = '"…", which `uavlinkd enroll --finish` writes'
 _RATES = Field(default=None, examples=["{ ATTITUDE = 10 }"])
 
 
@@ -290,10 +300,41 @@ class MemberSection(KeySection):
 
 
 class RelayServerSection(Section):
-    """``[relay_server]``: what a relay carries for all members together."""
+    """``[relay_server]``: what a relay carries for all members together, and for each one by certificate."""
 
     datagrams_s: int = Field(default=10**6, ge=1, le=10**6, examples=["100_000"])
     bits_s: int = Field(default=10**10, ge=LEAST_BUDGET, le=10**10, examples=["100_000_000"])
+    member_max_peers: int = Field(default=256, ge=1, le=4000)
+    member_datagrams_s: int = Field(default=2000, ge=1, le=10**6)
+    member_bits_s: int = Field(default=20_000_000, ge=LEAST_BUDGET, le=10**10, examples=["20_000_000"])
+
+
+class FleetSection(Section):
+    """``[fleet]``: this daemon is a member of a fleet with an authority."""
+
+    authority: Authority = Field(examples=[_SIGNED])
+    successor: KeyHash | None = Field(default=None, examples=[_SIGNED])
+    certificate: SignedCertificate = Field(examples=[_SIGNED])
+    bulletin: SignedBulletin = Field(examples=[_SIGNED])
+    call: list[FrameRole] | None = Field(default=None, examples=['["operator"]'])
+    operator: Literal["certificate", "pinned"] = "certificate"
+    require_bulletin: int = Field(default=0, ge=0, le=LAST_SERIAL)
+    deny: list[MemberName] = Field(default=[], examples=['["v3"]'])
+
+
+class ContactSection(Section):
+    """``[[contact]]``: a member whose certificate and address this daemon has from the start."""
+
+    public_key: PublicKey = Field(examples=[_SIGNED])
+    certificate: SignedCertificate = Field(examples=[_SIGNED])
+    addresses: PeerAddresses = Field(default=[], examples=['["relay.example.org:5790"]'])
+    relays: bool = False
+
+
+class FleetRoleSection(PolicySection):
+    """``[[fleet_role]]``: what the members with a role may send here, instead of the usual policy."""
+
+    name: FrameRole = Field(examples=['"operator"'])
 
 
 class EndpointSection(PolicySection):
@@ -348,6 +389,7 @@ SINGLE: dict[str, type[Section]] = {
     "metrics": MetricsSection,
     "recording": RecordingSection,
     "relay_server": RelayServerSection,
+    "fleet": FleetSection,
 }
 """The sections that a file has once, such as ``[link]``."""
 REPEATED: dict[str, type[Section]] = {
@@ -356,5 +398,7 @@ REPEATED: dict[str, type[Section]] = {
     "peer": PeerSection,
     "member": MemberSection,
     "relay": RelaySection,
+    "contact": ContactSection,
+    "fleet_role": FleetRoleSection,
 }
 """The sections that a file may have several times, such as ``[[peer]]``."""

@@ -185,6 +185,12 @@ class AuthorityKey:
         self._key = Ed25519PublicKey.from_public_bytes(public)
         self.public = public
 
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, AuthorityKey) and self.public == other.public
+
+    def __hash__(self) -> int:
+        return hash(self.public)
+
     def verifies(self, signature: bytes, data: bytes) -> bool:
         """Whether the holder of the private key signed the data."""
         try:

@@ -1,0 +1,73 @@
+"""Members of a fleet by certificate: the settings of their peers, and what they may send. authority/README.md."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from types import MappingProxyType
+from typing import Final
+
+from uavlinkd.config.model import FleetConfig, PeerConfig, PolicyData
+from uavlinkd.core import constants as c
+from uavlinkd.core.certificates import Certificate, MemberRole
+from uavlinkd.core.settings import Link, PeerSettings
+from uavlinkd.mavlink.policy.roles import ROLES
+from uavlinkd.relay.forwarding import MemberSettings
+
+_VEHICLE: Final[PolicyData] = {"role": "vehicle"}
+DEFAULT_POLICIES: Final[Mapping[MemberRole, Mapping[MemberRole, PolicyData]]] = {
+    MemberRole.RELAY: {},
+    MemberRole.VEHICLE: {
+        MemberRole.VEHICLE: {"role": "swarm-member"},
+        MemberRole.OPERATOR: {"role": "operator"},
+        MemberRole.OBSERVER: {"role": "observer"},
+    },
+    MemberRole.OPERATOR: {MemberRole.VEHICLE: _VEHICLE},
+    # Only an observer's requests leave this daemon, whatever the vehicle accepts.
+    MemberRole.OBSERVER: {
+        MemberRole.VEHICLE: {"allow_in": ROLES["vehicle"].allow_in, "allow_out": ROLES["observer"].allow_in}
+    },
+}
+"""By the role of this daemon, then by that of the other one."""
+
+
+def policies_of(
+    own: MemberRole, written: Mapping[MemberRole, PolicyData], *, pins_operators: bool
+) -> dict[MemberRole, PolicyData]:
+    """What the members of each role may send here, without their system ids. A role without a policy has no link.
+
+    A ``written`` policy that is complete replaces the default one, another adds to it.
+    """
+    policies = {**DEFAULT_POLICIES[own]}
+    for role, policy in written.items():
+        is_complete = "role" in policy or {"allow_in", "allow_out"} <= set(policy)
+        policies[role] = policy if is_complete else {**policies.get(role, {}), **policy}
+    if pins_operators:
+        policies.pop(MemberRole.OPERATOR, None)
+    return policies
+
+
+def fleet_link(link: Link) -> Link:
+    """The settings with which a daemon of a fleet talks to members."""
+    return replace(link, features=link.features | c.FEATURE_RECORDS | c.FEATURE_FLEET)
+
+
+def member_peer(fleet: FleetConfig, key: bytes, certificate: Certificate) -> PeerConfig:
+    """The peer of a member whose role has a policy here. It has the addresses that its contact has in the file."""
+    first, last = certificate.system_ids
+    ids = first if first == last else f"{first}-{last}"
+    contact = next((contact for contact in fleet.contacts if contact.key == key), None)
+    return PeerConfig(
+        settings=PeerSettings(certificate.name, key, None, fleet.link, is_certified=True),
+        addresses=() if contact is None else contact.addresses,
+        policy=MappingProxyType({**fleet.policies[certificate.role], "system_ids": (ids,)}),
+        egress=fleet.egress,
+        relays=tuple(name for name in fleet.relays if not (contact and contact.relays and name == contact.name)),
+    )
+
+
+def relay_member(fleet: FleetConfig, key: bytes, certificate: Certificate) -> MemberSettings:
+    """A member by certificate of the relay that this daemon is."""
+    link = replace(fleet.link, features=c.FEATURE_RECORDS | c.FEATURE_FLEET)
+    peer = PeerSettings(certificate.name, key, None, link, initiates=False, is_certified=True)
+    return MemberSettings(peer, fleet.member_most_peers, fleet.member_limits)
