@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import suppress
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.authority.signing import AUTHORITY, CERTIFICATE, FLEET, bulletin, published, signed, vehicle
@@ -230,6 +230,7 @@ BULLETINS = st.builds(
 
 
 @given(st.lists(BULLETINS, max_size=12))
+@settings(max_examples=50, deadline=None)
 def test_any_history_of_bulletins(history: list[Bulletin]) -> None:
     """The number grows, what is refused stays refused, and no certificate that is refused is held or accepted."""
     known = Trust(AUTHORITY, OWN, OWN_DATA, bulletin(1))
@@ -250,6 +251,7 @@ def test_any_history_of_bulletins(history: list[Bulletin]) -> None:
         assert refused(known, *SIGNED[serial]) is DropReason.CERTIFICATE_REVOKED
 
 
+@settings(max_examples=50, deadline=None)
 @given(st.lists(st.tuples(st.sampled_from(SERIALS), st.integers(1, 3), st.integers(1, 40)), max_size=12))
 def test_any_history_of_certificates(history: list[tuple[int, int, int]]) -> None:
     """No two held ones have a name or a system id in common, and the serial for a key never falls."""

@@ -1,0 +1,347 @@
+"""The exchange of one daemon with its peers, record by record, at chosen times."""
+
+from __future__ import annotations
+
+from math import inf
+
+import pytest
+
+from tests.authority.signing import AUTHORITY, bulletin, published, signed, vehicle
+from uavlinkd.authority import constants as c
+from uavlinkd.authority.exchange import ROLLED_BACK, BulletinExchange, Reaction
+from uavlinkd.authority.trust import BulletinVerdict, Trust
+from uavlinkd.core.certificates import Bulletin, digest_of
+from uavlinkd.core.drops import Drop, DropReason
+from uavlinkd.core.relay_records import BulletinRecord, CertificateRecord, FleetRecord, Have, Who
+
+OWN, PEER, OTHER = (bytes((number,)) * 32 for number in (1, 2, 3))
+CERTIFICATES = {PEER: signed(vehicle(2, 20), PEER), OTHER: signed(vehicle(3), OTHER)}
+OLD, NEW = bulletin(5), bulletin(6, 99)
+WAIT_S = 0.5
+NOW = 100.0
+
+
+def have(data: bytes, serial: int = 20, known: int = 10) -> Have:
+    """What a peer states that has this bulletin."""
+    return Have(int.from_bytes(data[5:9], "big"), digest_of(data), serial, known)
+
+
+class Daemon:
+    """The exchange of vehicle 1, which has serial 10, and what it sent."""
+
+    def __init__(self, data: bytes = OLD, certificate: bytes = signed(vehicle(1, 10), OWN)) -> None:
+        self.trust = Trust(AUTHORITY, OWN, certificate, data)
+        for key, held in CERTIFICATES.items():
+            self.trust.hold(key, held)
+        self.exchange = BulletinExchange(self.trust, lambda size: b"\xff" * size)
+        self.order = 0
+
+    def up(self, *keys: bytes, now: float = NOW) -> list[tuple[bytes, FleetRecord]]:
+        """Sessions are made; what is sent at once."""
+        for key in keys or (PEER,):
+            self.exchange.on_handshake(key, WAIT_S, now)
+        return self.due(now)
+
+    def due(self, now: float) -> list[tuple[bytes, FleetRecord]]:
+        """What is sent at a time."""
+        assert self.exchange.next_at <= now
+        return self.exchange.do_due(now)
+
+    def receive(self, record: FleetRecord, now: float = NOW, key: bytes = PEER) -> Reaction:
+        """A record arrives, in the order in which it was sealed."""
+        self.order += 1
+        return self.exchange.receive(key, record, self.order, now)
+
+    def drop(self, record: FleetRecord, now: float = NOW, key: bytes = PEER) -> DropReason:
+        """Why a record is dropped. The bulletin does not change."""
+        before = self.trust.bulletin_bytes
+        with pytest.raises(Drop) as drop:
+            self.receive(record, now, key)
+        assert self.trust.bulletin_bytes == before
+        return drop.value.reason
+
+    def hour(self, now: float = NOW) -> list[tuple[float, bytes, FleetRecord]]:
+        """What is sent in the next hour without any answer."""
+        sent: list[tuple[float, bytes, FleetRecord]] = []
+        while self.exchange.next_at < now + 3600:
+            at = max(now, self.exchange.next_at)
+            sent += [(round(at - now, 6), *item) for item in self.exchange.do_due(at)]
+        return sent
+
+
+MINE = Have(5, digest_of(OLD), 10, 20)
+"""What the daemon states to the peer in the beginning."""
+
+
+def test_equal_ends() -> None:
+    """Each states once what it has. Then they are silent."""
+    daemon = Daemon()
+    assert daemon.exchange.next_at == inf
+    assert daemon.up() == [(PEER, MINE)]
+    assert daemon.receive(have(OLD)) == Reaction()
+    assert daemon.exchange.shown(PEER) == 5
+    assert daemon.exchange.shown(OTHER) is None
+    assert daemon.hour() == []
+
+
+def test_peer_that_states_nothing() -> None:
+    """It is asked again, ten times after the wait, then at the long interval."""
+    daemon = Daemon()
+    daemon.up()
+    times = [at for at, *_ in daemon.hour()]
+    assert times[: c.PUSH_TRIES + 2] == [*(WAIT_S * n for n in range(1, 11)), 15.0, 25.0]
+
+
+def test_peer_with_an_older_bulletin() -> None:
+    """It gets the newer one at once, again until it states it, and less often after the tries."""
+    daemon = Daemon(NEW)
+    daemon.up()
+    daemon.receive(have(OLD), NOW + 1)
+    sent = daemon.hour(NOW + 1)
+    assert {item[1:] for item in sent} == {(PEER, BulletinRecord(NEW))}
+    assert [at for at, *_ in sent][: c.PUSH_TRIES + 1] == [*(WAIT_S * n for n in range(10)), 14.5]
+    daemon.receive(have(NEW), NOW + 4000)
+    assert daemon.hour(NOW + 4000) == []
+
+
+def test_flood_of_have() -> None:
+    """Different ones cause a bulletin for each wait, and *have* ten times a second at most."""
+    daemon = Daemon(NEW)
+    daemon.up()
+    sent: list[FleetRecord] = []
+    for step in range(10_000):
+        now = NOW + step / 1000
+        daemon.receive(have(OLD, serial=step % 20, known=step % 3 * 9), now)
+        sent += [record for _, record in daemon.exchange.do_due(now)]
+    assert 15 <= sum(isinstance(record, BulletinRecord) for record in sent) <= 21
+    assert sum(isinstance(record, Have) for record in sent) <= 101
+    assert len(sent) <= 101 + 3 * 21
+
+
+def test_peer_with_a_newer_bulletin() -> None:
+    """It is asked if its bulletin does not come; *have* follows the write, and other peers get the bulletin."""
+    daemon = Daemon()
+    daemon.up(PEER, OTHER)
+    daemon.receive(have(OLD, serial=3), key=OTHER)
+    daemon.receive(have(NEW))
+    assert daemon.due(NOW + WAIT_S) == [(PEER, MINE)]
+    assert daemon.receive(BulletinRecord(NEW), NOW + 1) == Reaction(persists=True)
+    assert daemon.due(NOW + 1 + c.PUSH_JITTER_S) == [(OTHER, BulletinRecord(NEW))]
+    daemon.exchange.note_persisted(6, digest_of(NEW))
+    daemon.receive(have(NEW, serial=3), NOW + 2, OTHER)
+    stated = Have(6, digest_of(NEW), 10, 20)
+    assert daemon.due(NOW + 2) == [(PEER, stated), (OTHER, stated._replace(known=3))]
+    assert daemon.hour(NOW + 2) == []
+
+
+def test_disk_that_cannot_be_written() -> None:
+    """The bulletin counts and is passed on. No *have* states it, and a bulletin that is repeated causes none."""
+    daemon = Daemon()
+    daemon.up(PEER, OTHER)
+    daemon.receive(have(OLD, serial=3), key=OTHER)
+    daemon.receive(have(NEW))
+    daemon.receive(BulletinRecord(NEW), NOW + 0.1)
+    daemon.receive(BulletinRecord(NEW), NOW + 0.2)
+    assert daemon.due(NOW + 1) == [(OTHER, BulletinRecord(NEW))]
+    daemon.exchange.on_down(OTHER)
+    assert daemon.hour(NOW + 2) == []
+    assert daemon.up(now=NOW + 4000) == [(PEER, MINE)]
+    assert daemon.trust.bulletin.number == 6
+    daemon.exchange.note_persisted(6, digest_of(NEW))
+    assert daemon.due(NOW + 4001) == [(PEER, Have(6, digest_of(NEW), 10, 20))]
+
+
+def test_bulletin_is_answered() -> None:
+    """Its sender may have missed what this end stated."""
+    daemon = Daemon(NEW)
+    daemon.up()
+    daemon.receive(have(NEW))
+    for data in (NEW, OLD):
+        assert daemon.receive(BulletinRecord(data), NOW + 0.01) == Reaction()
+        assert daemon.exchange.next_at == NOW + c.HAVE_LEAST_S
+    assert daemon.due(NOW + c.HAVE_LEAST_S) == [(PEER, MINE._replace(number=6, digest=digest_of(NEW)))]
+    assert daemon.hour(NOW + 1) == []
+
+
+def test_bulletin_before_have() -> None:
+    """Its sender has it, and does not get it back."""
+    daemon = Daemon()
+    daemon.up()
+    daemon.receive(BulletinRecord(NEW))
+    daemon.exchange.note_persisted(6, digest_of(NEW))
+    daemon.receive(have(OLD), NOW + 1)
+    assert [record for _, _, record in daemon.hour(NOW + 1)] == [Have(6, digest_of(NEW), 10, 20)]
+
+
+def test_repeated_have_is_a_question() -> None:
+    """It is answered, but not if this end stated it a moment ago: two ends do not answer each other without end."""
+    daemon = Daemon()
+    daemon.up()
+    daemon.receive(have(OLD))
+    daemon.receive(have(OLD), NOW + 0.4)
+    assert daemon.hour(NOW + 0.4) == []
+    daemon.receive(have(OLD), NOW + WAIT_S)
+    assert daemon.due(NOW + WAIT_S) == [(PEER, MINE)]
+    daemon.receive(have(OLD), NOW + WAIT_S + 0.1)
+    assert daemon.hour(NOW + 1) == []
+
+
+def test_bulletin_from_the_operator() -> None:
+    """All peers that are up get it within the jitter; the same one again changes nothing."""
+    daemon, gone = Daemon(), bytes(32)
+    daemon.up(PEER, OTHER, gone)
+    daemon.exchange.on_down(gone)
+    daemon.receive(have(OLD))
+    daemon.receive(have(OLD, serial=3), key=OTHER)
+    assert daemon.exchange.publish(NEW, NOW) == (BulletinVerdict.NEWER, Reaction(persists=True))
+    assert daemon.due(NOW + 0.1) == [(PEER, BulletinRecord(NEW)), (OTHER, BulletinRecord(NEW))]
+    assert daemon.exchange.publish(NEW, NOW) == (BulletinVerdict.KNOWN, Reaction())
+
+
+def test_revoked_peer_ends() -> None:
+    """Also the one that sent the bulletin. It gets nothing more, and what it sends is dropped."""
+    daemon = Daemon()
+    daemon.up(PEER, OTHER)
+    reaction = daemon.receive(BulletinRecord(bulletin(6, 20)))
+    assert reaction == Reaction((PEER,), persists=True)
+    assert {key for _, key, _ in daemon.hour()} == {OTHER}
+    assert daemon.exchange.shown(PEER) is None
+    assert daemon.drop(have(NEW)) is DropReason.UNEXPECTED_RECORD
+
+
+@pytest.mark.parametrize(
+    ("data", "reason", "event"),
+    [
+        pytest.param(b"?", DropReason.BAD_CONTROL, "", id="not a bulletin"),
+        pytest.param(NEW[:-1] + b"?", DropReason.BAD_CONTROL, "", id="not signed"),
+        pytest.param(published(Bulletin(b"none", 9, 1, ())), DropReason.BAD_CONTROL, "", id="another fleet"),
+        pytest.param(bulletin(6, least=0), None, "bulletin_shrinks", id="it shrinks"),
+        pytest.param(bulletin(5, 3), None, "bulletin_conflict", id="the same number"),
+    ],
+)
+def test_bulletin_that_is_refused(data: bytes, reason: DropReason | None, event: str) -> None:
+    """The peer must wait a second before another one is verified. Older ones need no signature check."""
+    daemon = Daemon()
+    daemon.up()
+    if reason is None:
+        assert daemon.receive(BulletinRecord(data)) == Reaction(event=event)
+    else:
+        assert daemon.drop(BulletinRecord(data)) is reason
+    assert daemon.drop(BulletinRecord(NEW), NOW + 0.99) is DropReason.RECORD_OVER_LIMIT
+    daemon.receive(BulletinRecord(bulletin(4)), NOW + 0.99)
+    daemon.up(now=NOW + 0.99)
+    assert daemon.drop(BulletinRecord(NEW), NOW + 0.99) is DropReason.RECORD_OVER_LIMIT, "a handshake resets a limit"
+    assert daemon.receive(BulletinRecord(NEW), NOW + c.BULLETIN_LEAST_S).persists
+
+
+def test_other_digest_of_the_same_number() -> None:
+    """It is reported once for each statement."""
+    daemon = Daemon()
+    daemon.up()
+    other = have(bulletin(5, 3))
+    assert daemon.receive(other).event == "bulletin_conflict"
+    assert daemon.receive(other).event == ""
+    assert daemon.hour() == []
+
+
+def test_peer_whose_disk_was_restored() -> None:
+    """What it had stated is remembered while it is down. A record that was overtaken does not count."""
+    daemon = Daemon(NEW)
+    daemon.up()
+    daemon.receive(have(NEW))
+    with pytest.raises(Drop) as drop:
+        daemon.exchange.receive(PEER, have(OLD), 0, NOW)
+    assert drop.value.reason is DropReason.OLD_RECORD
+    daemon.exchange.on_down(PEER)
+    assert daemon.drop(have(OLD)) is DropReason.UNEXPECTED_RECORD
+    daemon.up(now=NOW + 60)
+    assert daemon.receive(have(OLD), NOW + 60).event == ROLLED_BACK
+    assert daemon.receive(have(OLD), NOW + 61).event == ""
+    assert daemon.due(NOW + 61) == [(PEER, BulletinRecord(NEW))]
+    daemon.exchange.forget(PEER)
+    daemon.exchange.on_down(PEER)
+    assert daemon.exchange.shown(PEER) is None
+
+
+# Certificates.
+
+
+def test_peer_that_lacks_its_newer_certificate() -> None:
+    """It gets it until it states its serial."""
+    daemon = Daemon()
+    daemon.up()
+    daemon.receive(have(OLD, serial=7))
+    assert daemon.due(NOW) == [(PEER, CertificateRecord(PEER, CERTIFICATES[PEER]))]
+    daemon.receive(have(OLD, serial=20), NOW + 0.1)
+    assert daemon.hour(NOW + 1) == []
+
+
+def test_peer_that_holds_an_older_own_certificate() -> None:
+    """It gets the newer one; a peer that holds none does not need it."""
+    daemon = Daemon()
+    daemon.up()
+    daemon.receive(have(OLD, known=9))
+    assert daemon.due(NOW) == [(PEER, CertificateRecord(OWN, signed(vehicle(1, 10), OWN)))]
+    daemon.receive(have(OLD, known=0), NOW + 0.1)
+    assert daemon.hour(NOW + 1) == []
+
+
+def test_newer_own_certificate() -> None:
+    """It is asked for, used, written, and passed on to those that hold the one before."""
+    daemon, newer = Daemon(), signed(vehicle(1, 11), OWN)
+    daemon.up(PEER, OTHER)
+    daemon.receive(have(OLD, serial=3), key=OTHER)
+    daemon.receive(have(OLD, known=11))
+    assert daemon.due(NOW + WAIT_S) == [(PEER, MINE)]
+    assert daemon.receive(CertificateRecord(OWN, newer), NOW + 1) == Reaction(persists=True)
+    stated = MINE._replace(serial=11)
+    assert daemon.due(NOW + 2) == [
+        (PEER, stated),
+        (OTHER, CertificateRecord(OWN, newer)),
+        (OTHER, stated._replace(known=3)),
+    ]
+    assert daemon.receive(CertificateRecord(OWN, newer), NOW + 2) == Reaction()
+    assert daemon.due(NOW + 3) == [(PEER, stated), (OTHER, CertificateRecord(OWN, newer))]
+
+
+def test_newer_certificate_of_the_sender() -> None:
+    """It is held, and stated. If name, role or ids changed, the peer ends, and begins again."""
+    daemon = Daemon()
+    daemon.up()
+    daemon.receive(have(OLD, serial=21))
+    assert daemon.receive(CertificateRecord(PEER, signed(vehicle(2, 21), PEER))) == Reaction()
+    assert daemon.due(NOW + 1) == [(PEER, MINE._replace(known=21))]
+    assert daemon.receive(CertificateRecord(PEER, signed(vehicle(4, 22), PEER)), NOW + 1) == Reaction((PEER,))
+    assert daemon.hour(NOW + 1) == []
+
+
+@pytest.mark.parametrize(
+    ("record", "reason"),
+    [
+        pytest.param(CertificateRecord(OWN, bytes(100)), DropReason.BAD_CERTIFICATE, id="own, malformed"),
+        pytest.param(CertificateRecord(OWN, CERTIFICATES[PEER]), DropReason.BAD_CERTIFICATE, id="of another key"),
+        pytest.param(CertificateRecord(PEER, bytes(100)), DropReason.BAD_CERTIFICATE, id="the peer's, malformed"),
+        pytest.param(CertificateRecord(OTHER, CERTIFICATES[OTHER]), DropReason.UNEXPECTED_RECORD, id="of a third"),
+        pytest.param(Who(4), DropReason.UNEXPECTED_RECORD, id="who"),
+    ],
+)
+def test_certificate_that_is_refused(record: FleetRecord, reason: DropReason) -> None:
+    """One signature a second is verified. The held bytes need none."""
+    daemon = Daemon()
+    daemon.up()
+    assert daemon.drop(record) is reason
+    if reason is DropReason.BAD_CERTIFICATE:
+        assert daemon.drop(CertificateRecord(OWN, bytes(100)), NOW + 0.9) is DropReason.RECORD_OVER_LIMIT
+        assert daemon.receive(CertificateRecord(PEER, CERTIFICATES[PEER]), NOW + 0.9) == Reaction()
+        assert daemon.receive(CertificateRecord(OWN, signed(vehicle(1, 11), OWN)), NOW + 1).persists
+
+
+def test_ends_without_certificates() -> None:
+    """A pinned pair, of which one end has no certificate, exchanges bulletins."""
+    daemon = Daemon(certificate=b"")
+    pinned = bytes(32)
+    assert daemon.up(pinned) == [(pinned, Have(5, digest_of(OLD)))]
+    daemon.receive(have(bulletin(4), serial=0, known=3), key=pinned)
+    assert daemon.due(NOW) == [(pinned, BulletinRecord(OLD))]
+    assert daemon.drop(CertificateRecord(OWN, bytes(100)), key=pinned) is DropReason.UNEXPECTED_RECORD
+    assert daemon.drop(CertificateRecord(pinned, bytes(100)), key=pinned) is DropReason.UNEXPECTED_RECORD

@@ -1,0 +1,285 @@
+"""How bulletins and newer certificates reach the peers of one daemon. README.md, "Bulletins".
+
+Pure: no I/O, no clock, no randomness of its own. An exchange knows what each peer stated, so what the peer lacks. It
+sends that until the peer states that it has it. The static public key of a peer names it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import inf
+from typing import NamedTuple
+
+from uavlinkd.authority import constants as c
+from uavlinkd.authority.trust import BulletinVerdict, Trust
+from uavlinkd.core.crypto import Entropy
+from uavlinkd.core.drops import Drop, DropReason
+from uavlinkd.core.relay_records import BulletinRecord, CertificateRecord, FleetRecord, Have
+
+ROLLED_BACK = "bulletin_rolled_back"
+"""A peer has an older bulletin than it had before: its disk was restored."""
+
+
+class Reaction(NamedTuple):
+    """What the daemon does because of a record, in this order."""
+
+    ended: tuple[bytes, ...] = ()
+    """The peers with these keys end at once, without a close. The exchange has forgotten them."""
+    persists: bool = False
+    """The bulletin and the own certificate are to be written, then :meth:`BulletinExchange.note_persisted`."""
+    event: str = ""
+    """For the log: ``bulletin_conflict``, ``bulletin_shrinks`` or ``bulletin_rolled_back``."""
+
+
+@dataclass(slots=True)
+class _Peer:
+    """What one peer stated, and when it gets what. Kept while it is down: it may come back with an older disk."""
+
+    wait_s: float = c.PUSH_AGAIN_S
+    is_up: bool = False
+    have: Have | None = None
+    """What it stated last, on a session of the present link."""
+    has: int = 0
+    """The newest bulletin that it stated or sent since then."""
+    stated: int | None = None
+    """The number that it stated last, ever."""
+    order: int = -1
+    """Of the record that stated it."""
+    push_at: float = inf
+    pushed_at: float = -inf
+    tries: int = 0
+    owes_have: bool = False
+    """Whether this end has to state what it has."""
+    have_sent_at: float = -inf
+    bulletin_verified_at: float = -inf
+    certificate_verified_at: float = -inf
+
+    @property
+    def next_at(self) -> float:
+        """When it may get something. The answer to a *have* or a bulletin waits for the next one at least."""
+        return min(self.push_at, self.have_sent_at + c.HAVE_LEAST_S if self.owes_have else inf)
+
+
+class BulletinExchange:
+    """The exchange of one daemon with its peers that have ``FEATURE_FLEET``. Times are monotonic seconds.
+
+    Look at :attr:`next_at` after each call: :meth:`do_due` alone returns records to send.
+
+    Args:
+        trust: its bulletin and its own certificate are on the disk.
+    """
+
+    def __init__(self, trust: Trust, entropy: Entropy) -> None:
+        self._trust = trust
+        self._entropy = entropy
+        self._persisted = (trust.bulletin.number, trust.digest)
+        self._peers: dict[bytes, _Peer] = {}
+        self.next_at = inf
+        """When :meth:`do_due` has something to do, or sooner."""
+
+    # Peers.
+
+    def on_handshake(self, key: bytes, wait_s: float, now: float) -> None:
+        """A session with a peer was made, or its link is up again.
+
+        Args:
+            key: its static public key.
+            wait_s: before a repetition: two round trips; with a budget, at least four airtimes.
+            now: monotonic seconds.
+        """
+        peer = self._peers.setdefault(key, _Peer())
+        peer.wait_s = max(wait_s, c.PUSH_AGAIN_S)
+        peer.is_up, peer.have, peer.has, peer.tries = True, None, 0, 0
+        peer.owes_have, peer.push_at = True, now + peer.wait_s
+        self._note(peer)
+
+    def on_down(self, key: bytes) -> None:
+        """The link of a peer is lost or closed."""
+        if (peer := self._peers.get(key)) is not None:
+            peer.is_up, peer.push_at, peer.owes_have = False, inf, False
+
+    def forget(self, key: bytes) -> None:
+        """The peer was removed."""
+        self._peers.pop(key, None)
+
+    def shown(self, key: bytes) -> int | None:
+        """The number of the newest bulletin that a peer has, as far as is known; None if it did not state any."""
+        peer = self._peers.get(key)
+        return None if peer is None or peer.stated is None else max(peer.has, peer.stated)
+
+    # Receipt.
+
+    def receive(self, key: bytes, record: FleetRecord, order: int, now: float) -> Reaction:
+        """A peer sent *have*, a bulletin, or a certificate for its own key or this daemon's.
+
+        Args:
+            key: the peer's.
+            record: what it sent.
+            order: that of :class:`~uavlinkd.core.outputs.RecordReceived`.
+            now: monotonic seconds.
+
+        Raises:
+            Drop: the record has no effect.
+        """
+        peer = self._peers.get(key)
+        if peer is None or not peer.is_up:
+            raise Drop(DropReason.UNEXPECTED_RECORD)
+        if isinstance(record, Have):
+            return self._receive_have(key, peer, record, order, now)
+        if isinstance(record, BulletinRecord):
+            return self._receive_bulletin(peer, record.bulletin, now)
+        if isinstance(record, CertificateRecord):
+            return self._receive_certificate(key, peer, record, now)
+        raise Drop(DropReason.UNEXPECTED_RECORD)
+
+    def _receive_have(self, key: bytes, peer: _Peer, have: Have, order: int, now: float) -> Reaction:
+        if order <= peer.order:
+            raise Drop(DropReason.OLD_RECORD)
+        is_repeated, before = have == peer.have, peer.stated
+        peer.order, peer.have, peer.has = order, have, max(peer.has, have.number)
+        peer.stated = have.number
+        if not is_repeated:
+            peer.tries = 0
+        if self._lacks(key, peer):
+            peer.push_at = max(now, peer.pushed_at + peer.wait_s)
+        elif self._asks(peer):
+            peer.push_at = min(peer.push_at, now + peer.wait_s)
+        else:
+            peer.push_at = inf
+            # The peer may not know what this end has. The peer's answer to the answer comes too soon for a loop.
+            peer.owes_have |= is_repeated and now >= peer.have_sent_at + peer.wait_s
+        self._note(peer)
+        if before is not None and have.number < before:
+            return Reaction(event=ROLLED_BACK)
+        own = self._trust.bulletin.number, self._trust.digest
+        is_other = have.number == own[0] and have.digest != own[1]
+        return Reaction(event=BulletinVerdict.CONFLICT.value if is_other and not is_repeated else "")
+
+    def _receive_bulletin(self, peer: _Peer, data: bytes, now: float) -> Reaction:
+        may_verify = now >= peer.bulletin_verified_at + c.BULLETIN_LEAST_S
+        verdict, ended = self._trust.receive_bulletin(data, may_verify=may_verify)
+        if verdict is BulletinVerdict.UNVERIFIED:
+            raise Drop(DropReason.RECORD_OVER_LIMIT)
+        if verdict is BulletinVerdict.KNOWN:
+            peer.owes_have |= self._persisted[0] == self._trust.bulletin.number  # else when it is written
+            self._note(peer)
+        else:
+            peer.bulletin_verified_at = now
+        if verdict is BulletinVerdict.INVALID:
+            raise Drop(DropReason.BAD_CONTROL)
+        if data == self._trust.bulletin_bytes:
+            peer.has = self._trust.bulletin.number
+        if verdict is BulletinVerdict.NEWER:
+            return self._accepted(ended, now)
+        return Reaction(event="" if verdict is BulletinVerdict.KNOWN else verdict.value)
+
+    def publish(self, data: bytes, now: float) -> tuple[BulletinVerdict, Reaction]:
+        """Take a bulletin from the operator, as if a peer had sent it."""
+        verdict, ended = self._trust.receive_bulletin(data)
+        return verdict, self._accepted(ended, now) if verdict is BulletinVerdict.NEWER else Reaction()
+
+    def _accepted(self, ended: list[bytes], now: float) -> Reaction:
+        for key in ended:
+            self.forget(key)
+        self._plan_all(now)
+        return Reaction(tuple(ended), persists=True)
+
+    def _receive_certificate(self, key: bytes, peer: _Peer, record: CertificateRecord, now: float) -> Reaction:
+        trust, is_own = self._trust, record.key == self._trust.own_key
+        held = trust.own if is_own else trust.held.get(key)
+        if record.key not in (trust.own_key, key) or held is None:
+            raise Drop(DropReason.UNEXPECTED_RECORD)
+        peer.owes_have = True
+        self._note(peer)
+        if record.certificate == held.data:
+            return Reaction()
+        if now < peer.certificate_verified_at + c.BULLETIN_LEAST_S:
+            raise Drop(DropReason.RECORD_OVER_LIMIT)
+        peer.certificate_verified_at = now
+        if not is_own:
+            ended = trust.hold(key, record.certificate)
+            for other in ended:
+                self.forget(other)
+            return Reaction(tuple(ended))
+        if not trust.replace_own(record.certificate):
+            raise Drop(DropReason.BAD_CERTIFICATE)
+        self.note_own_certificate(now)
+        return Reaction(persists=True)
+
+    # Own changes.
+
+    def note_persisted(self, number: int, digest: bytes) -> None:
+        """The bulletin with this number is on the disk. Before, no *have* states it."""
+        self._persisted = number, digest
+        self._owe_all()
+
+    def note_own_certificate(self, now: float) -> None:
+        """The own certificate was replaced: peers that hold the one before get it."""
+        self._owe_all()
+        self._plan_all(now)
+
+    def _owe_all(self) -> None:
+        for peer in self._peers.values():
+            peer.owes_have |= peer.is_up
+            self._note(peer)
+
+    def _plan_all(self, now: float) -> None:
+        """Send each peer what it lacks, a little later: it may come from others until then."""
+        for peer in self._peers.values():
+            if peer.is_up:
+                soon = now + c.PUSH_JITTER_S * self._entropy(1)[0] / 255
+                peer.tries, peer.push_at = 0, max(soon, peer.pushed_at + peer.wait_s)
+                self._note(peer)
+
+    def _note(self, peer: _Peer) -> None:
+        self.next_at = min(self.next_at, peer.next_at)
+
+    # Sending.
+
+    def do_due(self, now: float) -> list[tuple[bytes, FleetRecord]]:
+        """The records to send now, each with the key of its receiver."""
+        sent: list[tuple[bytes, FleetRecord]] = []
+        for key, peer in self._peers.items():
+            if peer.next_at > now:
+                continue
+            records: list[FleetRecord] = []
+            if peer.push_at <= now:
+                records, asks = self._lacks(key, peer), self._asks(peer)
+                peer.pushed_at = now if records else peer.pushed_at
+                peer.owes_have |= asks
+                peer.tries += 1
+                again_s = peer.wait_s if peer.tries < c.PUSH_TRIES else max(c.HAVE_INTERVAL_S, peer.wait_s)
+                peer.push_at = now + again_s if records or asks else inf
+            if peer.owes_have and now >= peer.have_sent_at + c.HAVE_LEAST_S:
+                records.append(self._have(key))
+                peer.owes_have, peer.have_sent_at = False, now
+            sent += [(key, record) for record in records]
+        self.next_at = min((peer.next_at for peer in self._peers.values()), default=inf)
+        return sent
+
+    def _have(self, key: bytes) -> Have:
+        own, held = self._trust.own, self._trust.held.get(key)
+        serials = (0 if one is None else one.certificate.serial for one in (own, held))
+        return Have(*self._persisted, *serials)
+
+    def _lacks(self, key: bytes, peer: _Peer) -> list[FleetRecord]:
+        """What a peer does not have, as far as this end knows."""
+        trust, have = self._trust, peer.have
+        if have is None:
+            return []
+        records: list[FleetRecord] = []
+        if peer.has < trust.bulletin.number:
+            records.append(BulletinRecord(trust.bulletin_bytes))
+        held, own = trust.held.get(key), trust.own
+        if held is not None and have.serial < held.certificate.serial:
+            records.append(CertificateRecord(key, held.data))
+        if own is not None and 0 < have.known < own.certificate.serial:
+            records.append(CertificateRecord(trust.own_key, own.data))
+        return records
+
+    def _asks(self, peer: _Peer) -> bool:
+        """Whether the peer did not state what it has yet, or has more than this end: *have* asks for it."""
+        have, own = peer.have, self._trust.own
+        if have is None or have.number > self._trust.bulletin.number:
+            return True
+        return own is not None and have.known > own.certificate.serial

@@ -1,0 +1,89 @@
+"""The file with the newest bulletin and the newest own certificate, for the next start. README.md, "Start and state".
+
+A text of four lines: what it is, the bulletin and the certificate in base64, and a checksum of the lines before.
+"""
+
+from __future__ import annotations
+
+import os
+from base64 import b64decode, b64encode
+from contextlib import suppress
+from pathlib import Path
+from stat import S_ISREG
+from typing import NamedTuple
+
+from uavlinkd.authority.trust import BulletinVerdict, Trust
+from uavlinkd.core.crypto import sha256
+
+_TITLE = b"uavlinkd fleet state 1"
+_MOST_BYTES = 1024
+"""Of the file. The longest one has 600."""
+
+
+class FleetState(NamedTuple):
+    """The content of a file."""
+
+    bulletin: bytes
+    certificate: bytes
+    """Empty for a daemon that has none."""
+
+
+def read(path: Path, trust: Trust) -> str:
+    """Let a daemon that starts know what the file has.
+
+    Returns the cause in words if it cannot be used, and nothing if it is used or absent.
+    """
+    try:
+        if not S_ISREG(path.stat().st_mode):  # opening a FIFO would wait for its writer
+            return f"{path} is not a file"
+        with path.open("rb") as file:
+            data = file.read(_MOST_BYTES)
+    except FileNotFoundError:
+        return ""
+    except OSError as error:
+        return f"{path} cannot be read: {error.strerror}"
+    if (state := _parse(data)) is None:
+        return f"{path} is incomplete, or was not written by uavlinkd"
+    verdict, _ = trust.receive_bulletin(state.bulletin)
+    if verdict not in (BulletinVerdict.NEWER, BulletinVerdict.KNOWN):
+        return f"{path} has a bulletin of another fleet, or one that contradicts the configuration ({verdict.value})"
+    trust.replace_own(state.certificate)
+    return ""
+
+
+def write(path: Path, state: FleetState) -> None:
+    """Replace the file: after a power cut it has the old content or the new one, and when this returns, the new one.
+
+    Raises:
+        OSError: the file has the old content, or perhaps will have it after a power cut.
+    """
+    new = path.with_name(f".{path.name}.new")
+    try:
+        with new.open("wb") as file:
+            file.write(_encode(state))
+            file.flush()
+            os.fsync(file.fileno())
+        new.replace(path)
+    except OSError:
+        with suppress(OSError):
+            new.unlink()  # the disk may be full
+        raise
+    folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+def _encode(state: FleetState) -> bytes:
+    lines = b"\n".join((_TITLE, *map(b64encode, state), b""))
+    return lines + sha256(lines).hex().encode() + b"\n"
+
+
+def _parse(data: bytes) -> FleetState | None:
+    try:
+        _, bulletin, certificate, _, _ = data.split(b"\n")
+        state = FleetState(b64decode(bulletin), b64decode(certificate))
+    except ValueError:
+        return None
+    return state if _encode(state) == data else None
