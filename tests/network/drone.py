@@ -21,7 +21,7 @@ from uavlinkd.core.path_measures import limit_at
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.refusals import Refused
 from uavlinkd.core.session import Session
-from uavlinkd.core.settings import Link, PeerSettings
+from uavlinkd.core.settings import Admit, Link, PeerSettings
 
 if TYPE_CHECKING:
     from tests.network.network import Network
@@ -50,6 +50,8 @@ class Drone:
         self.contacted: set[tuple[Address, Address]] = set()
         self.private_key = world.rng.randbytes(32)
         self.public_key = x25519_public_key(self.private_key)
+        self.on_certificate: Admit | None = None
+        """Decides on certificates."""
         self.acquaintances: dict[str, tuple[PeerSettings, tuple[Path, ...]]] = {}
         self.removed: dict[str, tuple[PeerSettings, tuple[Path, ...]]] = {}
         """Peers that were removed from the configuration, and can be added again."""
@@ -226,7 +228,9 @@ class Drone:
             self.clock = clock - self._world.now
         now = self.local_now
         entropy = Random(self._world.rng.randbytes(16))
-        self.node = Node(Secret(self.private_key), entropy.randbytes, now, screen=self._world.screen)
+        self.node = Node(
+            Secret(self.private_key), entropy.randbytes, now, screen=self._world.screen, admit=self.on_certificate
+        )
         self.node.set_metered(self.metered_sockets, self.local_now)
         peers = [(self.node.add_peer(settings, now), paths) for settings, paths in self.acquaintances.values()]
         self._set_lines()

@@ -1,4 +1,7 @@
-"""Relays and their members in the simulated network: the node, and around it what a daemon has for relays."""
+"""Relays and their members in the simulated network: the node, and around it what a daemon has for relays.
+
+A relay has its members in its configuration, or accepts those with a certificate.
+"""
 
 from __future__ import annotations
 
@@ -12,9 +15,11 @@ from typing import Final
 
 import structlog
 
+from tests.authority.signing import AUTHORITY, bulletin
 from tests.network.air import Address, Endpoint
 from tests.network.drone import Drone
 from tests.network.network import Network
+from uavlinkd.authority.trust import Trust
 from uavlinkd.config import PeerAddress, PeerConfig, RelayConfig
 from uavlinkd.config.build import TIMERS
 from uavlinkd.core import constants as c
@@ -23,7 +28,7 @@ from uavlinkd.core.crypto import Entropy
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.path import RELAY_HOST, Path
 from uavlinkd.core.peer import Peer
-from uavlinkd.core.relay_records import Bind, FilterTest, token_of
+from uavlinkd.core.relay_records import Bind, CertificateRecord, FilterTest, token_of
 from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.link.direct_search import OwnSocket
 from uavlinkd.link.peer_link import PeerLink
@@ -38,6 +43,7 @@ HOUSEKEEPING_S: Final = 1.0
 MOST_PEERS: Final = 8
 FEATURES: Final = c.KNOWN_FEATURES
 LINK: Final = Link(features=FEATURES)
+BULLETIN: Final = bulletin(1 << 24)
 _LIMITS: Final = RelayLimits(datagrams_s=20_000, bits_s=100_000_000)
 _FIRST_NEW_PORT: Final = 32_768
 _REMEMBERED_S: Final = c.BIND_LIFETIME_S + c.QUESTION_LIFETIME_S + HOUSEKEEPING_S
@@ -47,11 +53,13 @@ _LOG: Final = structlog.wrap_logger(structlog.ReturnLogger(), wrapper_class=_QUI
 
 
 class Relay(Drone):
-    """A relay with a public address. It is configured with its members, and carries no frames of its own."""
+    """A relay with a public address. It carries no frames of its own."""
 
     def __init__(self, world: Network, name: str, address: Address, clock: float = 0.0) -> None:
         super().__init__(world, name, (address,), clock)
         self.members: dict[bytes, str] = {}
+        self.trust: Trust | None = None
+        """In a fleet with an authority."""
         self.service: RelayService | None = None
         self.forwarded = 0
         self._asked: dict[tuple[str, str], float] = {}
@@ -61,10 +69,16 @@ class Relay(Drone):
         self._arrived: tuple[Path, int] | None = None
         self._housekeeping_at = 0.0
 
+    def certify(self) -> None:
+        """Accept certificates from the start on, and have no members in the configuration."""
+        self.on_certificate = self._admit
+
     def start(self, clock: float | None = None) -> None:
         super().start(clock)
         assert self.node is not None
         self._asked.clear()
+        if self.on_certificate is not None:
+            self.trust = Trust(AUTHORITY, self.public_key, b"", BULLETIN)
         shell = RelayShell(
             entropy=Random(self._world.rng.randbytes(16)).randbytes,
             clock=lambda: self.local_now,
@@ -77,9 +91,19 @@ class Relay(Drone):
         members = {
             key: MemberSettings(PeerSettings(name, key, None, LINK), MOST_PEERS, _LIMITS)
             for key, name in self.members.items()
+            if self.on_certificate is None
         }
         self.service.set_members(members, {}, self.local_now)
         self._housekeeping_at = self.local_now + HOUSEKEEPING_S
+
+    def _admit(self, key: bytes, certificate: bytes, now: float) -> PeerSettings:
+        assert self.trust is not None
+        self.trust.hold(key, certificate)
+        return PeerSettings(self.members[key], key, None, LINK, is_certified=True)
+
+    def has_asked(self, name: str, other: str) -> bool:
+        """Whether one member asked for another one recently."""
+        return self._world.now <= self._asked.get((name, other), -math.inf) + _REMEMBERED_S
 
     def receive(self, datagram: bytes, path: Path) -> None:
         """Forward data, and pass anything else to the node."""
@@ -100,8 +124,7 @@ class Relay(Drone):
         assert len(datagram) <= size
         sender, receiver = (self._world.owners[one.address[:2]] for one in (arrived, path))
         for asking in ((sender, receiver), (receiver, sender)):
-            at = self._asked.get(asking, -math.inf)
-            assert self._world.now <= at + _REMEMBERED_S, f"{self.name} forwards, but {asking} is not asked for"
+            assert self.has_asked(*asking), f"{self.name} forwards, but {asking} is not asked for"
         self.forwarded += 1
         self._world.perform(self, [o.Transmit(datagram, path)])
 
@@ -129,6 +152,12 @@ class Relay(Drone):
 
     def on_event(self, event: o.Event) -> None:
         assert self.service is not None
+        if isinstance(event, o.PeerAdmitted):
+            assert self.trust is not None
+            assert isinstance(event.peer, Peer)
+            settings = event.peer.settings
+            member, held = MemberSettings(settings, MOST_PEERS, _LIMITS), self.trust.held[settings.public_key]
+            self.service.admit(event.peer, member, held, self.local_now, is_own=True)
         self.service.on_event(event, self.local_now)
 
     def next_deadline(self) -> float:
@@ -216,6 +245,9 @@ class Member(Drone):
         """Whether it looks for direct paths to its peers."""
         self.links: dict[str, _Link] = {}
         self.tokens_taken = 0
+        self.certificate = b""
+        """For relays that accept certificates."""
+        self.introductions = 0
         self._housekeeping_at = 0.0
 
     def joins(self, relays: Iterable[Relay]) -> None:
@@ -231,12 +263,14 @@ class Member(Drone):
         self.links = {}
         relays = Relays(self.node, _Sockets(self), self.links, {}, _LOG, self._entropy())  # type: ignore[arg-type]
         self.relays = relays
+        self.node.set_certificate(self.certificate)
         self._look()
         for name in self.acquaintances:
             self._link(name)
         for relay in self.uses:
             link = replace(LINK, timers=TIMERS)
-            settings = PeerSettings(RELAY_HOST + relay.name, relay.public_key, None, link)
+            is_certified = relay.on_certificate is not None
+            settings = PeerSettings(RELAY_HOST + relay.name, relay.public_key, None, link, is_certified=is_certified)
             relays.add(RelayConfig(settings, (PeerAddress(addresses.Address(*relay.addresses[0])),)), now)
         relays.follow_links(now)
         for end in self.absent_ends():
@@ -315,6 +349,11 @@ class Member(Drone):
 
     def on_record(self, received: o.RecordReceived) -> None:
         assert self.relays is not None
+        if isinstance(received.record, CertificateRecord):
+            relay = next(relay for relay in self.uses if received.peer.name == RELAY_HOST + relay.name)
+            assert relay.has_asked(relay.members[received.record.key], self.name), "an introduction without a wish"
+            self.introductions += 1
+            return
         reason = self.relays.on_record(received, self.local_now)
         if reason is not None:
             self.drops[reason] += 1

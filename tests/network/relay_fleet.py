@@ -1,10 +1,14 @@
-"""The drones of a random history that meet at relays, each behind its NATs, and one that they do not know."""
+"""The drones of a random history that meet at relays, each behind its NATs, and one that they do not know.
+
+The relays have their members in the configuration, or by certificate.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from random import Random
 
+from tests.authority.signing import FLEET, signed
 from tests.network.air import Address, Hop
 from tests.network.drone import Drone
 from tests.network.fleet import Fleet, Pair, Route
@@ -13,6 +17,7 @@ from tests.network.nat import Nat
 from tests.network.network import Network
 from tests.network.plans import Plan
 from uavlinkd.core import constants as c
+from uavlinkd.core.certificates import Certificate, MemberRole
 from uavlinkd.core.settings import Link
 
 
@@ -31,6 +36,12 @@ class RelayFleet(Fleet):
         self.pairs = [pair._replace(hops=self._hops(pair)) for pair in self.pairs]
         self.unwanted = self._member("x", 99, 1)
         """It asks for every drone, but they do not know it."""
+        self.is_certified = lot.random() >= 0.5
+        """Whether the relays accept members by certificate, and have none in their configuration."""
+        for relay in self.relays:
+            assert isinstance(relay, Relay)
+            if self.is_certified:
+                relay.certify()
         for drone in self.drones:
             self.unwanted.knows(drone, link=LINK)
         for member in (*self.drones, self.unwanted):
@@ -50,6 +61,8 @@ class RelayFleet(Fleet):
         network, lot, clock = self.network, self.lot, self.random_clock()
         addresses: list[Address] = [(f"10.{socket}.0.{number + 1}", 5790) for socket in range(networks)]
         member = network.add_drone(Member(network, name, addresses, clock, searches=self.searches))
+        certificate = Certificate(FLEET, number + 1, MemberRole.VEHICLE, (number + 1, number + 1), name)
+        member.certificate = signed(certificate, member.public_key)
         for socket in range(networks):
             member.nats[socket] = Nat(
                 f"203.0.{113 + socket}.{number + 1}",
@@ -102,6 +115,8 @@ class RelayFleet(Fleet):
         assert not self.unwanted.relays.handles._outward
         for drone in self.drones:
             assert not self.unwanted.peer(drone).is_up
+            assert isinstance(drone, Member)
+            assert (drone.introductions > 0) is self.is_certified, "drones learn that it asks for them"
         self._check_filters()
 
     def _check_filters(self) -> None:
