@@ -11,7 +11,9 @@ import pytest
 from rich.console import Console
 
 from tests.config.files import load
+from tests.config.fleets import bulletin, certificate, contact, fleet, load_member, member_file
 from uavlinkd.config import Config, keys
+from uavlinkd.core.certificates import MemberRole
 from uavlinkd.mavlink import dialect
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import Gate, Refusal
@@ -55,6 +57,27 @@ def _printed(config: Config, *, columns: int | None = None) -> str:
 
 def _line(printed: str, start: str) -> str:
     return next(line for line in printed.splitlines() if line.startswith(start))
+
+
+def test_fleet_is_shown_for_a_review(tmp_path: Path) -> None:
+    """Who this daemon is in its fleet, whom it knows from the start, and what members of each role may send."""
+    sections = fleet(news=bulletin(3)) + contact() + contact(MemberRole.RELAY, "r1")
+    printed = _printed(load_member(tmp_path, member_file(sections)))
+    for line in (
+        r"fingerprint +[a-z2-7]{8}",
+        r"certificate +v7: vehicle, system id 7, serial 7",
+        r"bulletin +number 3 in this file, or a newer one",
+        r"contact +gs: operator, at gs\.example\.org:5790",
+        r"contact +r1: relay, used as a relay, at r1\.example\.org:5790",
+        r"connects to +contacts, and members of the role operator",
+        r"members +vehicle +swarm-member +of its certificate",
+        r"Policy of members: observer",
+    ):
+        assert re.search(rf"^{line}$", printed, re.MULTILINE), line
+    station = certificate(MemberRole.OPERATOR, "gs2", (250, 254))
+    assert "gs2: operator, system ids 250 to 254, serial 7" in _printed(
+        load_member(tmp_path, member_file(fleet(station)))
+    )
 
 
 def test_open_endpoint_is_marked_in_rows_of_one_line(tmp_path: Path) -> None:

@@ -12,10 +12,13 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
+from uavlinkd.authority.enrolment import fingerprint_of
 from uavlinkd.config import Config, EndpointConfig, PeerConfig, PolicyData
 from uavlinkd.config.advice import exposure
 from uavlinkd.config.keys import encode_key, looks_private
+from uavlinkd.config.model import FleetConfig
 from uavlinkd.config.network_rules import used_networks
+from uavlinkd.core.certificates import parse_bulletin
 from uavlinkd.core.settings import Link
 from uavlinkd.mavlink import dialect
 from uavlinkd.mavlink.policy.compilation import Policy, PolicyRow
@@ -57,6 +60,8 @@ def _facts(config: Config, here: Surroundings | None) -> list[RenderableType]:
     Text from the file is always a :class:`rich.text.Text`, so that it cannot act as markup.
     """
     parts: list[RenderableType] = [_identity(config)]
+    if config.fleet is not None:
+        parts += [_heading("Fleet"), _fleet(config.fleet)]
     if config.networks:
         parts += [_heading("Networks"), _networks(config, here)]
     if config.peers:
@@ -138,6 +143,26 @@ def _identity(config: Config) -> Table:
     if config.recording is not None:
         free = f"keeps {config.recording.min_free_bytes / 1e9:g} GB of the disk free"
         table.add_row("recordings", Text(f"{config.recording.folder} ({free})"))
+    return table
+
+
+def _fleet(fleet: FleetConfig) -> Table:
+    own, bulletin = fleet.own.certificate, parse_bulletin(fleet.bulletin)
+    first, last = own.system_ids
+    systems = f"system ids {first} to {last}" if last > first else f"system id {first}"
+    table = Table.grid(padding=(0, 2))
+    table.add_column(style="dim")
+    table.add_column(overflow="fold")
+    table.add_row("fingerprint", Text(fingerprint_of(fleet.authority.public), style="bold"))
+    facts = [own.role.name.lower(), systems if last else "", f"serial {own.serial}"]
+    table.add_row("certificate", Text(f"{own.name}: {', '.join(filter(None, facts))}"))
+    assert bulletin is not None  # it was checked
+    table.add_row("bulletin", f"number {bulletin.number} in this file, or a newer one")
+    for contact in fleet.contacts:
+        what = contact.role.name.lower() + (", used as a relay" if contact.relays else "")
+        table.add_row("contact", Text(f"{contact.name}: {what}, at {', '.join(map(str, contact.addresses))}"))
+    called = ", ".join(sorted(role.name.lower() for role in fleet.call))
+    table.add_row("connects to", f"contacts{f', and members of the role {called}' if called else ''}")
     return table
 
 
@@ -235,6 +260,9 @@ def _policies(config: Config) -> list[RenderableType]:
     """A line for each peer and endpoint; then each policy once, with the names of its peers and endpoints."""
     senders = [("peer", peer.name, peer.policy, peer.make_policy()) for peer in config.peers]
     senders += [("endpoint", endpoint.name, endpoint.policy, endpoint.make_policy()) for endpoint in config.endpoints]
+    for member, limits in config.fleet.policies.items() if config.fleet else ():
+        of_role = {**limits, "system_ids": dialect.ALL}
+        senders.append(("members", member.name.lower(), of_role, Policy(of_role)))
     if not senders:
         return []
     summary: list[tuple[str | Text, ...]] = []
@@ -247,8 +275,9 @@ def _policies(config: Config) -> list[RenderableType]:
         role: str | Text = incoming["role"]
         if kind == "peer" and role == dialect.ALL:
             role = Text("all: everything except SETUP_SIGNING", style="bold yellow")
-        summary.append((kind, name, role, incoming["may speak as"]))
-        names_of.setdefault(table_rows(policy, data), []).append(name)
+        systems = "of its certificate" if kind == "members" else incoming["may speak as"]
+        summary.append((kind, name, role, systems))
+        names_of.setdefault(table_rows(policy, data), []).append(f"members: {name}" if kind == "members" else name)
     parts: list[RenderableType] = [_heading("Roles"), _table(("", "name", "role", "system ids"), summary)]
     for rows, names in names_of.items():
         parts += [_heading(f"Policy of {', '.join(names)}"), *_policy_tables(rows)]
