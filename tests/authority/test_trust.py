@@ -160,6 +160,19 @@ def test_new_key_of_a_member() -> None:
     assert known.hold(bytes(32), signed(RELAY._replace(name="relay2", serial=31), bytes(32))) == []
 
 
+def test_member_that_is_given_up_reserves_nothing() -> None:
+    """Its name and ids are free: a daemon that holds too many gives one up. Others keep theirs."""
+    known, wide = trust(), Certificate(FLEET, 20, MemberRole.OPERATOR, (200, 210), "gcs")
+    for number in (7, 8):
+        known.hold(bytes([number]) * 32, signed(vehicle(number), bytes([number]) * 32))
+    known.hold(KEY, signed(wide, KEY))
+    del known.held[bytes([7]) * 32]
+    known.hold(bytes([9]) * 32, signed(vehicle(7, 30), bytes([9]) * 32))
+    inside = Certificate(FLEET, 40, MemberRole.VEHICLE, (210, 211), "v210")
+    assert refused(known, bytes([6]) * 32, signed(inside, bytes([6]) * 32)) is DropReason.MEMBER_CONFLICT
+    assert refused(known, bytes([6]) * 32, signed(vehicle(8), bytes([6]) * 32)) is DropReason.MEMBER_CONFLICT
+
+
 def test_held_bytes_are_not_verified_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """A member that shows its certificate at each handshake costs a comparison."""
     known, data = trust(), signed(CERTIFICATE, KEY)

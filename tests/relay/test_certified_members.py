@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from tests.relay.certified import LINK, CertifiedRelay
 from uavlinkd.authority.constants import CERTIFICATES_PER_ANSWER, INTRODUCTIONS, WHO
-from uavlinkd.authority.places import longest_down
 from uavlinkd.core import constants as c
 from uavlinkd.core.certificates import MemberRole
 from uavlinkd.core.drops import DropReason
@@ -352,21 +351,3 @@ def test_member_that_carries_frames_keeps_its_peer() -> None:
     again = relay.node.add_peer(peer.settings, relay.now)
     relay.service.admit(again, settings, held, relay.now, is_own=False)
     assert relay.service.members[one.key].peer is again
-
-
-def test_member_that_is_down_for_longest_gives_way() -> None:
-    """None that is up or kept, and no peer of the configuration."""
-    relay = CertifiedRelay()
-    one, other, up = *relay.join(1), *relay.join(2), *relay.join(3)
-    other.close()
-    one.close()
-    relay.node.add_peer(PeerSettings("pinned", bytes([9]) * 32, None, LINK), relay.now)
-    peers = relay.node.peers.values()
-    assert longest_down(peers) is one.at_relay
-    assert longest_down(peers, {one.key}) is other.at_relay
-    assert longest_down(peers, {one.key, other.key}) is None
-    new = relay.node.add_peer(PeerSettings("new", bytes([8]) * 32, None, LINK, is_certified=True), relay.now + 5)
-    assert longest_down(peers, {one.key}) is other.at_relay
-    relay.node.remove_peer(other.at_relay, relay.now)
-    assert longest_down(peers, {one.key, other.key}) is new
-    assert up.at_relay.is_up

@@ -5,7 +5,7 @@ Pure: no I/O, no clock, no randomness. Whether a certificate may be accepted dep
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from enum import Enum
 from typing import NamedTuple
 
@@ -82,6 +82,10 @@ class Trust:
         """The own certificate."""
         self.held: dict[bytes, HeldCertificate] = {}
         """By static public key, without the own one."""
+        self._claims: dict[str | int, bytes] = {}
+        """Who was held last with a name or a system id: a relay holds thousands, and must not compare all of them."""
+        self._last_valid = (b"", b"")
+        """The key and certificate whose signature was found valid last: they are judged, then held."""
         self.pinned = Pinned()
         if certificate and not self.replace_own(certificate):
             raise ValueError("is not a certificate of this fleet for the key of this daemon")
@@ -142,12 +146,13 @@ class Trust:
         before = self.held.get(key)
         if before is not None and certificate.serial <= before.certificate.serial:
             return []
-        ended = [other for other, held in self.held.items() if other != key and _same(held.certificate, certificate)]
+        ended = [other for other, _ in self._rivals(key, certificate)]  # the same member before
         if before is not None and not _same(before.certificate, certificate):
             ended.append(key)
         for other in ended:
             del self.held[other]
         self.held[key] = HeldCertificate(certificate, data)
+        self._claims |= dict.fromkeys(_claims_of(certificate), key)
         return ended
 
     def reserve(self, pinned: Pinned) -> list[bytes]:
@@ -172,16 +177,25 @@ class Trust:
                 return f"{name}, which has system id {system_id} in the configuration"
         if self.own is not None and _overlap(self.own.certificate, certificate):
             return "this daemon's own certificate"
-        for other, held in self.held.items():
-            is_newer = held.certificate.serial < certificate.serial and _same(held.certificate, certificate)
-            if other != key and not is_newer and _overlap(held.certificate, certificate):
-                return f"{held.certificate.name}, serial {held.certificate.serial}"
+        for _, held in self._rivals(key, certificate):
+            if held.serial >= certificate.serial or not _same(held, certificate):
+                return f"{held.name}, serial {held.serial}"
         return None
+
+    def _rivals(self, key: bytes, certificate: Certificate) -> list[tuple[bytes, Certificate]]:
+        """Other keys that are held with the same name or a system id of it, and their certificates."""
+        claimants = dict.fromkeys(filter(None, map(self._claims.get, _claims_of(certificate))))
+        rivals = [(other, self.held[other].certificate) for other in claimants if other != key and other in self.held]
+        return [(other, held) for other, held in rivals if _overlap(held, certificate)]
 
     def _is_signed(self, certificate: Certificate, key: bytes, data: bytes) -> bool:
         held = self.held.get(key)
-        is_held = held is not None and held.data == data
-        return is_held or (certificate.fleet == self.fleet and is_certified(data, key, self._authority))
+        if (held is not None and held.data == data) or self._last_valid == (key, data):
+            return True
+        if certificate.fleet != self.fleet or not is_certified(data, key, self._authority):
+            return False
+        self._last_valid = key, data
+        return True
 
     # Bulletins.
 
@@ -220,6 +234,13 @@ class Trust:
 def _same(one: Certificate, other: Certificate) -> bool:
     """Whether two certificates are of the same member."""
     return one._replace(serial=0) == other._replace(serial=0)
+
+
+def _claims_of(certificate: Certificate) -> Iterator[str | int]:
+    """What no other member may have."""
+    yield certificate.name
+    if certificate.system_ids[1]:
+        yield from range(certificate.system_ids[0], certificate.system_ids[1] + 1)
 
 
 def _overlap(one: Certificate, other: Certificate) -> bool:
