@@ -44,6 +44,7 @@ class SimulatedMember:
         self.is_writable = True
         self.highest_stated = 0
         """By *have*, since its disk was restored."""
+        self.wakes_at = inf
         self.start()
 
     def start(self) -> None:
@@ -85,6 +86,7 @@ class SimulatedFleet:
             except Drop as drop:
                 if drop.reason is not DropReason.CERTIFICATE_REVOKED:
                     raise
+                self.disconnect(one, other)
                 return False
             assert ended == []
             held = here.trust.held[there.key].certificate
@@ -139,6 +141,7 @@ class SimulatedFleet:
         if member.is_writable and epoch is member.epoch:
             member.disk = member.trust.bulletin_bytes
             member.exchange.note_persisted(member.trust.bulletin.number, member.trust.digest)
+            self._wake(member)
 
     def repair_disk(self, number: int) -> None:
         """It can be written again, and is."""
@@ -151,23 +154,26 @@ class SimulatedFleet:
     def run(self, seconds: float, until: Callable[[], bool] = lambda: False) -> float:
         """Let time pass until a condition holds. Returns how long it took, infinity if it did not hold."""
         start, end = self.now, self.now + seconds
+        for member in self.members.values():
+            self._wake(member)
         while not until():
-            due = min(member.exchange.next_at for member in self.members.values())
-            self.now = max(self.now, min(due, self._coming[0][0] if self._coming else inf))
-            if self.now > end:
+            if not self._coming or self._coming[0][0] > end:
                 self.now = end
                 return inf
-            while self._coming and self._coming[0][0] <= self.now:
-                heapq.heappop(self._coming)[2]()
-            for member in self.members.values():
-                if member.exchange.next_at <= self.now:
-                    self._send(member)
+            self.now, _, action = heapq.heappop(self._coming)
+            action()
         return self.now - start
 
     def _later(self, seconds: float, action: Callable[[], None]) -> None:
         heapq.heappush(self._coming, (self.now + seconds, next(self._numbers), action))
 
+    def _wake(self, member: SimulatedMember) -> None:
+        if member.exchange.next_at < member.wakes_at:
+            member.wakes_at = member.exchange.next_at
+            self._later(max(0.0, member.wakes_at - self.now), lambda: self._send(member))
+
     def _send(self, member: SimulatedMember) -> None:
+        member.wakes_at = inf
         for key, record in member.exchange.do_due(self.now):
             other = self.members[int.from_bytes(key[:2], "big")]
             order, data = next(self._numbers), record.encode()
@@ -179,6 +185,7 @@ class SimulatedFleet:
             if other.number in member.up and self._rng.random() >= self.loss:
                 delay = self._rng.choice(self._delays)
                 self._later(delay, lambda e=other.epoch, a=(other, member, data, order): self._deliver(e, *a))  # type: ignore[misc]
+        self._wake(member)
 
     def _deliver(
         self, epoch: object, member: SimulatedMember, sender: SimulatedMember, data: bytes, order: int
@@ -202,5 +209,6 @@ class SimulatedFleet:
         if reaction.event:
             member.events.append((sender.number, reaction.event))
         self._react(member, reaction)
+        self._wake(member)
         for other in member.up:
             assert not member.trust.bulletin.refuses(self.members[other].serial), "a link with a revoked serial"

@@ -244,6 +244,14 @@ def test_other_digest_of_the_same_number() -> None:
     assert daemon.hour() == []
 
 
+def test_other_digest_of_the_number_that_is_accepted() -> None:
+    """A peer had stated it before this end had a bulletin of that number."""
+    daemon = Daemon()
+    daemon.up(PEER, OTHER)
+    daemon.receive(have(bulletin(6, 3)))
+    assert daemon.receive(BulletinRecord(NEW), key=OTHER) == Reaction(persists=True, event="bulletin_conflict")
+
+
 def test_peer_whose_disk_was_restored() -> None:
     """What it had stated is remembered while it is down. A record that was overtaken does not count."""
     daemon = Daemon(NEW)

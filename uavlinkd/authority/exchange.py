@@ -6,6 +6,7 @@ sends that until the peer states that it has it. The static public key of a peer
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from math import inf
 from typing import NamedTuple
@@ -151,22 +152,19 @@ class BulletinExchange:
         self._note(peer)
         if before is not None and have.number < before:
             return Reaction(event=ROLLED_BACK)
-        own = self._trust.bulletin.number, self._trust.digest
-        is_other = have.number == own[0] and have.digest != own[1]
-        return Reaction(event=BulletinVerdict.CONFLICT.value if is_other and not is_repeated else "")
+        return Reaction(event="" if is_repeated else self._conflict([peer]))
 
     def _receive_bulletin(self, peer: _Peer, data: bytes, now: float) -> Reaction:
         may_verify = now >= peer.bulletin_verified_at + c.BULLETIN_LEAST_S
         verdict, ended = self._trust.receive_bulletin(data, may_verify=may_verify)
         if verdict is BulletinVerdict.UNVERIFIED:
             raise Drop(DropReason.RECORD_OVER_LIMIT)
-        if verdict is BulletinVerdict.KNOWN:
-            peer.owes_have |= self._persisted[0] == self._trust.bulletin.number  # else when it is written
-            self._note(peer)
-        else:
+        if verdict is not BulletinVerdict.KNOWN:
             peer.bulletin_verified_at = now
         if verdict is BulletinVerdict.INVALID:
             raise Drop(DropReason.BAD_CONTROL)
+        peer.owes_have |= self._persisted[0] == self._trust.bulletin.number  # else when it is written
+        self._note(peer)
         if data == self._trust.bulletin_bytes:
             peer.has = self._trust.bulletin.number
         if verdict is BulletinVerdict.NEWER:
@@ -182,7 +180,14 @@ class BulletinExchange:
         for key in ended:
             self.forget(key)
         self._plan_all(now)
-        return Reaction(tuple(ended), persists=True)
+        return Reaction(tuple(ended), persists=True, event=self._conflict(self._peers.values()))
+
+    def _conflict(self, peers: Iterable[_Peer]) -> str:
+        """The event if one of these stated the own number with another digest."""
+        own = self._trust.bulletin.number, self._trust.digest
+        stated = [peer.have for peer in peers if peer.have is not None]
+        is_other = any(have.number == own[0] and have.digest != own[1] for have in stated)
+        return BulletinVerdict.CONFLICT.value if is_other else ""
 
     def _receive_certificate(self, key: bytes, peer: _Peer, record: CertificateRecord, now: float) -> Reaction:
         trust, is_own = self._trust, record.key == self._trust.own_key
