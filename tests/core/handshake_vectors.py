@@ -16,7 +16,8 @@ from typing import NamedTuple
 
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
 
-from tests.core.independent import FFDHE, GROUPS, X25519, Draw, Initiator, Parameters, Responder, echo_request
+from tests.core.independent import FFDHE, GROUPS, X25519, Draw, Initiator, Parameters, Responder
+from tests.core.independent_records import echo_request
 
 PATH = Path(__file__).parents[1] / "vectors" / "handshake.json"
 ABOUT = (

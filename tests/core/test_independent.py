@@ -10,8 +10,9 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
 
 from tests.core import independent
-from tests.core.independent import FFDHE2048, MLKEM768, MLKEM1024, X25519, Initiator, Parameters, Probe, read_probe
+from tests.core.independent import FFDHE2048, MLKEM768, MLKEM1024, X25519, Initiator, Parameters
 from tests.core.independent import Session as IndependentSession
+from tests.core.independent_records import Probe, echo_reply, echo_request, read_probe
 from uavlinkd.core import constants, kem
 from uavlinkd.core.crypto import Secret
 from uavlinkd.core.drops import DropReason
@@ -198,7 +199,7 @@ def test_frames_after_a_silence_come_out_with_the_peers_word() -> None:
     (question,) = pair.node.receive(old, HERE, 30.0)
     assert pair.node.receive(new, HERE, 30.1) == []
     assert isinstance(question, Transmit)
-    reply = independent.echo_reply(linked.open(question.datagram), fresh=linked.counter - 1)
+    reply = echo_reply(linked.open(question.datagram), fresh=linked.counter - 1)
     outputs = pair.node.receive(linked.seal(reply), HERE, 30.2)
     assert outputs == [Deliver(pair.peer, FRAME + b"\xfd\x01"), Dropped(DropReason.DELAYED, pair.peer, None)]
     assert pair.node.receive(linked.seal(FRAME), HERE, 30.3) == [Deliver(pair.peer, FRAME)]
@@ -214,10 +215,10 @@ def test_fresh_is_of_the_session_that_was_asked_on() -> None:
         assert before.open(envelope.datagram) == FRAME
     after = pair.link(now=3.9, parameters=Parameters(generation=1))
     asked = 4.0  # frames 0, 1 and 2 were sent at 1, 2 and 3 s
-    (reply,) = pair.node.receive(before.seal(independent.echo_request(0xCAFE0001)), HERE, asked)
+    (reply,) = pair.node.receive(before.seal(echo_request(0xCAFE0001)), HERE, asked)
     assert isinstance(reply, Transmit)
     # The Node's question has counter 0 on each session, and the first frame counter 1.
-    assert after.open(reply.datagram) == independent.echo_reply(independent.echo_request(0xCAFE0001), 2, 2, 2)
+    assert after.open(reply.datagram) == echo_reply(echo_request(0xCAFE0001), 2, 2, 2)
 
 
 def test_another_address_is_asked_and_carries_traffic_after_its_answer() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.core.harness import AT_A, ELSEWHERE, Pair, Side, datagrams, of, only, quiet, reasons, state_of, unsealed
-from tests.core.independent import refusal_report
+from tests.core.independent_records import refusal_report
 from uavlinkd.core import constants as c
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.outputs import Transmit
