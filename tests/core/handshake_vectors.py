@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
 
-from tests.core.independent import FFDHE, GROUPS, X25519, Draw, Initiator, Parameters, Responder
+from tests.core.independent import FFDHE, FFDHE2048, GROUPS, MLKEM768, X25519, Draw, Initiator, Parameters, Responder
 from tests.core.independent_records import echo_request
 
 PATH = Path(__file__).parents[1] / "vectors" / "handshake.json"
@@ -25,6 +25,7 @@ ABOUT = (
     " `python -m tests.core.handshake_vectors`. Byte strings in hex. Parameters: generation, confidential, tag bytes,"
     " MAC key bits, largest envelope, features. `entropy` lists what each side draws, in order: its index, its"
     " ephemeral X25519 key, and with a group the initiator's exponent or ML-KEM seed, the responder's exponent."
+    " A certificate is 100 bytes that no authority signed."
 )
 FRAME = bytes.fromhex("fd09000001010100000000000000020303040303") + b"\x9a\x2e"
 
@@ -38,17 +39,19 @@ class Case(NamedTuple):
     has_psk: bool
     initiator: Parameters
     responder: Parameters
+    certificate: bytes = b""
 
     @property
     def name(self) -> str:
         """What distinguishes it."""
         group = GROUPS.get(self.suite, "X25519").lower()
         mode = "confidential" if self.initiator.confidential or self.responder.confidential else "authenticated"
-        return f"{group}, {'PSK' if self.has_psk else 'no PSK'}, {mode}"
+        form = ", certificate" if self.certificate else ""
+        return f"{group}, {'PSK' if self.has_psk else 'no PSK'}, {mode}{form}"
 
 
 def cases() -> Iterator[Case]:
-    """Each suite in both modes, with and without a PSK; the smallest suite in all four combinations."""
+    """Each suite in both modes, with and without a PSK; the smallest one in all four combinations; certificates."""
     plain = Parameters(), Parameters()
     unlike = Parameters(7, False, 8, 256, 1452, 1), Parameters(3, False, 32, 1024, 1232, 1)
     confidential = Parameters(confidential=True), Parameters(2, False, 32, 512, 320)
@@ -57,6 +60,9 @@ def cases() -> Iterator[Case]:
     for suite in (X25519, *GROUPS):
         yield Case(suite, False, *plain)
         yield Case(suite, True, *confidential)
+    certified = Parameters(features=0b1010), Parameters(features=0b1010)
+    for suite in (X25519, FFDHE2048, MLKEM768):
+        yield Case(suite, False, *certified, hashlib.shake_256(b"certificate").digest(100))
 
 
 def is_reproducible(case: Case) -> bool:
@@ -95,8 +101,9 @@ def make(case: Case) -> Vector:
         parameters=case.responder,
         draw=draw("responder"),
     )
-    initiation = initiator.initiation()
+    initiation = initiator.initiation(certificate=case.certificate)
     response, answered = responder.answer(initiation)
+    assert responder.certificate == case.certificate
     session = initiator.read_response(response)
     confirmation, frame = session.seal(echo_request(1)), answered.seal(FRAME)
     assert answered.open(confirmation) == echo_request(1)
@@ -110,6 +117,7 @@ def make(case: Case) -> Vector:
         "responder_static": keys[1].hex(),
         "initiator_parameters": list(case.initiator),
         "responder_parameters": list(case.responder),
+        "certificate": case.certificate.hex(),
         "entropy": drawn,
         "initiation": initiation.hex(),
         "group_ciphertext": ciphertext.hex() if not is_reproducible(case) else None,

@@ -1,8 +1,8 @@
 """A second implementation of the handshake and the envelopes, written from ``uavlinkd/core/README.md`` alone.
 
 It shares no code with the core: what the two agree on, the document says. It is as short as possible: it has no
-timers, no replay window and no set of paths, and the test sets the age of its envelopes. `handshake_vectors` makes
-whole handshakes with both of its roles.
+timers, no replay window and no set of paths, and the test sets the age of its envelopes. `independent_records` and
+`independent_fleet` have the records and certificates. `handshake_vectors` makes whole handshakes with both roles.
 """
 
 from __future__ import annotations
@@ -164,6 +164,9 @@ class Session:
         ours = _expand(first, VERSION + purpose + b" initiator to responder" + noise.h, length)
         theirs = _expand(second, VERSION + purpose + b" responder to initiator" + noise.h, length)
         self.send_key, self.receive_key = (ours, theirs) if is_initiator else (theirs, ours)
+        ours = _expand(first, VERSION + b" records initiator to responder" + noise.h, 32)
+        theirs = _expand(second, VERSION + b" records responder to initiator" + noise.h, 32)
+        self.record_keys = (ours, theirs) if is_initiator else (theirs, ours)
 
     def seal(self, payload: bytes, *, long_form: bool = False) -> bytes:
         """The next envelope. ``long_form`` writes the counter long where the protocol wants it short."""
@@ -176,6 +179,17 @@ class Session:
         if self.parameters.confidential:
             return header + ChaCha20Poly1305(self.send_key).encrypt(nonce, payload, header)
         return header + payload + _hmac(self.send_key, header + payload)[: self.parameters.tag_bytes]
+
+    def seal_record(self, record: bytes) -> bytes:
+        """Section 21: the next envelope, with a record."""
+        sealed = ChaCha20Poly1305(self.record_keys[0]).encrypt(_aead_nonce(self.counter), record, None)
+        return self.seal(b"\x07" + sealed)
+
+    def open_record(self, datagram: bytes) -> bytes:
+        """The record in an envelope to us with a small counter."""
+        payload, counter = self.open(datagram), int.from_bytes(datagram[3:5], "big")
+        assert (datagram[0], payload[0]) == (0x40, 7)
+        return ChaCha20Poly1305(self.record_keys[1]).decrypt(_aead_nonce(counter), payload[1:], None)
 
     def open(self, datagram: bytes) -> bytes:
         """The payload of an envelope to us."""
@@ -217,8 +231,8 @@ class Initiator:
         self.mlkem = mlkem.from_seed_bytes(seed)
         self.mac1 = b""
 
-    def initiation(self, cookie: bytes | None = None) -> bytes:
-        """Message 1. Once for each Initiator."""
+    def initiation(self, cookie: bytes | None = None, certificate: bytes = b"") -> bytes:
+        """Message 1, in the long form with a certificate. Once for each Initiator."""
         header = struct.pack(">BBH", 1, self.suite, self.index)
         noise, public = self.noise, self.ephemeral.public_key().public_bytes_raw()
         noise.mix_hash(public)
@@ -229,7 +243,7 @@ class Initiator:
             message += noise.seal(self._share())
         message += noise.seal(self.static.public_key().public_bytes_raw())
         noise.mix_key(_x25519(self.static, self.responder_public))
-        message += noise.seal(header[1:] + self.parameters.encode())
+        message += noise.seal(header[1:] + self.parameters.encode() + certificate)
         self.mac1 = _hmac(_sha256(VERSION + b" mac1" + self.responder_public), message)[:16]
         message += self.mac1
         return message + (bytes(16) if cookie is None else _hmac(cookie, message)[:16])
@@ -290,6 +304,8 @@ class Responder:
         self.parameters = Parameters() if parameters is None else parameters
         self.encapsulated = (b"", b"")
         """The group's ciphertext and secret."""
+        self.certificate = b""
+        """What the initiator showed."""
 
     def answer(self, initiation: bytes) -> tuple[bytes, Session]:
         """Message 2, and the session that it makes."""
@@ -311,6 +327,8 @@ class Responder:
         noise.mix_key(_x25519(self.static, self.initiator_public))
         payload = noise.open(body[48:])
         assert payload[:3] == initiation[1:4]
+        self.certificate = payload[15:]
+        assert len(self.certificate) in (0, 100)
 
         index = int.from_bytes(self.draw(2), "big") or 1
         ephemeral = X25519PrivateKey.from_private_bytes(self.draw(32))
@@ -329,7 +347,7 @@ class Responder:
         noise.mix_key_and_hash(self.psk)
         message += noise.seal(header[1:] + self.parameters.encode())
         message += _hmac(_sha256(VERSION + b" mac1" + self.initiator_public), message)[:16] + bytes(16)
-        agreed = _agree(self.parameters, payload[3:])
+        agreed = _agree(self.parameters, payload[3:15])
         return message, Session(noise, agreed, index, remote_index, is_initiator=False)
 
     def _encapsulate(self, suite: int, share: bytes) -> tuple[bytes, bytes]:

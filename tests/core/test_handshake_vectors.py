@@ -79,6 +79,7 @@ def test_core_as_initiator(vector: dict[str, Any]) -> None:
         int.from_bytes(index, "big"),
         vector["initiator_parameters"][0],
         fixed(*drawn),
+        raw(vector, "certificate"),
     )
     assert MacKeys(settings.public_key).add_macs(initiated.message, None) == raw(vector, "initiation")
     check_keys(handshake.receive_response(initiated, wire.parse_response(raw(vector, "response"))), vector)
@@ -96,6 +97,7 @@ def test_core_as_responder(vector: dict[str, Any], monkeypatch: pytest.MonkeyPat
     received = handshake.receive_initiation(KeyPair(raw(vector, "responder_static")), initiation)
     assert received.public_key == settings.public_key
     assert received.parameters == Parameters(*vector["initiator_parameters"])
+    assert received.certificate == raw(vector, "certificate")
     message, keys = handshake.respond(
         received, settings, int.from_bytes(index, "big"), vector["responder_parameters"][0], fixed(*drawn)
     )
