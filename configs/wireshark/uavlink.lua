@@ -29,7 +29,7 @@ local TYPES = {
     [SHORT_ENVELOPE] = "Envelope, 2-byte counter",
     [LONG_ENVELOPE] = "Envelope, 4-byte counter",
 }
-local AEAD_TAG_BYTES, COOKIE_BYTES = 16, 52
+local AEAD_TAG_BYTES, COOKIE_BYTES, CERTIFICATE_BYTES = 16, 52, 100
 local TAG_LENGTHS = { 16, 8, 12, 32 } -- 16 is the default, so it comes first
 local IS_TAG_LENGTH = { [8] = true, [12] = true, [16] = true, [32] = true }
 
@@ -75,7 +75,7 @@ local f = {
     ephemeral = ProtoField.bytes("uavlink.ephemeral", "Ephemeral X25519 public key"),
     group = ProtoField.bytes("uavlink.sealed_group", "Encrypted share of the suite's group"),
     static = ProtoField.bytes("uavlink.sealed_static", "Encrypted static public key"),
-    parameters = ProtoField.bytes("uavlink.sealed_payload", "Encrypted parameters"),
+    parameters = ProtoField.bytes("uavlink.sealed_payload", "Encrypted parameters, and certificate in the long form"),
     mac1 = ProtoField.bytes("uavlink.mac1", "mac1"),
     mac2 = ProtoField.bytes("uavlink.mac2", "mac2"),
     nonce = ProtoField.bytes("uavlink.cookie_nonce", "Nonce"),
@@ -435,14 +435,15 @@ local function add_in_order(tvb, tree, offset, sizes)
     end
 end
 
--- The length of a handshake message, or nil if it is not one.
+-- The length that a handshake message must have, or nil if it is not one.
 local function handshake_length(tvb)
     if tvb:len() < 6 then
         return nil
     end
     local kind, suite = tvb(0, 1):uint(), SUITES[tvb(1, 1):uint()]
     if kind == INITIATION and suite and tvb(2, 2):uint() > 0 then
-        return 147 + (suite[2] > 0 and suite[2] + AEAD_TAG_BYTES or 0)
+        local short = 147 + (suite[2] > 0 and suite[2] + AEAD_TAG_BYTES or 0)
+        return tvb:len() == short + CERTIFICATE_BYTES and tvb:len() or short
     elseif kind == RESPONSE and suite and tvb(2, 2):uint() > 0 and tvb(4, 2):uint() > 0 then
         return 103 + (suite[3] > 0 and suite[3] + AEAD_TAG_BYTES or 0)
     elseif kind == COOKIE and tvb(1, 1):uint() == 0 and tvb(2, 2):uint() > 0 then
@@ -468,8 +469,10 @@ local function dissect_handshake(tvb, tree)
     tree:add(f.sender, tvb(2, 2))
     if kind == INITIATION then
         local share = suite[2] > 0 and suite[2] + AEAD_TAG_BYTES or 0
-        add_in_order(tvb, tree, 4, { { f.ephemeral, 32 }, { f.group, share }, { f.static, 48 }, { f.parameters, 31 }, { f.mac1, 16 }, { f.mac2, 16 } })
-        return string.format("%s, %s, sender 0x%04x", TYPES[kind], suite[1], tvb(2, 2):uint())
+        local payload = tvb:len() - 116 - share
+        add_in_order(tvb, tree, 4, { { f.ephemeral, 32 }, { f.group, share }, { f.static, 48 }, { f.parameters, payload }, { f.mac1, 16 }, { f.mac2, 16 } })
+        local form = payload > 31 and ", with a certificate" or ""
+        return string.format("%s, %s, sender 0x%04x%s", TYPES[kind], suite[1], tvb(2, 2):uint(), form)
     end
     local ciphertext = suite[3] > 0 and suite[3] + AEAD_TAG_BYTES or 0
     tree:add(f.receiver, tvb(4, 2))

@@ -29,7 +29,7 @@ from uavlinkd.core.crypto import AuthorityKey, KeyPair, Secret
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import PeerAdmitted, PeerUp, RecordReceived, Transmit
 from uavlinkd.core.path import Path
-from uavlinkd.core.relay_records import BulletinRecord, CertificateRecord, Have, Who, parse_record
+from uavlinkd.core.relay_records import BulletinRecord, CertificateRecord, Have, Record, Who, parse_record
 from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.core.suites import SUITES
 
@@ -76,7 +76,7 @@ def test_bulletins(vector: dict[str, Any]) -> None:
     assert is_published(data, AUTHORITY)
     published = bulletin.encode() + fleet_vectors.AUTHORITY.sign(bulletin.to_be_signed())
     assert published == data
-    assert independent_fleet.read_bulletin(published, AUTHORITY.public) == bulletin
+    assert independent_fleet.read_bulletin(published, AUTHORITY.public) == tuple(bulletin)
 
 
 def test_records() -> None:
@@ -84,7 +84,7 @@ def test_records() -> None:
     key, certificate, _ = certificate_of(VECTORS["certificates"][-1])
     bulletin = bytes.fromhex(VECTORS["bulletins"][-1]["bytes"])
     roles = 1 << MemberRole.VEHICLE | 1 << MemberRole.OPERATOR
-    expected = {
+    expected: dict[str, Record] = {
         "have": Have(VECTORS["bulletins"][-1]["fields"][0], digest_of(bulletin), 7, 1),
         "bulletin": BulletinRecord(bulletin),
         "certificate": CertificateRecord(key, certificate),

@@ -18,10 +18,12 @@ from pymavlink.generator import mavgen
 
 from tests.core.harness import AT_A, AT_B, FRAME, PLAIN, Pair, datagrams, exhaust, only
 from tests.needs import need
-from uavlinkd.core import wire
+from uavlinkd.core import handshake, wire
+from uavlinkd.core.cookie import MacKeys
+from uavlinkd.core.crypto import KeyPair
 from uavlinkd.core.probe import Probe
 from uavlinkd.core.refusals import RefusalReport, Refused
-from uavlinkd.core.settings import Link
+from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.core.suites import SUITES, Suite
 from uavlinkd.core.wire import TAG_LENGTHS
 
@@ -195,6 +197,23 @@ def test_handshakes_on_any_port(folder: Path, suite: Suite) -> None:
     assert [packet.get("type") for packet in packets[:3]] == ["0x01", "0x02", "0x40"]
     assert packets[0]["suite"] == packets[1]["suite"] == str(suite.number)
     assert packets[-1]["type"] == "0x41"
+
+
+@pytest.mark.parametrize("suite", [SUITES[0], SUITES[16]], ids=lambda suite: suite.name)
+def test_initiation_with_a_certificate(folder: Path, suite: Suite) -> None:
+    """Its length shows it, on any port, and the encrypted part is as long as it is."""
+    link = replace(PLAIN, suites=(suite,))
+    alpha, bravo = KeyPair(bytes([1]) * 32), KeyPair(bytes([2]) * 32)
+    peer = PeerSettings("bravo", bravo.public, None, link)
+    long = handshake.initiate(alpha, peer, 9, 0, random.Random(1).randbytes, bytes(wire.CERTIFICATE_BYTES))
+    short = handshake.initiate(alpha, peer, 9, 0, random.Random(1).randbytes)
+    packets = [Sent(True, MacKeys(bravo.public).add_macs(each.message, None)) for each in (long, short)]
+    capture = write(folder / "capture.pcap", packets, 40000)
+    lines = tshark(folder, capture, "-T", "fields", "-e", "_ws.col.Info", "-e", "uavlink.sealed_payload").splitlines()
+    name = f"Handshake Initiation, {suite.name}, sender 0x0009"
+    infos, payloads = zip(*(line.split("\t") for line in lines), strict=True)
+    assert infos == (f"{name}, with a certificate", name)
+    assert [len(payload) // 2 for payload in payloads] == [131, 31]
 
 
 def test_cookie_reply(folder: Path) -> None:
