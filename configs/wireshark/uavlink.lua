@@ -40,9 +40,11 @@ local RECORDS = {
     [3] = { "Probe" }, -- 22 bytes with a question, else 20; frames or padding may follow
     [5] = { "Close", 1 },
     [6] = { "Refusal Report" }, -- 1 byte, and 10 for each of 1 to 16 entries
+    [7] = { "Encrypted Record" }, -- 1 byte, a record of at least 1 byte, and its AEAD tag
     [8] = { "Problem Report" }, -- 1 byte, and 1 for each of 0 to 8 codes
 }
 local REFUSAL_REPORT, ENTRY_BYTES, MOST_ENTRIES = 6, 10, 16
+local ENCRYPTED_RECORD = 7
 local PROBLEM_REPORT, MOST_CODES = 8, 8
 local PROBE, ANSWER_BYTES, QUESTION_BYTES = 3, 20, 22
 local ALONE, FRAMES_FOLLOW, PADDING_FOLLOWS = 0, 1, 2
@@ -169,6 +171,9 @@ local function is_record(kind, size)
     if kind == REFUSAL_REPORT then
         return (size - 1) % ENTRY_BYTES == 0 and size > 1 and size <= 1 + MOST_ENTRIES * ENTRY_BYTES
     end
+    if kind == ENCRYPTED_RECORD then
+        return size > 1 + AEAD_TAG_BYTES
+    end
     if kind == PROBLEM_REPORT then
         return size >= 1 and size <= 1 + MOST_CODES
     end
@@ -237,8 +242,13 @@ end
 
 -- The tag length of this envelope, or nil if none fits, as in confidential mode.
 local function infer_tag(tvb, pinfo, offset, index)
-    local here = possible_tags(tvb, offset)
     local key = tostring(pinfo.dst) .. " " .. pinfo.dst_port .. " " .. index
+    local here
+    if tvb:len() > offset and tvb(offset, 1):uint() == ENCRYPTED_RECORD then
+        here = sessions[key] or {} -- nothing inside shows its end, and an encrypted payload may begin with any byte
+    else
+        here = possible_tags(tvb, offset)
+    end
     local common, is_empty = {}, true
     for length in pairs(sessions[key] or here) do
         if here[length] then
@@ -247,7 +257,7 @@ local function infer_tag(tvb, pinfo, offset, index)
     end
     if is_empty then
         common = here
-    elseif not pinfo.visited then
+    elseif not pinfo.visited and not IS_TAG_LENGTH[tvb:len() - offset] then -- a keepalive is the same in both modes
         sessions[key] = common
     end
     for _, length in ipairs(TAG_LENGTHS) do
@@ -307,6 +317,8 @@ local function add_record(tvb, tree, offset, kind, stop)
         if kind == 2 then
             tree:add(f.fresh, tvb(offset + 13, 4))
         end
+    elseif kind == ENCRYPTED_RECORD then
+        tree:add(f.payload, tvb(offset + 1, stop - offset - 1)):append_text(" (encrypted)")
     elseif kind == REFUSAL_REPORT then
         for at = offset + 1, stop - ENTRY_BYTES, ENTRY_BYTES do
             tree:add(f.refused_msgid, tvb(at, 3))

@@ -199,6 +199,19 @@ def test_handshakes_on_any_port(folder: Path, suite: Suite) -> None:
     assert packets[-1]["type"] == "0x41"
 
 
+@pytest.mark.parametrize("link", [PLAIN, with_tag(8), CONFIDENTIAL], ids=["tag 16", "tag 8", "confidential"])
+def test_encrypted_record(folder: Path, link: Link) -> None:
+    """It is named where other envelopes show the tag length, and not in confidential mode."""
+    packets = conversation(link)
+    header = packets[2].datagram[:3] + bytes([0, 40])
+    packets.append(Sent(True, header + b"\x07" + bytes(17 + 16 + link.tag_bytes)))
+    shown = rows(folder, packets)[-1]
+    if link.confidential:
+        assert ("record" not in shown, shown["mode"]) == (True, "confidential (inferred)")
+    else:
+        assert (shown["record"], shown["tag_bytes"]) == ("7", str(link.tag_bytes))
+
+
 @pytest.mark.parametrize("suite", [SUITES[0], SUITES[16]], ids=lambda suite: suite.name)
 def test_initiation_with_a_certificate(folder: Path, suite: Suite) -> None:
     """Its length shows it, on any port, and the encrypted part is as long as it is."""
