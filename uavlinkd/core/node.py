@@ -137,6 +137,10 @@ class Node:
         self._schedule.remove(peer)
         return out
 
+    def find(self, public_key: bytes) -> Peer | None:
+        """The peer with this static key."""
+        return self._handshakes.peers.get(public_key)
+
     def set_paths(self, peer: Peer, paths: Iterable[Path], now: float) -> None:
         """Where to initiate to this peer, the likeliest first. A path that works stays in use."""
         self._forget_addresses(peer)

@@ -17,7 +17,7 @@ from uavlinkd.core.constants import NEVER
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.outputs import Deliver, Output, Transmit
 from uavlinkd.core.path import Path, SocketAddress
-from uavlinkd.core.relay_records import Bind, FilterTest
+from uavlinkd.core.relay_records import Bind, FilterTest, FleetRecord
 from uavlinkd.core.timers import Schedule
 from uavlinkd.core.wire import ENVELOPE_STARTS
 from uavlinkd.endpoints.reader import Datagrams
@@ -341,8 +341,11 @@ class FrameCarrier:
         self._parts.drops.add("datagrams_dropped", reason, name, 1, monotonic(), fact)
 
     def _on_record(self, received: o.RecordReceived) -> None:
-        relay = self._parts.relay
-        if not isinstance(received.record, Bind | FilterTest):
+        relay, fleet = self._parts.relay, self._parts.fleet
+        if isinstance(received.record, FleetRecord):
+            reason = DropReason.UNEXPECTED_RECORD if fleet is None else fleet.on_record(received, monotonic())
+            self.arm()
+        elif not isinstance(received.record, Bind | FilterTest):
             reason = self._parts.relays.on_record(received, monotonic())
             self.arm()
         elif relay is None:
@@ -354,6 +357,10 @@ class FrameCarrier:
 
     def _on_event(self, event: o.Event) -> None:
         now, parts = monotonic(), self._parts
+        if parts.fleet is not None:
+            parts.fleet.on_event(event, now)
+        if isinstance(event, o.PeerAdmitted | o.PeerExpired):  # no other part knows it yet
+            return
         if self._handshakes and isinstance(event, o.SessionEstablished):  # its peer waits for no other answer
             for key in self._node.initiations_from(event.path):
                 if (waiting := self._handshakes.pop(key, None)) is not None:
@@ -383,7 +390,8 @@ class FrameCarrier:
 
     def arm(self) -> None:
         """Set the one timer to the next deadline. It is moved only to an earlier time: firing too early is cheap."""
-        deadline = min(self._node.next_deadline(), self._waiting.next_at, self._parts.relays.next_at)
+        fleet_at = NEVER if self._parts.fleet is None else self._parts.fleet.next_at
+        deadline = min(self._node.next_deadline(), self._waiting.next_at, self._parts.relays.next_at, fleet_at)
         if deadline < self._timer_at:
             if self._timer is not None:
                 self._timer.cancel()
@@ -399,6 +407,8 @@ class FrameCarrier:
                 link.send_waiting(now)
             if now >= self._parts.relays.next_at:
                 self.perform(self._parts.relays.handle_timeout(now))
+            if self._parts.fleet is not None and now >= self._parts.fleet.next_at:
+                self._parts.fleet.do_due(now)
         finally:
             self._timer_at = NEVER
             self.arm()

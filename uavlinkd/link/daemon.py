@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from base64 import b64encode
 import os
 from contextlib import suppress
 from typing import TYPE_CHECKING
@@ -179,6 +180,10 @@ class Daemon:
                 self.carrier.arm()
                 await tests.ended.wait()
                 return netcheck(parts, monotonic())
+            case ("bulletin", "", "") if parts.fleet is not None:
+                return {"bulletin": b64encode(parts.fleet.trust.bulletin_bytes).decode()}
+            case ("publish", " ", signed) if parts.fleet is not None:
+                return parts.fleet.publish(signed, monotonic())
             case ("ping", " ", name):
                 return ping(parts, self.carrier, name, monotonic())
         return None

@@ -10,11 +10,13 @@ from structlog.typing import FilteringBoundLogger
 from uavlinkd.config import Config
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import LinkedPeer, Output
+from uavlinkd.core.settings import PeerSettings
 from uavlinkd.endpoints.ports import LocalPort
 from uavlinkd.link.conditions import LineLimits
 from uavlinkd.link.drop_summary import DropSummary
 from uavlinkd.link.event_log import EventLog
 from uavlinkd.link.evidence import Evidence, History
+from uavlinkd.link.fleet_members import FleetMembers
 from uavlinkd.link.local_endpoints import LocalEndpoints
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.peer_sockets import PeerSockets
@@ -38,7 +40,10 @@ class DaemonParts:
         self.config = config
         """The one in force."""
         self.log = log
-        self.node = node = Node(config.private_key, os.urandom, now, screen=screen)
+        admit = None if config.fleet is None else self._admit
+        self.node = node = Node(config.private_key, os.urandom, now, screen=screen, admit=admit)
+        self.fleet: FleetMembers | None = None
+        """Who is a member by certificate; None without a fleet."""
         self.links: dict[str, PeerLink] = {}
         """By the peer's name."""
         self.link_of: dict[LinkedPeer, PeerLink] = {}
@@ -70,6 +75,10 @@ class DaemonParts:
             )
             self.relay = RelayService(node, config.relay_server.limits, shell)
             sockets.pause_s = 0.0
+
+    def _admit(self, key: bytes, certificate: bytes, now: float) -> PeerSettings:
+        assert self.fleet is not None, "it is there before the sockets are read"
+        return self.fleet.admit(key, certificate, now)
 
     def _on_pause(self, pause_s: float) -> None:
         self.history.paused = monotonic(), pause_s

@@ -126,9 +126,9 @@ class PeerLink:
         """When something new came from it last, or the daemon began to expect it."""
         return silent_since(self.peer, self.expected_since)
 
-    def leave(self, now: float) -> None:
-        """Cut the peer off at once."""
-        self._perform(self._node.remove_peer(self.peer, now))
+    def leave(self, now: float, *, closes: bool = True) -> None:
+        """Cut the peer off at once. ``closes``: it gets a close."""
+        self._perform(self._node.remove_peer(self.peer, now, closes=closes))
         self.output.clear(now)
         self._carriage.waiting.remove(self)
 

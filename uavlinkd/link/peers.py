@@ -6,6 +6,9 @@ from collections.abc import Sequence
 
 from uavlinkd.config import Config, PeerConfig, RelayConfig
 from uavlinkd.config.changes import ConfigChanges
+from uavlinkd.core.peer import Peer
+from uavlinkd.core.settings import PeerSettings
+from uavlinkd.link.fleet_members import FleetMembers
 from uavlinkd.link.parts import DaemonParts
 from uavlinkd.link.peer_link import Carriage, PeerLink
 from uavlinkd.system.clock import monotonic
@@ -21,6 +24,9 @@ class Peers:
     def __init__(self, parts: DaemonParts, carriage: Carriage) -> None:
         self._parts = parts
         self._carriage = carriage
+        if (fleet := parts.config.fleet) is not None:
+            known = parts.links, parts.relays, parts.relay
+            parts.fleet = FleetMembers(parts.config, fleet, parts.node, *known, self, carriage.perform, parts.log)
 
     def start(self) -> None:
         """Add all that the configuration has."""
@@ -30,10 +36,27 @@ class Peers:
         self._add_relays(config.relays)
         self._follow_members()
 
+    # Members of the fleet: see :class:`.fleet_members.Membership`.
+
+    def add_member(self, config: PeerConfig, peer: Peer | None) -> None:
+        """Carry frames to a member by certificate. ``peer``: it is in the core already."""
+        self._add_peer(config, peer)
+        self._follow_members()
+
+    def remove_member(self, name: str) -> None:
+        """End the link with a member at once, without a close."""
+        self._remove_peer(name, closes=False)
+
+    def change_member(self, config: PeerConfig) -> None:
+        """Apply another policy to a member."""
+        self._change_peer(config)
+
     def follow(self, config: Config, changes: ConfigChanges) -> None:
         """Apply the changes of a new configuration."""
         parts, perform = self._parts, self._carriage.perform
         parts.config = config
+        if parts.fleet is not None and config.fleet is not None:
+            parts.fleet.follow(config, config.fleet, monotonic())
         for name in changes.removed_relays:
             perform(parts.relays.remove(name, monotonic()))
         for name in changes.removed_peers:
@@ -65,26 +88,38 @@ class Peers:
     def _add_relays(self, configs: Sequence[RelayConfig]) -> None:
         """Call it after the peers are there: a relay may be one of them."""
         for config in configs:
-            self._parts.relays.add(config, monotonic())
+            if self._is_accepted(config.settings):
+                self._parts.relays.add(config, monotonic())
         if configs:
             self._parts.relays.follow_links(monotonic())
 
-    def _add_peer(self, config: PeerConfig) -> None:
+    def _is_accepted(self, settings: PeerSettings) -> bool:
+        """Whether no bulletin revokes this peer or relay of the configuration."""
+        fleet = self._parts.fleet
+        return not settings.is_certified or fleet is None or settings.public_key in fleet.trust.held
+
+    def _add_peer(self, config: PeerConfig, peer: Peer | None = None) -> None:
         now, parts = monotonic(), self._parts
-        link = PeerLink(config, parts.node.add_peer(config.settings, now), self._carriage, now, parts.recorder)
+        if not self._is_accepted(config.settings):
+            return
+        if peer is None:
+            peer = parts.node.add_peer(config.settings, now)
+        link = PeerLink(config, peer, self._carriage, now, parts.recorder)
         parts.links[config.name] = link
         self._map_peers()
         parts.switch.add(link, link.policy)
         self._note_delays()
         parts.peer_sockets.follow(link)
 
-    def _remove_peer(self, name: str) -> None:
+    def _remove_peer(self, name: str, *, closes: bool = True) -> None:
         """End the link at once: nothing of this peer is accepted any more."""
         parts = self._parts
         parts.peer_sockets.stop_following(name)
         link = parts.links[name]
         parts.switch.remove(link)
-        link.leave(monotonic())
+        link.leave(monotonic(), closes=closes)
+        if parts.fleet is not None:
+            parts.fleet.exchange.forget(link.key)
         del parts.links[name]
         self._map_peers()
         self._note_delays()

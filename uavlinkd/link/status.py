@@ -56,6 +56,7 @@ def daemon_status(daemon: DaemonParts, now: float) -> dict[str, object]:
         "findings": [finding.as_json() for finding in findings],
         "peers": {name: peer_status(link, now, daemon.peer_sockets.way_of) for name, link in daemon.links.items()},
         "relays": {name: used_relay_status(relay, daemon, now) for name, relay in daemon.relays.by_name.items()},
+        "fleet": None if daemon.fleet is None else daemon.fleet.status(now),
         "networks": daemon.peer_sockets.network_status(now),
         "endpoints": {
             endpoint.name: endpoint_status(endpoint, daemon.local.policies[endpoint.name], now)

@@ -1,0 +1,55 @@
+"""Daemons that are members of one fleet with an authority."""
+
+from __future__ import annotations
+
+from base64 import b64decode, b64encode
+
+from tests.authority.signing import AUTHORITY, FLEET, bulletin, signed
+from tests.daemon.process import DaemonProcess
+from uavlinkd.core.certificates import Certificate, MemberRole
+
+
+def text(data: bytes) -> str:
+    return b64encode(data).decode()
+
+
+class CertifiedFleet:
+    """Gives daemons certificates and contacts. ``number``: of the newest bulletin."""
+
+    def __init__(self) -> None:
+        self.serial = 0
+        self.number = 1
+        self.revoked: list[int] = []
+        self.certificates: dict[str, tuple[bytes, bytes, Certificate]] = {}
+
+    @property
+    def bulletin(self) -> bytes:
+        return bulletin(self.number, *self.revoked)
+
+    def join(self, daemon: DaemonProcess, role: MemberRole, system_id: int = 0, *contacts: DaemonProcess) -> None:
+        """Sign for a daemon, and write what it needs into its configuration."""
+        self.serial += 1
+        key = b64decode(daemon.public_key)
+        certificate = Certificate(FLEET, self.serial, role, (system_id, system_id), daemon.name)
+        self.certificates[daemon.name] = key, signed(certificate, key), certificate
+        daemon.config["fleet"] = {
+            "authority": text(AUTHORITY.public),
+            "certificate": text(self.certificates[daemon.name][1]),
+            "bulletin": text(self.bulletin),
+        }
+        daemon.config["contact"] = [
+            {
+                "public_key": contact.public_key,
+                "certificate": text(self.certificates[contact.name][1]),
+                "addresses": [contact.address],
+            }
+            for contact in contacts
+        ]
+        if role is MemberRole.RELAY:
+            daemon.config["relay_server"] = {}
+
+    def revoke(self, *names: str) -> str:
+        """The request that publishes a bulletin which revokes these members too."""
+        self.number += 1
+        self.revoked = sorted({*self.revoked, *(self.certificates[name][2].serial for name in names)})
+        return f"publish {text(self.bulletin)}"

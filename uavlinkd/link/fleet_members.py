@@ -1,0 +1,417 @@
+"""The members of the fleet that this daemon knows by certificate. uavlinkd/authority/README.md.
+
+A member comes by its own initiation, or by a relay's introduction. It is removed when a bulletin revokes it, when the
+configuration changes, or when the daemon holds too many.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from base64 import b64decode
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+from structlog.typing import FilteringBoundLogger
+
+from uavlinkd.authority import state_file
+from uavlinkd.authority.constants import (
+    CERTIFICATES,
+    CERTIFICATES_PER_ANSWER,
+    CERTIFIED_PEERS,
+    CONTACTS_FIRST_S,
+    HAVE_INTERVAL_S,
+    WHO_INTERVAL_S,
+)
+from uavlinkd.authority.exchange import BulletinExchange, Reaction
+from uavlinkd.authority.trust import Pinned, Trust
+from uavlinkd.config import Config, PeerConfig
+from uavlinkd.config.members import member_peer, relay_member
+from uavlinkd.config.model import FleetConfig
+from uavlinkd.config.relay_rules import MOST_MEMBERS
+from uavlinkd.core import constants as c
+from uavlinkd.core import outputs as o
+from uavlinkd.core.certificates import Certificate, fingerprint_of
+from uavlinkd.core.drops import Drop, DropReason
+from uavlinkd.core.limits import TokenBucket
+from uavlinkd.core.node import Node
+from uavlinkd.core.outputs import Output
+from uavlinkd.core.peer import Peer
+from uavlinkd.core.relay_records import CertificateRecord, FleetRecord, Have, Who
+from uavlinkd.core.settings import PeerSettings
+from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.link.relays import Relays
+from uavlinkd.relay.service import RelayService
+from uavlinkd.system.clock import monotonic
+from uavlinkd.system.tasks import Threads
+
+WHO_SOON_S: Final = 0.5
+"""A question to a relay is repeated after this, and each time after twice as long: it, or an answer, may be lost."""
+EVENT_S: Final = 60.0
+"""An event of bulletins is logged this often at most, and shown for so long."""
+_THREAD = Threads(1, "fleet state")
+
+
+class Membership(Protocol):
+    """What the daemon does about its peers."""
+
+    def add_member(self, config: PeerConfig, peer: Peer | None) -> None:
+        """Carry frames to a member. ``peer``: it is in the core already."""
+
+    def remove_member(self, name: str) -> None:
+        """End the link at once, without a close."""
+
+    def change_member(self, config: PeerConfig) -> None:
+        """Apply another policy."""
+
+
+@dataclass(slots=True)
+class _Asking:
+    """What one relay is asked about other members."""
+
+    due_at: float
+    tries: int = 0
+    after: int = 0
+    """The highest serial of an answer, if it was full: ask on from there."""
+    received: int = 0
+    """Certificates since the last question."""
+
+
+class FleetMembers:
+    """Certificates, bulletins and introductions of one daemon. Times are monotonic seconds.
+
+    Look at :attr:`next_at` after each call.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        fleet: FleetConfig,
+        node: Node,
+        links: Mapping[str, PeerLink],
+        relays: Relays,
+        relay: RelayService | None,
+        membership: Membership,
+        perform: Callable[[list[Output]], None],
+        log: FilteringBoundLogger,
+    ) -> None:
+        self._fleet = fleet
+        self._node = node
+        self._links = links
+        self._relays = relays
+        self._relay = relay
+        self._membership = membership
+        self._perform = perform
+        self._log = log
+        self.trust = Trust(fleet.authority, config.public_key, fleet.own.data, fleet.bulletin)
+        state, self.problem = state_file.read(fleet.state_file)
+        if state is not None:
+            self.trust.receive_bulletin(state.bulletin)
+            self.trust.replace_own(state.certificate)
+        self.exchange = BulletinExchange(self.trust, os.urandom)
+        self.events: dict[str, float] = {}
+        """When something about bulletins was noticed last that a person has to know."""
+        self._askings: dict[bytes, _Asking] = {}  # by key of a relay
+        self._limits: dict[bytes, TokenBucket] = {}  # of certificates, by key of the sender
+        self._settled_at = monotonic() + CONTACTS_FIRST_S if fleet.contacts else -c.NEVER
+        self._writing: asyncio.Task[None] | None = None
+        self._written_at = c.NEVER
+        """When a state that could not be written is written again."""
+        self._reserve(config, fleet)
+        self._hold_contacts()
+        self._show_certificate()
+
+    @property
+    def next_at(self) -> float:
+        """When :meth:`do_due` has something to do."""
+        return min(self.exchange.next_at, self._written_at, *(one.due_at for one in self._askings.values()), c.NEVER)
+
+    def do_due(self, now: float) -> None:
+        """Send what is due. Call it at :attr:`next_at`."""
+        for key, record in self.exchange.do_due(now):
+            self._send(key, record, now)
+        for key, asking in self._askings.items():
+            if now >= asking.due_at:
+                roles = sum(1 << role for role in self._fleet.call)
+                self._send(key, Who(roles, asking.after), now)
+                asking.due_at = now + min(WHO_INTERVAL_S, WHO_SOON_S * 2.0 ** min(asking.tries, 6))
+                asking.tries += 1
+                asking.received = asking.after = 0
+        if now >= self._written_at:
+            self._persist()
+
+    # The configuration.
+
+    def follow(self, config: Config, fleet: FleetConfig, now: float) -> None:
+        """Apply a new configuration. Call it before its peers are added, which may have names and keys of members."""
+        for contact in self._fleet.contacts:
+            if contact not in fleet.contacts:
+                self.trust.held.pop(contact.key, None)  # its peer leaves with the configuration
+        self._fleet = fleet
+        self.trust.replace_own(fleet.own.data)
+        for key in self._reserve(config, fleet):
+            self._end(key, now)
+        self._react(self.exchange.publish(fleet.bulletin, now)[1], now)
+        for contact in fleet.contacts:
+            if (peer := self._node.find(contact.key)) is not None and self._links.get(contact.name) is not None:
+                continue
+            if peer is not None:
+                self._end(contact.key, now)
+        self._hold_contacts()
+        for key, held in list(self.trust.held.items()):
+            if self._is_contact(key):
+                continue
+            if not self._is_wanted(held.certificate):
+                del self.trust.held[key]
+                self._end(key, now)
+            elif (link := self._links.get(held.certificate.name)) is not None and link.key == key:
+                self._membership.change_member(self._config_of(key))
+        self._show_certificate()
+
+    def _reserve(self, config: Config, fleet: FleetConfig) -> list[bytes]:
+        pinned = [peer for peer in config.peers if not peer.settings.is_certified]
+        members = () if config.relay_server is None else config.relay_server.members
+        own = {*(peer.settings for peer in pinned), *(relay.settings for relay in config.relays)}
+        reserved = {one for one in own if not one.is_certified} | {member.peer for member in members}
+        return self.trust.reserve(
+            Pinned(
+                keys={one.public_key for one in reserved},
+                names={one.name for one in reserved},
+                system_ids={number: peer.name for peer in pinned for number in numbers_of(peer)},
+                denied=fleet.denied,
+            )
+        )
+
+    def _hold_contacts(self) -> None:
+        for contact in self._fleet.contacts:
+            try:
+                self.trust.hold(contact.key, contact.certificate)
+            except Drop as drop:
+                self._log.warning("contact_refused", contact=contact.name, reason=drop.reason.value)
+
+    def _is_contact(self, key: bytes) -> bool:
+        return any(contact.key == key for contact in self._fleet.contacts)
+
+    def _is_wanted(self, certificate: Certificate) -> bool:
+        """Whether members with this role have a policy here, or this daemon is their relay."""
+        return self._relay is not None or certificate.role in self._fleet.policies
+
+    def _config_of(self, key: bytes) -> PeerConfig:
+        return member_peer(self._fleet, key, self.trust.held[key].certificate)
+
+    # Members.
+
+    def admit(self, key: bytes, data: bytes, now: float) -> PeerSettings:
+        """An initiation shows this certificate. Returns the settings of its peer.
+
+        Raises:
+            Drop: why it is refused.
+        """
+        certificate = self._hold(key, data, now)
+        if certificate.role in self._fleet.policies:
+            return self._config_of(key).settings
+        return relay_member(self._fleet, key, certificate).peer
+
+    def _hold(self, key: bytes, data: bytes, now: float) -> Certificate:
+        """Hold a certificate that is valid and wanted, and not too early or one too many. Raises Drop."""
+        certificate = self.trust.judge(key, data)
+        if not self._is_wanted(certificate):
+            raise Drop(DropReason.ROLE_NOT_ACCEPTED, certificate.name)
+        is_enough = self.trust.bulletin.number >= self._fleet.required_bulletin
+        if not is_enough or (now < self._settled_at and not self._is_contact(key)):
+            raise Drop(DropReason.BULLETIN_AWAITED)
+        if key not in self.trust.held:
+            self._make_room(now)
+        for ended in self.trust.hold(key, data):
+            self._end(ended, now)
+        return certificate
+
+    def _make_room(self, now: float) -> None:
+        """Give up the member that is down for longest, if there are as many as may be."""
+        if len(self.trust.held) < (CERTIFIED_PEERS if self._relay is None else MOST_MEMBERS):
+            return
+        absent: dict[bytes, float] = {}
+        for key in self.trust.held:
+            peer = self._node.find(key)
+            if not self._is_contact(key) and (peer is None or not peer.is_up):
+                absent[key] = -c.NEVER if peer is None or peer.received_at is None else peer.received_at
+        if not absent:
+            raise Drop(DropReason.TOO_MANY_MEMBERS)
+        longest = min(absent, key=absent.__getitem__)
+        del self.trust.held[longest]
+        self._end(longest, now)
+
+    def on_event(self, event: o.Event, now: float) -> None:
+        """An event of any peer. Call it before other parts act on it: they may not know the peer yet."""
+        if not isinstance(peer := event.peer, Peer):
+            return
+        key = peer.settings.public_key
+        match event:
+            case o.PeerAdmitted():
+                certificate = self.trust.held[key].certificate
+                if self._relay is not None:
+                    self._relay.admit(peer, relay_member(self._fleet, key, certificate), now)
+                if certificate.role in self._fleet.policies:
+                    self._membership.add_member(self._config_of(key), peer)
+            case o.PeerExpired():
+                self.trust.held.pop(key, None)
+            case o.SessionEstablished() if peer.session_with(c.FEATURE_FLEET, now) is not None:
+                budget = self._node.facts.pace(peer.path) if peer.path is not None else None
+                self.exchange.on_handshake(key, max(2 * peer.answer_s, 0.0 if budget is None else budget.ask_s), now)
+                if self._fleet.call and any(relay.peer is peer for relay in self._relays.by_name.values()):
+                    self._askings[key] = _Asking(now)
+            case o.PeerLost() | o.PeerClosed():
+                self.exchange.on_down(key)
+                self._askings.pop(key, None)
+
+    # Records.
+
+    def on_record(self, received: o.RecordReceived, now: float) -> DropReason | None:
+        """A record of a fleet came. Returns why it has no effect; None if it has one."""
+        peer, record = received.peer, received.record
+        assert isinstance(peer, Peer)
+        key = peer.settings.public_key
+        try:
+            if isinstance(record, CertificateRecord) and record.key not in (key, self.trust.own_key):
+                self._introduce(key, record, now)
+            elif isinstance(record, Who):
+                return DropReason.UNEXPECTED_RECORD if self._relay is None else self._relay.on_record(received, now)
+            elif isinstance(record, FleetRecord):
+                self._react(self.exchange.receive(key, record, received.order, now), now)
+        except Drop as drop:
+            return drop.reason
+        if self._is_contact(key) and isinstance(record, Have) and record.number <= self.trust.bulletin.number:
+            self._settled_at = now
+        return None
+
+    def _introduce(self, sender: bytes, record: CertificateRecord, now: float) -> None:
+        """A relay names a member: make a link with it. Raises Drop."""
+        limit = self._limits.setdefault(sender, TokenBucket(*CERTIFICATES, now))
+        if not limit.take(now):
+            raise Drop(DropReason.RECORD_OVER_LIMIT)
+        if self.trust.judge(record.key, record.certificate).role not in self._fleet.policies:
+            raise Drop(DropReason.ROLE_NOT_ACCEPTED)
+        certificate = self._hold(record.key, record.certificate, now)
+        if (asking := self._askings.get(sender)) is not None:
+            asking.received += 1
+            asking.after = max(asking.after, certificate.serial)
+            if asking.received == CERTIFICATES_PER_ANSWER:
+                asking.due_at, asking.tries = now, 0
+        if self._node.find(record.key) is None:
+            self._membership.add_member(self._config_of(record.key), None)
+
+    def publish(self, signed: str, now: float) -> dict[str, object]:
+        """Take a bulletin from the operator of this machine, and newer certificates of members: KEY:CERTIFICATE.
+
+        All of it in base64, with spaces between. Returns what became of it.
+        """
+        try:
+            first, *others = [[b64decode(part, validate=True) for part in one.split(":")] for one in signed.split()]
+            certificates = [(key, certificate) for key, certificate in others]
+            (bulletin,) = first
+        except ValueError:
+            return {"error": "is not a bulletin in base64, or was cut"}
+        verdict, reaction = self.exchange.publish(bulletin, now)
+        self._react(reaction, now)
+        for key, certificate in certificates:
+            with suppress(Drop):
+                self.trust.judge(key, certificate)
+                for ended in self.trust.hold(key, certificate) if key in self.trust.held else ():
+                    self._end(ended, now)
+        if certificates:
+            self.exchange.note_own_certificate(now)
+        return {"verdict": verdict.value, "number": self.trust.bulletin.number}
+
+    def _react(self, reaction: Reaction, now: float) -> None:
+        for key in reaction.ended:
+            self._end(key, now)
+        if reaction.event:
+            if now >= self.events.get(reaction.event, -c.NEVER) + EVENT_S:
+                self._log.error(reaction.event, number=self.trust.bulletin.number)
+            self.events[reaction.event] = now
+        if reaction.persists:
+            self._show_certificate()
+            self._persist()
+
+    def _show_certificate(self) -> None:
+        if self.trust.own is not None:
+            self._node.set_certificate(self.trust.own.data)
+
+    def _send(self, key: bytes, record: FleetRecord, now: float) -> None:
+        if (peer := self._node.find(key)) is not None:
+            self._perform(self._node.send_record(peer, None, record, now))
+
+    def status(self, now: float) -> dict[str, object]:
+        """What this daemon knows of its fleet. ``events``: with their age in seconds. ``bulletins``: numbers that peers
+        stated, by name.
+        """
+        trust = self.trust
+        own = None if trust.own is None else trust.own.certificate
+        stated = {link.name: self.exchange.stated(link.key) for link in self._links.values()}
+        return {
+            "fleet": fingerprint_of(self._fleet.authority.public),
+            "name": own and own.name,
+            "role": own and own.role.name.lower(),
+            "serial": own and own.serial,
+            "is_revoked": own is not None and trust.bulletin.refuses(own.serial),
+            "number": trust.bulletin.number,
+            "least": trust.bulletin.least,
+            "revoked": list(trust.bulletin.revoked),
+            "held": {held.certificate.name: held.certificate.serial for held in trust.held.values()},
+            "bulletins": {name: None if one is None else one[0] for name, one in stated.items()},
+            "problem": self.problem,
+            "events": {name: now - at for name, at in self.events.items() if now < at + EVENT_S},
+        }
+
+    # Ends.
+
+    def _end(self, key: bytes, now: float) -> None:
+        """Nothing of this key is accepted any more. It gets no close: it is not a peer."""
+        self.exchange.forget(key)
+        self._askings.pop(key, None)
+        self._limits.pop(key, None)
+        if self._relay is not None:
+            self._relay.end(key, now)
+        for name, relay in list(self._relays.by_name.items()):
+            if relay.config.settings.public_key == key:
+                self._relays.remove(name, now)
+        for name in [name for name, link in self._links.items() if link.key == key]:
+            self._membership.remove_member(name)
+        if (peer := self._node.find(key)) is not None:
+            self._node.remove_peer(peer, now, closes=False)
+
+    # The disk.
+
+    def _persist(self) -> None:
+        """Write the state in a thread: what a bulletin revokes has ended already."""
+        self._written_at = c.NEVER
+        if self._writing is None:
+            self._writing = asyncio.get_running_loop().create_task(self._write())
+
+    async def _write(self) -> None:
+        trust = self.trust
+        while True:
+            bulletin, number, digest = trust.bulletin_bytes, trust.bulletin.number, trust.digest
+            certificate = b"" if trust.own is None else trust.own.data
+            try:
+                await _THREAD.run(state_file.write, self._fleet.state_file, bulletin, certificate)
+            except OSError as error:
+                if not self.problem:
+                    self._log.error("fleet_state_unwritten", file=str(self._fleet.state_file), error=error.strerror)
+                self.problem = f"cannot be written: {error.strerror}"
+                self._written_at = monotonic() + HAVE_INTERVAL_S
+                break
+            self.problem = ""
+            self.exchange.note_persisted(number, digest)
+            if bulletin == trust.bulletin_bytes and (trust.own is None or certificate == trust.own.data):
+                break
+        self._writing = None
+        self._perform([])
+
+
+def numbers_of(peer: PeerConfig) -> list[int]:
+    """The system ids that a peer of the configuration has alone."""
+    ids = peer.policy.get("system_ids", ())
+    return [number for number in ids if isinstance(number, int)] if isinstance(ids, tuple) else []
