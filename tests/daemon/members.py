@@ -18,13 +18,13 @@ class CertifiedFleet:
 
     def __init__(self) -> None:
         self.serial = 0
-        self.number = 1
+        self.number = self.least = 1
         self.revoked: list[int] = []
         self.certificates: dict[str, tuple[bytes, bytes, Certificate]] = {}
 
     @property
     def bulletin(self) -> bytes:
-        return bulletin(self.number, *self.revoked)
+        return bulletin(self.number, *self.revoked, least=self.least)
 
     def join(self, daemon: DaemonProcess, role: MemberRole, system_id: int = 0, *contacts: DaemonProcess) -> None:
         """Sign for a daemon, and write what it needs into its configuration."""
@@ -52,4 +52,20 @@ class CertifiedFleet:
         """The request that publishes a bulletin which revokes these members too."""
         self.number += 1
         self.revoked = sorted({*self.revoked, *(self.certificates[name][2].serial for name in names)})
+        return f"publish {text(self.bulletin)}"
+
+    def renew(self, *daemons: DaemonProcess) -> str:
+        """The request that hands new certificates of these over."""
+        renewed: list[str] = []
+        for daemon in daemons:
+            key, _, before = self.certificates[daemon.name]
+            self.serial += 1
+            certificate = before._replace(serial=self.serial)
+            self.certificates[daemon.name] = key, signed(certificate, key), certificate
+            renewed.append(f"{daemon.public_key}:{text(self.certificates[daemon.name][1])}")
+        return f"publish {text(self.bulletin)} {' '.join(renewed)}"
+
+    def raise_least(self, least: int) -> str:
+        """The request that publishes a bulletin which refuses lower serials."""
+        self.number, self.least = self.number + 1, least
         return f"publish {text(self.bulletin)}"

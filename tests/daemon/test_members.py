@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
+import asyncio
+
+import pytest
+
 from tests.daemon.frames import frame
 from tests.daemon.harness import Stage
 from tests.daemon.members import CertifiedFleet
+from tests.daemon.process import DaemonProcess, Status
 from uavlinkd.core.certificates import MemberRole
+
+
+def is_up(status: Status, *names: str) -> bool:
+    return all(status["peers"].get(name, {}).get("state") == "up" for name in names)
 
 
 async def test_members_meet_at_a_relay(stage: Stage) -> None:
@@ -18,17 +27,91 @@ async def test_members_meet_at_a_relay(stage: Stage) -> None:
     into, screen = vehicle.add_endpoint("autopilot"), await stage.client()
     ground.add_endpoint("screen", f"udpout:{screen}")
     await stage.start(relay, ground, vehicle, linked=False)
-    await ground.until(lambda status: status["peers"].get("v1", {}).get("state") == "up")
+    await ground.until(lambda status: is_up(status, "v1"))
     autopilot = await stage.client()
     autopilot.send(frame(1), into)
     await screen.until(lambda: screen.received == frame(1))
-    answer = await ground.ask(fleet.revoke("v1"))
-    assert answer == {"verdict": "newer", "number": 2}
+    assert await ground.ask(fleet.revoke("v1")) == {"verdict": "newer", "number": 2}
     assert "v1" not in (await ground.status())["peers"]
     await relay.until(lambda status: "v1" not in status["relay"]["members"])
-    # The next start of the ground station begins with the bulletin on its disk.
-    await ground.stop()
-    await relay.stop()
+    await relay.until(lambda status: status["drops"].get("certificate_revoked", 0) > 0)
+    await asyncio.gather(ground.kill(), relay.stop())
     await ground.start()
-    status = await ground.ready()
-    assert status["fleet"]["number"] == 2
+    assert (await ground.ready())["fleet"]["number"] == 2, "the bulletin is on its disk"
+
+
+@pytest.fixture
+async def swarm(stage: Stage) -> tuple[CertifiedFleet, DaemonProcess, DaemonProcess, DaemonProcess]:
+    """A ground station that relays, and two vehicles that call each other too."""
+    fleet = CertifiedFleet()
+    ground, one, two = stage.daemon("ground"), stage.daemon("v1", []), stage.daemon("v2", [])
+    fleet.join(ground, MemberRole.OPERATOR, 255)
+    ground.config["relay_server"] = {}
+    for system_id, vehicle in enumerate((one, two), 1):
+        fleet.join(vehicle, MemberRole.VEHICLE, system_id, ground)
+        vehicle.config["contact"][0]["relays"] = True
+        vehicle.config["fleet"]["call"] = ["operator", "vehicle"]
+        vehicle.add_endpoint("autopilot")
+    ground.add_endpoint("screen")
+    await stage.start(ground, one, two, linked=False)
+    await one.until(lambda status: is_up(status, "ground", "v2"))
+    await two.until(lambda status: is_up(status, "ground", "v1"))
+    await ground.until(lambda status: is_up(status, "v1", "v2"))
+    return fleet, ground, one, two
+
+
+async def test_station_that_relays(
+    swarm: tuple[CertifiedFleet, DaemonProcess, DaemonProcess, DaemonProcess],
+) -> None:
+    """Vehicles meet there, and its bulletin revokes one of them at the other, which tells a member that was off."""
+    fleet, ground, one, two = swarm
+    await two.stop()
+    await one.until(lambda status: not is_up(status, "v2"))
+    await ground.ask(fleet.revoke("v1"))
+    await two.start()
+    await two.until(lambda status: is_up(status, "ground") and status["fleet"]["number"] == 2)
+    assert "v1" not in (await two.status())["peers"]
+    assert not two.events("link_up", peer="v1")
+
+
+async def test_member_gets_a_new_key(
+    stage: Stage, swarm: tuple[CertifiedFleet, DaemonProcess, DaemonProcess, DaemonProcess]
+) -> None:
+    """The same name and ids with a higher serial: all accept the new key, and the old one is revoked."""
+    fleet, ground, one, two = swarm
+    contacts = one.config["contact"]
+    await one.stop()
+    old = fleet.certificates.pop("v1")
+    new = stage.daemon("new", [])
+    new.name = new.config["name"] = "v1"
+    fleet.join(new, MemberRole.VEHICLE, 1, ground)
+    new.config["contact"] = contacts
+    new.add_endpoint("autopilot")
+    fleet.certificates["old"] = old
+    await ground.ask(fleet.revoke("old"))
+    await new.start()
+    await new.until(lambda status: is_up(status, "ground"))
+    await two.until(lambda status: is_up(status, "v1") and status["peers"]["v1"]["public_key"] == new.public_key)
+
+
+async def test_members_get_newer_certificates(
+    swarm: tuple[CertifiedFleet, DaemonProcess, DaemonProcess, DaemonProcess],
+) -> None:
+    """All get new certificates, each along live links. Then the least serial rises: no link ends."""
+    fleet, *daemons = swarm
+    ground, one, two = daemons
+    before = [(await daemon.status())["peers"] for daemon in daemons]
+    await ground.ask(fleet.renew(*daemons))
+    for daemon in daemons:
+        await daemon.until(
+            lambda status: status["fleet"]["serial"] > 3 and all(held > 3 for held in status["fleet"]["held"].values())
+        )
+    await ground.ask(fleet.raise_least(4))
+    for daemon in daemons:
+        await daemon.until(lambda status: status["fleet"]["least"] == 4 and all(status["fleet"]["bulletins"].values()))
+    after = [(await daemon.status())["peers"] for daemon in daemons]
+    for earlier, later in zip(before, after, strict=True):
+        assert {name: peer["handshakes"] for name, peer in earlier.items()} == {
+            name: peer["handshakes"] for name, peer in later.items()
+        }
+    assert {peer["state"] for peer in after[1].values()} == {"up"}

@@ -17,6 +17,8 @@ from typing import Final, Protocol
 from structlog.typing import FilteringBoundLogger
 
 from uavlinkd.authority import state_file
+from uavlinkd.authority.places import longest_down
+from uavlinkd.authority.state_file import FleetState
 from uavlinkd.authority.constants import (
     CERTIFICATES,
     CERTIFICATES_PER_ANSWER,
@@ -106,10 +108,8 @@ class FleetMembers:
         self._perform = perform
         self._log = log
         self.trust = Trust(fleet.authority, config.public_key, fleet.own.data, fleet.bulletin)
-        state, self.problem = state_file.read(fleet.state_file)
-        if state is not None:
-            self.trust.receive_bulletin(state.bulletin)
-            self.trust.replace_own(state.certificate)
+        self.problem = state_file.read(fleet.state_file, self.trust)
+        """Why the state on the disk is not used, or not written; empty if all is well."""
         self.exchange = BulletinExchange(self.trust, os.urandom)
         self.events: dict[str, float] = {}
         """When something about bulletins was noticed last that a person has to know."""
@@ -232,16 +232,12 @@ class FleetMembers:
         """Give up the member that is down for longest, if there are as many as may be."""
         if len(self.trust.held) < (CERTIFIED_PEERS if self._relay is None else MOST_MEMBERS):
             return
-        absent: dict[bytes, float] = {}
-        for key in self.trust.held:
-            peer = self._node.find(key)
-            if not self._is_contact(key) and (peer is None or not peer.is_up):
-                absent[key] = -c.NEVER if peer is None or peer.received_at is None else peer.received_at
-        if not absent:
+        contacts = {contact.key for contact in self._fleet.contacts}
+        if (peer := longest_down(self._node.peers.values(), contacts)) is None:
             raise Drop(DropReason.TOO_MANY_MEMBERS)
-        longest = min(absent, key=absent.__getitem__)
-        del self.trust.held[longest]
-        self._end(longest, now)
+        key = peer.settings.public_key
+        self.trust.held.pop(key, None)
+        self._end(key, now)
 
     def on_event(self, event: o.Event, now: float) -> None:
         """An event of any peer. Call it before other parts act on it: they may not know the peer yet."""
@@ -250,11 +246,7 @@ class FleetMembers:
         key = peer.settings.public_key
         match event:
             case o.PeerAdmitted():
-                certificate = self.trust.held[key].certificate
-                if self._relay is not None:
-                    self._relay.admit(peer, relay_member(self._fleet, key, certificate), now)
-                if certificate.role in self._fleet.policies:
-                    self._membership.add_member(self._config_of(key), peer)
+                self._join(key, peer, now)
             case o.PeerExpired():
                 self.trust.held.pop(key, None)
             case o.SessionEstablished() if peer.session_with(c.FEATURE_FLEET, now) is not None:
@@ -265,6 +257,16 @@ class FleetMembers:
             case o.PeerLost() | o.PeerClosed():
                 self.exchange.on_down(key)
                 self._askings.pop(key, None)
+
+    def _join(self, key: bytes, peer: Peer | None, now: float) -> None:
+        """A member is here, or is introduced: make a link with it, and let it use the relay of this daemon."""
+        held = self.trust.held[key]
+        has_link = held.certificate.role in self._fleet.policies
+        if has_link:
+            self._membership.add_member(self._config_of(key), peer)
+        if self._relay is not None and (known := self._node.find(key)) is not None:
+            member = relay_member(self._fleet, key, held.certificate)
+            self._relay.admit(known, member, held, now, is_own=not has_link)
 
     # Records.
 
@@ -300,7 +302,7 @@ class FleetMembers:
             if asking.received == CERTIFICATES_PER_ANSWER:
                 asking.due_at, asking.tries = now, 0
         if self._node.find(record.key) is None:
-            self._membership.add_member(self._config_of(record.key), None)
+            self._join(record.key, None, now)
 
     def publish(self, signed: str, now: float) -> dict[str, object]:
         """Take a bulletin from the operator of this machine, and newer certificates of members: KEY:CERTIFICATE.
@@ -313,15 +315,15 @@ class FleetMembers:
             (bulletin,) = first
         except ValueError:
             return {"error": "is not a bulletin in base64, or was cut"}
-        verdict, reaction = self.exchange.publish(bulletin, now)
-        self._react(reaction, now)
         for key, certificate in certificates:
             with suppress(Drop):
-                self.trust.judge(key, certificate)
+                if key == self.trust.own_key and self.trust.replace_own(certificate):
+                    self._react(Reaction(persists=True), now)
                 for ended in self.trust.hold(key, certificate) if key in self.trust.held else ():
                     self._end(ended, now)
-        if certificates:
-            self.exchange.note_own_certificate(now)
+        self.exchange.note_own_certificate(now)
+        verdict, reaction = self.exchange.publish(bulletin, now)
+        self._react(reaction, now)
         return {"verdict": verdict.value, "number": self.trust.bulletin.number}
 
     def _react(self, reaction: Reaction, now: float) -> None:
@@ -349,7 +351,7 @@ class FleetMembers:
         """
         trust = self.trust
         own = None if trust.own is None else trust.own.certificate
-        stated = {link.name: self.exchange.stated(link.key) for link in self._links.values()}
+        stated = {link.name: self.exchange.shown(link.key) for link in self._links.values()}
         return {
             "fleet": fingerprint_of(self._fleet.authority.public),
             "name": own and own.name,
@@ -360,7 +362,7 @@ class FleetMembers:
             "least": trust.bulletin.least,
             "revoked": list(trust.bulletin.revoked),
             "held": {held.certificate.name: held.certificate.serial for held in trust.held.values()},
-            "bulletins": {name: None if one is None else one[0] for name, one in stated.items()},
+            "bulletins": {name: one for name, one in stated.items()},
             "problem": self.problem,
             "events": {name: now - at for name, at in self.events.items() if now < at + EVENT_S},
         }
@@ -390,13 +392,17 @@ class FleetMembers:
         if self._writing is None:
             self._writing = asyncio.get_running_loop().create_task(self._write())
 
+    @property
+    def _state(self) -> FleetState:
+        return FleetState(self.trust.bulletin_bytes, b"" if self.trust.own is None else self.trust.own.data)
+
     async def _write(self) -> None:
         trust = self.trust
         while True:
-            bulletin, number, digest = trust.bulletin_bytes, trust.bulletin.number, trust.digest
-            certificate = b"" if trust.own is None else trust.own.data
+            number, digest = trust.bulletin.number, trust.digest
+            state = self._state
             try:
-                await _THREAD.run(state_file.write, self._fleet.state_file, bulletin, certificate)
+                await _THREAD.run(state_file.write, self._fleet.state_file, state)
             except OSError as error:
                 if not self.problem:
                     self._log.error("fleet_state_unwritten", file=str(self._fleet.state_file), error=error.strerror)
@@ -405,7 +411,7 @@ class FleetMembers:
                 break
             self.problem = ""
             self.exchange.note_persisted(number, digest)
-            if bulletin == trust.bulletin_bytes and (trust.own is None or certificate == trust.own.data):
+            if state == self._state:
                 break
         self._writing = None
         self._perform([])
