@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import pytest
 
-from tests.core.harness import AT_A, Pair, datagrams
+from tests.core.harness import AT_A, AT_B, KEY_A, KEY_C, Pair, datagrams, only, seeded
 from tests.core.harness import of as outputs_of
 from tests.core.test_path_set import PEER, answer, fail, linked, of, path_set, route, suspect
 from uavlinkd.core import constants as c
 from uavlinkd.core import establish, probing, wire
+from uavlinkd.core.crypto import Secret
 from uavlinkd.core.limits import prefix_of
-from uavlinkd.core.outputs import Output, PathChanged, PathSuspected, Transmit
+from uavlinkd.core.node import Node
+from uavlinkd.core.outputs import Output, PathChanged, PathSuspected, PeerLost, Transmit
 from uavlinkd.core.path import Path, relay_name, relayed
 from uavlinkd.core.probe import Probe
-from uavlinkd.core.settings import Class, Link
+from uavlinkd.core.settings import Class, Link, PeerSettings
 
 LTE, MESH = Path(0, ("192.0.2.1", 5790)), Path(1, ("198.51.100.1", 5790))
 DIRECT = [LTE, *(Path(0, (f"192.0.2.{number}", 5790)) for number in (2, 3, 4))]
@@ -258,3 +260,27 @@ def test_one_path_is_asked(pair: Pair) -> None:
     assert node.ask(peer, LTE_B, 1.3) == []
     other = Pair()
     assert other.a.node.ask(other.a.peer, other.a.peer_at, 0.0) == []
+
+
+def test_peer_without_any_path_is_lost() -> None:
+    """Nothing can be sent to it any more, so no answer is missed: its link ends after the usual time."""
+    pair = Pair(Link(verify_interval_s=1e6), Link(verify_interval_s=1e6))
+    pair.a.node.set_paths(pair.a.peer, [LTE_A], 0.0)
+    pair.a.peer_at = LTE_A
+    pair.establish()
+    pair.a.node.set_paths(pair.a.peer, [], 1.0)
+    assert not outputs_of(pair.a.timeout(3.9), PeerLost)
+    assert outputs_of(pair.a.timeout(1.0 + c.LOST_AFTER_S), PeerLost)
+
+
+def test_peers_behind_relays_are_closed_first() -> None:
+    """The close to the relay ends the handles along which the others are reached."""
+    pair = Pair().establish()
+    behind = pair.a.node.add_peer(PeerSettings("behind", KEY_C.public), 1.0)
+    pair.a.node.set_paths(behind, [LTE_A], 1.0)
+    initiation = only(datagrams(pair.a.timeout(1.0), wire.INITIATION))
+    other = Node(Secret(KEY_C._private.private_bytes_raw()), seeded(5), 1.0)
+    other.add_peer(PeerSettings("alpha", KEY_A.public), 1.0)
+    (response,) = datagrams(other.receive(initiation, LTE_A, 1.0))
+    pair.a.receive(response, 1.0, LTE_A)
+    assert [sent.path for sent in outputs_of(pair.a.node.close(2.0), Transmit)] == [LTE_A, AT_B]

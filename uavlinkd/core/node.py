@@ -32,7 +32,7 @@ from uavlinkd.core.session import Session
 from uavlinkd.core.sessions import Indices
 from uavlinkd.core.settings import Admit, Class, PeerSettings, Screen, hold_all
 from uavlinkd.core.timeouts import handle_timeout
-from uavlinkd.core.timers import Schedule
+from uavlinkd.core.timers import Schedule, Timer
 
 PEERS_AT_ONCE = 8
 """Peers that one call of :meth:`Node.handle_timeout` handles: datagrams wait meanwhile."""
@@ -191,6 +191,9 @@ class Node:
 
     def _revise_paths(self, peer: Peer, now: float) -> None:
         peer.paths.revise(now)
+        if peer.is_up and not peer.paths.by_path and peer.unanswered_since is None:
+            peer.unanswered_since = now  # nothing can be sent any more, so no answer can be missed
+            peer.timers.set(Timer.SILENCE, now + peer.lost_after_s)
         peer.set_paths_timer()
         peer.set_initiate()
         self._schedule.update(peer)
@@ -292,9 +295,9 @@ class Node:
         return self._schedule.next_at
 
     def close(self, now: float) -> list[Output]:
-        """Close the sessions with every peer."""
+        """Close the sessions with every peer, first those along a relay: its own close ends their handles."""
         out: list[Output] = []
-        for peer in self.peers.values():
+        for peer in sorted(self.peers.values(), key=lambda peer: peer.path is None or not peer.path.is_relayed):
             out += establish.close(peer, now)
             self._schedule.remove(peer)
         return out

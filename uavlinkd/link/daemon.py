@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from base64 import b64encode
 import os
+from base64 import b64encode
 from contextlib import suppress
 from typing import TYPE_CHECKING
 

@@ -17,8 +17,6 @@ from typing import Final, Protocol
 from structlog.typing import FilteringBoundLogger
 
 from uavlinkd.authority import state_file
-from uavlinkd.authority.places import longest_down
-from uavlinkd.authority.state_file import FleetState
 from uavlinkd.authority.constants import (
     CERTIFICATES,
     CERTIFICATES_PER_ANSWER,
@@ -27,7 +25,10 @@ from uavlinkd.authority.constants import (
     HAVE_INTERVAL_S,
     WHO_INTERVAL_S,
 )
+from uavlinkd.authority.enrolment import fingerprint_of
 from uavlinkd.authority.exchange import BulletinExchange, Reaction
+from uavlinkd.authority.places import longest_down
+from uavlinkd.authority.state_file import FleetState
 from uavlinkd.authority.trust import Pinned, Trust
 from uavlinkd.config import Config, PeerConfig
 from uavlinkd.config.members import member_peer, relay_member
@@ -35,7 +36,7 @@ from uavlinkd.config.model import FleetConfig
 from uavlinkd.config.relay_rules import MOST_MEMBERS
 from uavlinkd.core import constants as c
 from uavlinkd.core import outputs as o
-from uavlinkd.core.certificates import Certificate, fingerprint_of
+from uavlinkd.core.certificates import Certificate
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.limits import TokenBucket
 from uavlinkd.core.node import Node
@@ -69,6 +70,19 @@ class Membership(Protocol):
         """Apply another policy."""
 
 
+@dataclass(frozen=True, slots=True)
+class FleetShell:
+    """The parts of a daemon that its fleet concerns. ``perform`` executes outputs of the core."""
+
+    node: Node
+    links: Mapping[str, PeerLink]
+    relays: Relays
+    relay: RelayService | None
+    membership: Membership
+    perform: Callable[[list[Output]], None]
+    log: FilteringBoundLogger
+
+
 @dataclass(slots=True)
 class _Asking:
     """What one relay is asked about other members."""
@@ -87,26 +101,15 @@ class FleetMembers:
     Look at :attr:`next_at` after each call.
     """
 
-    def __init__(
-        self,
-        config: Config,
-        fleet: FleetConfig,
-        node: Node,
-        links: Mapping[str, PeerLink],
-        relays: Relays,
-        relay: RelayService | None,
-        membership: Membership,
-        perform: Callable[[list[Output]], None],
-        log: FilteringBoundLogger,
-    ) -> None:
+    def __init__(self, config: Config, fleet: FleetConfig, daemon: FleetShell) -> None:
         self._fleet = fleet
-        self._node = node
-        self._links = links
-        self._relays = relays
-        self._relay = relay
-        self._membership = membership
-        self._perform = perform
-        self._log = log
+        self._node = daemon.node
+        self._links = daemon.links
+        self._relays = daemon.relays
+        self._relay = daemon.relay
+        self._membership = daemon.membership
+        self._perform = daemon.perform
+        self._log = daemon.log
         self.trust = Trust(fleet.authority, config.public_key, fleet.own.data, fleet.bulletin)
         self.problem = state_file.read(fleet.state_file, self.trust)
         """Why the state on the disk is not used, or not written; empty if all is well."""
@@ -346,12 +349,11 @@ class FleetMembers:
             self._perform(self._node.send_record(peer, None, record, now))
 
     def status(self, now: float) -> dict[str, object]:
-        """What this daemon knows of its fleet. ``events``: with their age in seconds. ``bulletins``: numbers that peers
-        stated, by name.
+        """What this daemon knows of its fleet. ``events``: their age in seconds. ``bulletins``: the number that each
+        peer stated.
         """
         trust = self.trust
         own = None if trust.own is None else trust.own.certificate
-        stated = {link.name: self.exchange.shown(link.key) for link in self._links.values()}
         return {
             "fleet": fingerprint_of(self._fleet.authority.public),
             "name": own and own.name,
@@ -362,7 +364,7 @@ class FleetMembers:
             "least": trust.bulletin.least,
             "revoked": list(trust.bulletin.revoked),
             "held": {held.certificate.name: held.certificate.serial for held in trust.held.values()},
-            "bulletins": {name: one for name, one in stated.items()},
+            "bulletins": {name: self.exchange.shown(link.key) for name, link in self._links.items()},
             "problem": self.problem,
             "events": {name: now - at for name, at in self.events.items() if now < at + EVENT_S},
         }

@@ -8,7 +8,7 @@ from uavlinkd.config import Config, PeerConfig, RelayConfig
 from uavlinkd.config.changes import ConfigChanges
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.settings import PeerSettings
-from uavlinkd.link.fleet_members import FleetMembers
+from uavlinkd.link.fleet_members import FleetMembers, FleetShell
 from uavlinkd.link.parts import DaemonParts
 from uavlinkd.link.peer_link import Carriage, PeerLink
 from uavlinkd.system.clock import monotonic
@@ -25,8 +25,8 @@ class Peers:
         self._parts = parts
         self._carriage = carriage
         if (fleet := parts.config.fleet) is not None:
-            known = parts.links, parts.relays, parts.relay
-            parts.fleet = FleetMembers(parts.config, fleet, parts.node, *known, self, carriage.perform, parts.log)
+            known = parts.node, parts.links, parts.relays, parts.relay
+            parts.fleet = FleetMembers(parts.config, fleet, FleetShell(*known, self, carriage.perform, parts.log))
 
     def start(self) -> None:
         """Add all that the configuration has."""
