@@ -88,6 +88,8 @@ class Scene:
             ),
             events=SimpleNamespace(write=lambda *_: None),
             relay=None,
+            fleet=None,
+            config=SimpleNamespace(fleet=None),
             drops=drops,
             evidence=SimpleNamespace(add_dropped=lambda *_: None),
         )

@@ -53,7 +53,7 @@ from uavlinkd.system.tasks import Threads
 WHO_SOON_S: Final = 0.5
 """A question to a relay is repeated after this, and each time after twice as long: it, or an answer, may be lost."""
 EVENT_S: Final = 60.0
-"""An event of bulletins is logged this often at most, and shown for so long."""
+"""An event of bulletins is shown for so long."""
 _THREAD = Threads(1, "fleet state")
 
 
@@ -333,8 +333,6 @@ class FleetMembers:
         for key in reaction.ended:
             self._end(key, now)
         if reaction.event:
-            if now >= self.events.get(reaction.event, -c.NEVER) + EVENT_S:
-                self._log.error(reaction.event, number=self.trust.bulletin.number)
             self.events[reaction.event] = now
         if reaction.persists:
             self._show_certificate()
@@ -406,8 +404,6 @@ class FleetMembers:
             try:
                 await _THREAD.run(state_file.write, self._fleet.state_file, state)
             except OSError as error:
-                if not self.problem:
-                    self._log.error("fleet_state_unwritten", file=str(self._fleet.state_file), error=error.strerror)
                 self.problem = f"cannot be written: {error.strerror}"
                 self._written_at = monotonic() + HAVE_INTERVAL_S
                 break
