@@ -8,11 +8,12 @@ import tomllib
 from collections.abc import Callable
 from typing import Any, Final, NamedTuple
 
-from uavlinkd.authority import enrolment
+from uavlinkd.authority import constants as fleet_constants
+from uavlinkd.authority import enrolment, trust
 from uavlinkd.config import checks as config_checks
 from uavlinkd.config import keys
 from uavlinkd.config import load as config_load
-from uavlinkd.core import counters, handshake, path_state, probe, receive, refusals, session, wire
+from uavlinkd.core import certificates, counters, handshake, path_state, probe, receive, refusals, session, wire
 from uavlinkd.core import node as core_node
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.outputs import Transmit
@@ -184,6 +185,10 @@ PLANTS: Final = {
         "_open_payload",
         lambda _: lambda payload, header: (wire.parse_parameters(payload[len(header) - 1 :]), b""),
     ),
+    "any bulletin is signed": Plant("exchange", trust, "is_published", _always(True)),
+    "have is not limited": Plant("exchange", fleet_constants, "HAVE_LEAST_S", lambda _: 0.0),
+    "signature checks are not limited": Plant("exchange", fleet_constants, "BULLETIN_LEAST_S", lambda _: 0.0),
+    "serials in any order": Plant("signed", certificates, "pairwise", lambda _: lambda offsets: ()),
     "any checksum fits": Plant("stream", frames, "CHECKSUM_STEPS", lambda _: range(0x10000)),
     "a byte is skipped that belongs to the next frame": Plant(
         "frames", frames, "_length_of_frame", lambda right: lambda data, position: right(data, position) + 1

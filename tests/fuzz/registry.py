@@ -4,7 +4,19 @@ from __future__ import annotations
 
 from typing import Final
 
-from tests.fuzz import candidates, files, frames, handles, handshakes, insiders, lines, outsiders, relays, requests
+from tests.fuzz import (
+    candidates,
+    files,
+    fleets,
+    frames,
+    handles,
+    handshakes,
+    insiders,
+    lines,
+    outsiders,
+    relays,
+    requests,
+)
 from tests.fuzz.engine import Target
 
 _CONTROL: Final = (b"status", b"reload", b"\n", b"\r\n")
@@ -20,6 +32,10 @@ _TARGETS: Final = (
     Target("relay", "a relay: strangers, and members that hold their keys", relays.make, 512),
     Target("handles", "the handles that a hostile relay assigns", handles.make, 1024),
     Target("candidates", "the candidates of a peer that holds its keys", candidates.make, 1024),
+    Target("exchange", "bulletins and certificates from hostile members", fleets.make_exchange, 1024),
+    Target(
+        "signed", "what an authority signs, and its records", fleets.make_signed, 700, (), False, fleets.signed_seeds
+    ),
     Target("stream", "a client's MAVLink on a serial port or TCP, cut anywhere", frames.make_stream),
     Target("line", "the line of a serial network, cut anywhere", lines.make),
     Target("frames", "a client's datagrams, and a peer's payloads", frames.make_datagrams),
