@@ -16,6 +16,7 @@ from tests.core.harness import (
     ELSEWHERE,
     KEY_A,
     KEY_B,
+    KEY_C,
     PLAIN,
     Side,
     datagrams,
@@ -220,9 +221,12 @@ def test_peer_by_certificate() -> None:
     response = only(datagrams(fleet.b.receive(initiation, 0.0)))
     assert fleet.b.peer.provisional_until == c.UNCONFIRMED_LIFETIME_S
     assert not fleet.b.peer.is_up
+    assert fleet.b.node.facts.peers == 0
     confirmed = exchange(fleet.b, fleet.a, fleet.a.receive(response, 0.1), 0.1)
     events = [type(out) for out in confirmed if isinstance(out, PeerAdmitted | PeerUp)]
     assert events == [PeerAdmitted, PeerUp]
+    fleet.b.node.accept(fleet.b.peer)
+    assert fleet.b.node.facts.peers == 1
     fleet.b.timeout(20.0)
     assert fleet.b.node.peers["alpha"].is_up
     rekey = fleet.initiation(c.REKEY_AFTER_S + 1)
@@ -253,6 +257,10 @@ def test_refused_certificate(reason: DropReason) -> None:
     initiation = fleet.initiation(0.0)
     assert reasons(fleet.b.receive(initiation, 0.0)) == [reason]
     assert not fleet.b.node.peers
+    other = fleet.b.node.add_peer(PeerSettings("alpha", KEY_C.public), 0.0)
+    fleet.refused = None
+    assert reasons(fleet.b.receive(fleet.initiation(1.0), 1.0)) == [DropReason.MEMBER_CONFLICT]
+    fleet.b.node.remove_peer(other, 1.0)
     plain = Node(Secret(KEY_B._private.private_bytes_raw()), seeded(3), 0.0)
     assert reasons(plain.receive(initiation, AT_A, 0.0)) == [DropReason.UNKNOWN_PEER]
 

@@ -70,6 +70,7 @@ class Node:
         cookies = CookieJar(MacKeys(identity.public), entropy, now)
         self._handshakes = HandshakeReceiver(identity, cookies, self._indices, admission, self.facts, self._schedule)
         self._certificate = b""
+        self._provisional: set[Peer] = set()
         if admit is not None:
             self._handshakes.admit = partial(self._admit, admit)
         self.peers: dict[str, Peer] = {}
@@ -98,8 +99,7 @@ class Node:
         shared = Shared(self._indices, self._entropy, self._screen, self._last_seen, self.facts)
         peer = Peer(settings, handshakes.identity, shared, now)
         self.peers[settings.name] = handshakes.peers[settings.public_key] = peer
-        self.facts.peers = len(self.peers)
-        self._handshakes.admission.set_peers(len(self.peers))
+        self._count_peers()
         if settings.is_certified:
             peer.initiator.certificate = self._certificate
         return peer
@@ -109,11 +109,27 @@ class Node:
         settings = admit(public_key, certificate, now)
         peer = self._handshakes.peers.get(public_key)
         if peer is None:
+            if settings.name in self.peers:
+                raise Drop(DropReason.MEMBER_CONFLICT, settings.name)
             peer = self.add_peer(settings, now)
+            self._provisional.add(peer)
+            self._count_peers()
             peer.provisional_until = now + c.UNCONFIRMED_LIFETIME_S
             peer.set_expiry()
             self._schedule.update(peer)
         return peer
+
+    def accept(self, peer: Peer) -> None:
+        """A provisional peer proved itself, or the shell knows it from elsewhere: it stays."""
+        peer.provisional_until = c.NEVER
+        peer.set_expiry()
+        self._provisional.discard(peer)
+        self._count_peers()
+
+    def _count_peers(self) -> None:
+        # Without those that a replayed initiation can make: they must not slow down others.
+        self.facts.peers = len(self.peers) - len(self._provisional)
+        self._handshakes.admission.set_peers(self.facts.peers)
 
     def set_certificate(self, certificate: bytes) -> None:
         """Show this certificate to peers by certificate from the next initiation on."""
@@ -128,8 +144,8 @@ class Node:
         ``closes``: it gets a close.
         """
         del self.peers[peer.name]
-        self.facts.peers = len(self.peers)
-        self._handshakes.admission.set_peers(len(self.peers))
+        self._provisional.discard(peer)
+        self._count_peers()
         self._handshakes.forget(peer)
         self._forget_addresses(peer)
         out = establish.close(peer, now, sends=closes)

@@ -322,6 +322,8 @@ class FrameCarrier:
         if self._frames and not self._is_turn:
             delivered, self._frames = self._frames, {}
             for link, frames in delivered.items():
+                if link.peer not in self._links:  # revoked since these frames came
+                    continue
                 if link.recorder is not None:
                     link.recorder.add(link.name, [frame.raw for frame in frames], FROM_PEER, self._read_at)
                 self._switch.forward(link, frames, self._read_at, self._epoch)

@@ -263,6 +263,8 @@ class FleetMembers:
 
     def _join(self, key: bytes, peer: Peer | None, now: float) -> None:
         """A member is here, or is introduced: make a link with it, and let it use the relay of this daemon."""
+        if peer is not None:
+            self._node.accept(peer)
         held = self.trust.held[key]
         has_link = held.certificate.role in self._fleet.policies
         if has_link:
@@ -304,8 +306,9 @@ class FleetMembers:
             asking.after = max(asking.after, certificate.serial)
             if asking.received == CERTIFICATES_PER_ANSWER:
                 asking.due_at, asking.tries = now, 0
-        if self._node.find(record.key) is None:
-            self._join(record.key, None, now)
+        peer = self._node.find(record.key)
+        if peer is None or peer.provisional_until != c.NEVER:
+            self._join(record.key, peer, now)
 
     def publish(self, signed: str, now: float) -> dict[str, object]:
         """Take a bulletin from the operator of this machine, and newer certificates of members: KEY:CERTIFICATE.
