@@ -50,6 +50,15 @@ def test_newer_certificate_of_a_member_takes_the_place_of_the_one_before() -> No
     relay.service.admit(one.at_relay, relay.settings(one.at_relay.settings), newer, relay.now, is_own=True)
     assert operator.ask(VEHICLE, after=8) == [one.key]
     assert operator.ask(VEHICLE, after=9) == []
+    relay.service.introductions.renew(
+        {
+            one.key: held._replace(certificate=held.certificate._replace(serial=11)),
+            bytes(32): held,
+        }
+    )
+    assert operator.ask(VEHICLE, after=10) == [one.key]
+    relay.service.introductions.renew({})
+    assert operator.ask(VEHICLE, after=10) == [one.key]
     assert one.at_relay.sessions.current is session
     one.bind(operator, one)
     assert relay.service.bindings.refused(one.key) == 0

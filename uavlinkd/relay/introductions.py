@@ -6,7 +6,7 @@ Pure: no I/O, no clock, no randomness. Only members by certificate take part. Th
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right, insort
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from operator import itemgetter
 
 from uavlinkd.authority import constants as a
@@ -53,11 +53,23 @@ class Introductions:
 
     def set(self, key: bytes, held: HeldCertificate, now: float, *, is_up: bool) -> None:
         """A member has this certificate from now on."""
-        if (member := self._members.get(key)) is None:
-            member = self._members[key] = _Certified(held, now)
-        self.set_up(key, is_up=False)
-        member.held = held
+        if key not in self._members:
+            self._members[key] = _Certified(held, now)
+        self._renew(key, held)
         self.set_up(key, is_up=is_up)
+
+    def renew(self, held: Mapping[bytes, HeldCertificate]) -> None:
+        """These are held now: members may have newer ones than before."""
+        for key in self._members.keys() & held.keys():
+            self._renew(key, held[key])
+
+    def _renew(self, key: bytes, held: HeldCertificate) -> None:
+        member = self._members[key]
+        if held is not member.held:
+            is_up = member.is_up
+            self.set_up(key, is_up=False)
+            member.held = held
+            self.set_up(key, is_up=is_up)
 
     def remove(self, key: bytes) -> None:
         """Tell others nothing more about it."""
