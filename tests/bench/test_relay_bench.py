@@ -38,9 +38,10 @@ def test_members_are_bound_and_again_after_a_restart(tmp_path: Path) -> None:
         check(generator)
 
 
-def test_members_in_several_processes_are_bound_again(tmp_path: Path) -> None:
-    """Each needs a handshake, and the figures are of this restart only."""
-    with crews(tmp_path, 2, 2) as both:
+@pytest.mark.parametrize("has_fleet", [False, True])
+def test_members_in_several_processes_are_bound_again(tmp_path: Path, *, has_fleet: bool) -> None:
+    """Each needs a handshake, and the figures are of this restart only. Members may be those with a certificate."""
+    with crews(tmp_path, 2, 2, has_fleet=has_fleet) as both:
         first, again = both.do(Members.bind), both.restart()
         assert len(first.after_s) == len(again.after_s) == 4
         assert min(again.after_s) > 0

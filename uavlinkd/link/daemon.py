@@ -252,6 +252,8 @@ class Daemon:
         parts.stall.turn(now)
         self._supervisor.turn(self.carrier.peers.summary(), now)
         if parts.relay is not None:
+            if parts.fleet is not None:
+                parts.relay.introductions.renew(parts.fleet.trust.held)
             parts.relay.do_housekeeping(now)
             for reason, name, count in parts.relay.count_drops():
                 parts.drops.add("datagrams_dropped", reason, name, count, now)

@@ -64,13 +64,13 @@ def _datagrams(outputs: Sequence[Output]) -> list[bytes]:
     return [output.datagram for output in outputs if isinstance(output, Transmit)]
 
 
-def restart(folder: Path) -> None:
+def restart(folder: Path, *, has_fleet: bool) -> None:
     """Print how long all members are without a relay that is killed and started.
 
     They share a core, which computes for all of them what in flight each computes alone.
     """
     print(f"the core of the relay needs {handshake_ms():.2f} ms for a handshake", flush=True)
-    with crews(folder, MEMBERS // 2, CREWS) as found:
+    with crews(folder, MEMBERS // 2, CREWS, has_fleet=has_fleet) as found:
         _print("first bind", found.do(Members.bind))
         print(f"{MEMBERS} members: {resident_bytes(found.relay.pid) / 1e6:.0f} MB", flush=True)
         for _ in range(RESTARTS):
@@ -94,12 +94,13 @@ def _print(what: str, found: Found) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--restarts-only", action="store_true", help="measure no rates")
+    parser.add_argument("--certificates", action="store_true", help="restarts with members by certificate")
     arguments = parser.parse_args()
     os.sched_setaffinity(0, {LOAD_CORE})
     if not arguments.restarts_only:
         rates()
     with tempfile.TemporaryDirectory() as folder:
-        restart(Path(folder))
+        restart(Path(folder), has_fleet=arguments.certificates)
 
 
 def rates() -> None:

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import time
+from base64 import b64encode
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing import get_context
@@ -14,8 +15,9 @@ from multiprocessing.context import ForkProcess
 from pathlib import Path as FilePath
 from typing import Final, NamedTuple
 
+from tests.authority.signing import AUTHORITY, FLEET, bulletin, signed
 from tests.bench.relay.load import RELAY_CORE, Generator, host
-from tests.bench.relay.volleys import Address, Flow, Hosts, Received
+from tests.bench.relay.volleys import Flow, Hosts, Received
 from tests.daemon.toml import to_toml
 from uavlinkd.config import RelayConfig
 from uavlinkd.config.build import TIMERS
@@ -23,6 +25,7 @@ from uavlinkd.config.keys import decode_key, encode_key, generate_private_key, p
 from uavlinkd.core import constants as c
 from uavlinkd.core import outputs as o
 from uavlinkd.core import wire
+from uavlinkd.core.certificates import Certificate, MemberRole
 from uavlinkd.core.crypto import KeyPair, Secret
 from uavlinkd.core.node import Node
 from uavlinkd.core.path import RELAY_HOST, Path
@@ -43,16 +46,18 @@ AMPLE: Final = {"datagrams_s": 1_000_000, "bits_s": 10_000_000_000}
 class Member:
     """One member: its keys, its session with the relay, and its handle."""
 
-    def __init__(self, number: int, private: bytes, relay_key: bytes, relay: Address, hosts: Hosts) -> None:
+    def __init__(self, number: int, private: bytes, relay: RelayProcess, hosts: Hosts) -> None:
         self.key = KeyPair(private).public
         self.host = host(number)
-        self.relay = relay
+        self.relay = relay.address
         self.hosts = hosts
         now = time.monotonic()
         self.node = Node(Secret(private), os.urandom, now)
-        settings = PeerSettings(RELAY_HOST + "relay", relay_key, None, LINK)
+        certificate = Certificate(FLEET, 2 + number, MemberRole.RELAY, (0, 0), f"member{number}")
+        self.node.set_certificate(signed(certificate, self.key))
+        settings = PeerSettings(RELAY_HOST + "relay", relay.key, None, LINK, is_certified=relay.has_fleet)
         self.link = RelayLink(RelayConfig(settings, ()), self.node, RelayHandles(), lambda keys, now: None, now)
-        self.path = Path(0, relay)
+        self.path = Path(0, self.relay)
         self.handle = 0
         self.bound_at = 0.0
         self.initiations = self.envelopes = 0
@@ -109,9 +114,13 @@ class Member:
 
 
 class RelayProcess:
-    """It can be killed and started again."""
+    """It can be killed and started again.
 
-    def __init__(self, folder: FilePath, keys: Iterable[bytes]) -> None:
+    With ``has_fleet`` its members are those with a certificate. They are relays: there are only 255 system ids.
+    """
+
+    def __init__(self, folder: FilePath, keys: Iterable[bytes], *, has_fleet: bool = False) -> None:
+        self.has_fleet = has_fleet
         private = generate_private_key()
         self.address = "127.0.0.1", free_port()
         self.key = decode_key(public_key_text(private))
@@ -120,10 +129,21 @@ class RelayProcess:
         sections = [
             {"name": f"member{number}", "public_key": encode_key(key), **AMPLE} for number, key in enumerate(keys)
         ]
-        config = {"name": "relay", "private_key_file": "relay.key", "listen": [f"127.0.0.1:{self.address[1]}"]}
-        self._file.write_text(
-            to_toml({**config, "relay_server": AMPLE, "log": {"level": "error"}, "member": sections})
-        )
+        config: dict[str, object] = {
+            "name": "relay",
+            "private_key_file": "relay.key",
+            "listen": [f"127.0.0.1:{self.address[1]}"],
+            "relay_server": AMPLE,
+            "log": {"level": "error"},
+            "member": sections,
+        }
+        if has_fleet:
+            own = signed(Certificate(FLEET, 1, MemberRole.RELAY, (0, 0), "relay"), self.key)
+            parts = {"authority": AUTHORITY.public, "certificate": own, "bulletin": bulletin(1)}
+            config["fleet"] = {name: b64encode(data).decode() for name, data in parts.items()}
+            config["relay_server"] = AMPLE | {f"member_{name}": value for name, value in AMPLE.items()}
+            del config["member"]
+        self._file.write_text(to_toml(config))
         self.start()
 
     def start(self) -> None:
@@ -151,7 +171,7 @@ class Members:
         self.process = relay
         self.hosts = Hosts()
         numbered = enumerate(privates, first)
-        self.members = [Member(number, key, relay.key, relay.address, self.hosts) for number, key in numbered]
+        self.members = [Member(number, key, relay, self.hosts) for number, key in numbered]
         self._by_host = {member.host: member for member in self.members}
 
     def pid(self) -> int:
@@ -245,10 +265,10 @@ def _run(orders: Connection, relay: RelayProcess, privates: Sequence[bytes], fir
 class Crews:
     """A relay, and pairs of members in several processes."""
 
-    def __init__(self, folder: FilePath, pairs: int, processes: int) -> None:
+    def __init__(self, folder: FilePath, pairs: int, processes: int, *, has_fleet: bool) -> None:
         size = 2 * (pairs // processes)
         privates = [os.urandom(c.KEY_BYTES) for _ in range(size * processes)]
-        self.relay = RelayProcess(folder, [KeyPair(private).public for private in privates])
+        self.relay = RelayProcess(folder, [KeyPair(private).public for private in privates], has_fleet=has_fleet)
         self._orders: list[Connection] = []
         self._processes: list[ForkProcess] = []
         for first in range(0, len(privates), size):
@@ -285,9 +305,9 @@ class Crews:
 
 
 @contextmanager
-def crews(folder: FilePath, pairs: int, processes: int) -> Iterator[Crews]:
+def crews(folder: FilePath, pairs: int, processes: int, *, has_fleet: bool = False) -> Iterator[Crews]:
     """A relay and pairs of members that do nothing yet."""
-    all_crews = Crews(folder, pairs, processes)
+    all_crews = Crews(folder, pairs, processes, has_fleet=has_fleet)
     try:
         yield all_crews
     finally:
