@@ -158,7 +158,23 @@ def find_secret_file(name: str, folder: Path, environ: Mapping[str, str]) -> tup
 
 
 def read_secret_file(path: Path, *, credential: bool = False) -> Secret:
-    """The key in a regular file of this process's user or of root that no other user may access.
+    """The key in a file that :func:`read_private_file` accepts.
+
+    Raises:
+        KeyFileError: with the remedy.
+    """
+    content = read_private_file(path, _READ_LIMIT, credential=credential)
+    try:
+        key = decode_key(content.decode("ascii", errors="replace"))
+    except ValueError as error:
+        raise KeyFileError(f"{path}: {error}; the file may contain only the key") from None
+    if not any(key):
+        raise KeyFileError(f"{path}: is all zeros, a key that everyone knows: make another")
+    return Secret(key)
+
+
+def read_private_file(path: Path, limit: int, *, credential: bool = False) -> bytes:
+    """The first bytes of a regular file of this process's user or of root that no other user may access.
 
     A file's owner can always change it and its mode, so a key file of another user is refused (as by sshd).
 
@@ -182,18 +198,11 @@ def read_secret_file(path: Path, *, credential: bool = False) -> Secret:
             raise KeyFileError(f"{path}: is not a regular file")
         if _HAS_OWNERS:
             _check_access(path, status, 0o740 if credential else 0o700)
-        content = os.read(descriptor, _READ_LIMIT)
+        return os.read(descriptor, limit)
     except OSError as error:
         raise KeyFileError(f"{path}: cannot be read: {error.strerror}") from None
     finally:
         os.close(descriptor)
-    try:
-        key = decode_key(content.decode("ascii", errors="replace"))
-    except ValueError as error:
-        raise KeyFileError(f"{path}: {error}; the file may contain only the key") from None
-    if not any(key):
-        raise KeyFileError(f"{path}: is all zeros, a key that everyone knows: make another")
-    return Secret(key)
 
 
 def _check_access(path: Path, status: os.stat_result, allowed: int) -> None:

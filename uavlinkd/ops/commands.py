@@ -88,7 +88,7 @@ def _control_sockets(options: argparse.Namespace) -> list[Path]:
     return sockets
 
 
-def _control_socket(options: argparse.Namespace) -> Path:
+def control_socket(options: argparse.Namespace) -> Path:
     """The control socket of the only daemon.
 
     Raises:
@@ -183,7 +183,7 @@ def _reload(options: argparse.Namespace) -> int:
     def report_wait() -> None:
         print("the daemon has not answered yet: it reads its file, or is busy. Still waiting", file=sys.stderr)
 
-    socket = _control_socket(options)
+    socket = control_socket(options)
     answer = ask(socket, "reload", on_waiting=report_wait)
     if answer["problems"]:
         raise UsageError("\n".join(answer["problems"]))
@@ -195,7 +195,7 @@ def _ping(options: argparse.Namespace) -> int:
     from uavlinkd.ops.control import ask
     from uavlinkd.ops.netcheck import ping
 
-    socket = _control_socket(options)
+    socket = control_socket(options)
     if options.count < 1:
         raise UsageError("--count must be 1 or more")
     return OK if ping(lambda: ask(socket, f"ping {options.peer}"), options.count) else FAILED
