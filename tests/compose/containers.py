@@ -11,9 +11,10 @@ from typing import Any
 
 from tests.compose import images, outages
 from tests.compose.cluster import SYSTEM_IDS, Cluster, run
-from uavlinkd.fleet import operations
+from tests.fleet.vehicles import create
 from uavlinkd.fleet.manifest import FleetSettings
 from uavlinkd.ops.control import ControlError, ask
+from uavlinkd.system.addresses import Address
 
 USER = 10001
 NETWORK = f"10.{64 + os.getpid() % 128}"
@@ -46,16 +47,15 @@ class Containers(Cluster):
 
     async def open(self) -> None:
         settings = FleetSettings(
-            address_plan="{name}:5790",
-            psk=True,
+            swarm=True,
             control_socket="/run/uavlinkd/control.sock",
             ground_station_url="udpin:127.0.0.1:14550",
         )
         fleet = self._folder / "fleet"
-        operations.init(fleet, settings, 3, 1, 0)
+        create(fleet, settings, drones=3, stations=1, at=[Address("ground-station", 5790)])
         if self._mitm:
             replace(fleet / "drone1" / "drone1.toml", '"ground-station:5790"', '"mitm:5801"')
-            replace(fleet / "ground-station" / "ground-station.toml", '"drone1:5790"', '"mitm:5802"')
+            replace(fleet / "drone1" / "drone1.toml", "listen = []", 'listen = ["0.0.0.0:5790"]')
         for path in (fleet, *fleet.rglob("*")):
             os.chown(path, USER, USER)
         for path in (fleet, *fleet.parents):

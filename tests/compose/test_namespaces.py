@@ -13,10 +13,11 @@ import pytest_asyncio
 
 from tests.compose import images, outages
 from tests.compose.cluster import SYSTEM_IDS, Cluster, until
+from tests.fleet.vehicles import create
 from tests.namespaces import Namespace, connect, need_namespaces
-from uavlinkd.fleet import operations
 from uavlinkd.fleet.manifest import FleetSettings
 from uavlinkd.lab.child_processes import end_with_parent
+from uavlinkd.system.addresses import DEFAULT_PORT, Address
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
 
@@ -35,8 +36,9 @@ class Namespaces(Cluster):
         self._processes: list[asyncio.subprocess.Process] = []
 
     async def open(self) -> None:
-        settings = FleetSettings(psk=True, ground_station_url="udpin:127.0.0.1:14550")
-        operations.init(self._folder / "fleet", settings, 3, 1, 0)
+        settings = FleetSettings(swarm=True, ground_station_url="udpin:127.0.0.1:14550")
+        at = Address(self._address("ground-station"), DEFAULT_PORT)
+        create(self._folder / "fleet", settings, drones=3, stations=1, at=[at])
         self._air.open()
         self._air.ip("link add air type bridge", "link set air up")
         for name, host in self._hosts.items():

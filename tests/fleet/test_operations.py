@@ -15,25 +15,30 @@ from typing import Any
 
 import pytest
 
-from tests.fleet.vehicles import loaded
+from tests.fleet.vehicles import NAMES, create, loaded, unasked
 from tests.waiting import PATIENCE_S
+from uavlinkd.authority.enrolment import Request, parse_reply
 from uavlinkd.config import keys
+from uavlinkd.core.certificates import MemberRole
 from uavlinkd.fleet import operations, transaction
+from uavlinkd.fleet.authority_key import AUTHORITY_FILE, SUCCESSOR_FILE
+from uavlinkd.fleet.files import reply_for
 from uavlinkd.fleet.manifest import (
     Fleet,
     FleetError,
     FleetSettings,
-    MemberKind,
+    base64_of,
     check_settings,
     fill,
-    planned_address,
     read_manifest,
 )
+from uavlinkd.fleet.signing import Identity
 from uavlinkd.fleet.transaction import check_members, lock
 from uavlinkd.lab.child_processes import end_with_parent
-from uavlinkd.system.addresses import parse_address
+from uavlinkd.system.addresses import Address
 
 COMMAND = end_with_parent(sys.executable, "-m", "uavlinkd", "fleet", "add", "scout", "--out", "fleet")
+RELAY = Identity(MemberRole.RELAY, None, (Address("198.51.100.9", 5790),))
 
 
 def snapshot(folder: Path) -> dict[str, bytes]:
@@ -51,67 +56,61 @@ def refused(folder: Path, reason: str) -> Iterator[None]:
 
 
 def check_fleet(folder: Path) -> Fleet:
-    """Load every member, check that both ends of every pair agree, and return the fleet."""
+    """Load every member that is here, check its contacts, and return the fleet."""
     fleet = read_manifest(folder)
-    configs = {member.name: loaded(folder, member.name) for member in fleet.members}
-    for member in fleet.members:
-        config = configs[member.name]
-        assert keys.encode_key(config.public_key) == member.public_key
-        peers = {peer.name: peer for peer in config.peers}
-        assert set(peers) == {peer.name for peer in fleet.peers_of(member)}
-        for name, peer in peers.items():
-            assert peer.settings.public_key == configs[name].public_key
-            back = next(other for other in configs[name].peers if other.name == member.name)
-            assert peer.settings.psk == back.settings.psk
-            assert (peer.settings.psk is not None) == fleet.settings.psk
+    for member in fleet.current:
+        if (folder / member.name / f"{member.name}.toml").exists():
+            config = loaded(folder, member.name)
+            assert config.public_key == member.public_key
+            assert config.fleet is not None
+            assert config.fleet.own.certificate == member.certificate
+            contacts = [contact.key for contact in config.fleet.contacts]
+            assert contacts == [contact.public_key for contact in fleet.contacts_of(member.name)]
     return fleet
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A fleet of three drones, a ground station and an observer, with PSKs."""
+    """A fleet of a relay, a ground station, three drones and an observer."""
     folder = tmp_path / "fleet"
-    operations.init(folder, FleetSettings(psk=True), drones=3, ground_stations=1, observers=1)
+    create(folder, drones=3, stations=1, observers=1, relays=(Address("relay.example.org", 5790),))
     return folder
 
 
 def test_every_daemon_accepts_a_new_fleet(folder: Path) -> None:
-    """Each configuration loads without a warning, and both ends of each pair agree on keys."""
+    """Each configuration loads without a warning, and names no member but the relay."""
     fleet = check_fleet(folder)
-    names = ["drone1", "drone2", "drone3", "ground-station", "observer"]
+    names = ["relay", "ground-station", "drone1", "drone2", "drone3", "observer"]
     assert [member.name for member in fleet.members] == names
-    assert [member.system_id for member in fleet.members] == [1, 2, 3, 255, 254]
-    assert all(loaded(folder, name).warnings == () for name in names)
+    assert [member.ids for member in fleet.members] == ["-", "255", "1", "2", "3", "254"]
+    files = snapshot(folder)
+    for member in fleet.members:
+        assert loaded(folder, member.name).warnings == ()
+        of = {
+            path.split("/")[0] for path, content in files.items() if base64_of(member.public_key).encode() in content
+        }
+        assert of - {"fleet.toml"} == ({*names[1:]} if member.name == "relay" else set())
 
 
-def test_roles_are_those_of_the_pair(folder: Path) -> None:
-    """Drones are linked with each other, ground stations and observers; other kinds are not linked."""
-    roles = {
-        (config.name, peer.name): (peer.policy["role"], peer.policy["system_ids"])
-        for config in (loaded(folder, name) for name in ("drone1", "ground-station", "observer"))
-        for peer in config.peers
-    }
-    assert roles == {
-        ("drone1", "drone2"): ("swarm-member", (2,)),
-        ("drone1", "drone3"): ("swarm-member", (3,)),
-        ("drone1", "ground-station"): ("operator", (255,)),
-        ("drone1", "observer"): ("observer", (254,)),
-        **{("ground-station", f"drone{n}"): ("vehicle", (n,)) for n in (1, 2, 3)},
-        **{("observer", f"drone{n}"): ("vehicle", (n,)) for n in (1, 2, 3)},
-    }
+def test_ground_station_stands_in_for_a_relay(tmp_path: Path) -> None:
+    """The first one with an address is the contact of all others, and relays."""
+    create(tmp_path / "fleet", drones=2, stations=2, at=(Address("10.13.0.254", 5790), Address("10.13.0.253", 5790)))
+    fleet = check_fleet(tmp_path / "fleet")
+    assert [member.relays for member in fleet.members] == [True, False, False, False]
+    assert [member.name for member in fleet.contacts_of("drone1")] == ["ground-station1", "ground-station2"]
+    station = loaded(tmp_path / "fleet", "ground-station1")
+    assert station.relay_server is not None
+    assert list(map(str, station.listen)) == ["0.0.0.0:5790", "[::]:5790"]
 
 
 def test_private_keys_are_in_their_own_folder_alone(folder: Path) -> None:
-    """A private key is in one file, with mode 0600, and a PSK in the folders of its pair only."""
+    """A private key is in one file, with mode 0600; the authority's and its successor's too."""
     files = snapshot(folder)
-    for name in ("drone1", "drone2", "drone3", "ground-station", "observer"):
+    for name in (*NAMES, "ground-station", "observer", "relay"):
         key = (folder / name / f"{name}.key").read_bytes().strip()
         assert [path for path, content in files.items() if key in content] == [f"{name}/{name}.key"]
-    for path in folder.rglob("*.psk"):
-        places = {place for place, content in files.items() if path.read_bytes().strip() in content}
-        one, other = path.parent.name, path.stem
-        assert places == {f"{one}/{other}.psk", f"{other}/{one}.psk"}
-    assert {path.stat().st_mode & 0o777 for path in folder.rglob("*.[kp][es][yk]")} == {0o600}
+    secret = [*folder.rglob("*.key"), folder / AUTHORITY_FILE, folder / SUCCESSOR_FILE]
+    assert {path.stat().st_mode & 0o777 for path in secret} == {0o600}
 
 
 @pytest.mark.parametrize("damage", [b"\xff", b"[fleet", b"a = " + b"[" * 5000])
@@ -122,10 +121,41 @@ def test_damaged_manifest_is_refused(tmp_path: Path, damage: bytes) -> None:
         read_manifest(tmp_path)
 
 
+def test_manifest_of_an_earlier_version_is_refused(folder: Path) -> None:
+    """The message says what becomes of its members."""
+    (folder / "fleet.toml").write_text('[fleet]\naddress_plan = "none"\npsk = true\n')
+    with pytest.raises(FleetError, match=r"without an authority\. Its members work as before"):
+        read_manifest(folder)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("next_serial = 7", "next_serial = 6"),
+        ("system_ids = [1, 1]", "system_ids = [7, 7]"),
+        ("relays = true", "relays = 1"),
+        ('role = "observer"', 'role = "operator"'),
+        ("swarm = false", 'swarm = "no"'),
+        ("[[member]]", "[[peer]]"),
+        ('bulletin = "A', 'bulletin = "B'),
+        ("198", "1980"),
+    ],
+)
+def test_altered_manifest_is_refused(folder: Path, old: str, new: str) -> None:
+    """What the authority signed counts: the facts beside a certificate are for persons."""
+    operations.add(folder, "other", RELAY, unasked)
+    path = folder / "fleet.toml"
+    text = path.read_text().replace("next_serial = 8", "next_serial = 7")
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(FleetError):
+        read_manifest(folder)
+
+
 def test_fleet_is_made_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It appears at once, whole, and not if a configuration is not valid. An existing fleet is not changed."""
+    at = (Address("10.13.0.254", 5790),)
     with pytest.raises(FleetError, match="not valid"):
-        operations.init(tmp_path / "a" / "b", FleetSettings(drone_url="udpin:127.0.0.1:5790"), 2, 0, 0)
+        create(tmp_path / "a" / "b", FleetSettings(drone_url="nothing"), drones=2, stations=1, at=at)
     assert list((tmp_path / "a").iterdir()) == []
     rename, appeared = Path.rename, []
 
@@ -137,136 +167,129 @@ def test_fleet_is_made_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.M
 
     with monkeypatch.context() as watched:
         watched.setattr(Path, "rename", watch)
-        operations.init(tmp_path / "fleet", FleetSettings(), 2, 0, 0)
-    assert appeared == [["drone1", "drone2", "fleet.toml"]]
+        create(tmp_path / "fleet", drones=1, stations=1, at=at)
+    assert appeared == [["authority.pem", "drone1", "fleet.toml", "ground-station", "successor.pem"]]
     with refused(tmp_path, "exists already"):
-        operations.init(tmp_path / "fleet", FleetSettings(), 2, 0, 0)
+        create(tmp_path / "fleet")
 
 
 @pytest.mark.parametrize(
     ("settings", "counts", "reason"),
     [
-        (FleetSettings(), (0, 0, 0), "at least one"),
-        (FleetSettings(), (-1, 3, 0), "at least one"),
-        (FleetSettings(), (200, 56, 0), "at most 255"),
-        (FleetSettings(address_plan="10.13.0.0/29"), (7, 0, 0), "no address for drone7"),
-        (FleetSettings(address_plan="10.13.0.1/24"), (1, 0, 0), "neither a network"),
-        (FleetSettings(address_plan="10.13.0.{m}:5790"), (1, 0, 0), "has no address"),
-        (FleetSettings(address_plan="{{}}"), (1, 0, 0), "has no address"),
-        (FleetSettings(suite="rot13"), (1, 0, 0), "suite .* does not exist"),
-        (FleetSettings(control_socket="{x}"), (1, 0, 0), "--control-socket.*only braces"),
+        (FleetSettings(), {"drones": -1}, "at most 255"),
+        (FleetSettings(), {"drones": 200, "stations": 56}, "at most 255"),
+        (FleetSettings(), {"drones": 1}, "drone1 would find no other member"),
+        (FleetSettings(), {"drones": 1, "stations": 1}, "ground-station would find no other member"),
+        (FleetSettings(), {"at": (Address("10.13.0.254", 5790),)}, "more --station-address than --ground-stations"),
+        (FleetSettings(suite="rot13"), {}, "suite .* does not exist"),
+        (FleetSettings(control_socket="{x}"), {}, "--control-socket.*only braces"),
     ],
 )
 def test_impossible_fleets_are_refused(
-    tmp_path: Path, settings: FleetSettings, counts: tuple[int, int, int], reason: str
+    tmp_path: Path, settings: FleetSettings, counts: dict[str, Any], reason: str
 ) -> None:
     """What cannot be is refused with its reason, and nothing is written."""
     with pytest.raises(FleetError, match=reason):
-        operations.init(tmp_path / "fleet", settings, *counts)
+        create(tmp_path / "fleet", settings, **counts)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_added_member_is_known_to_the_others(folder: Path) -> None:
-    """A new drone and every other member are peers, with a PSK for each pair. The others' keys stay."""
+def test_added_member_changes_no_other_file(folder: Path) -> None:
+    """The others learn of it from the relay."""
     before = snapshot(folder)
-    result = operations.add(folder, "scout", MemberKind.DRONE)
-    fleet = check_fleet(folder)
-    assert set(result.changed) == {member.name for member in fleet.members}
-    assert fleet.member("scout").system_id == 4
-    assert str(fleet.member("scout").address) == "10.13.0.4:5790"
+    result = operations.add(folder, "scout", Identity(), unasked)
+    assert check_fleet(folder).member("scout").ids == "4"
+    assert result.changed == ("scout",)
     after = snapshot(folder)
-    assert all(after[path] == content for path, content in before.items() if not path.endswith(".toml"))
+    assert {path for path in after if after[path] != before.get(path)} == {
+        *("fleet.toml", "scout/scout.toml", "scout/scout.key"),
+    }
 
 
-@pytest.mark.parametrize(
-    ("name", "options", "reason"),
-    [
-        ("drone2", {}, "already"),
-        ("../drone9", {}, "is not a name"),
-        ("drone9", {"system_id": 3}, "system id of drone3"),
-        ("drone9", {"system_id": 254}, "address of ground-station"),
-        ("drone9", {"system_id": 256}, "from 1 to 255"),
-    ],
-)
-def test_impossible_members_are_refused(folder: Path, name: str, options: dict[str, int], reason: str) -> None:
-    """The command changes nothing if the member is not possible."""
-    with refused(folder, reason):
-        operations.add(folder, name, MemberKind.DRONE, system_id=options.get("system_id"))
-
-
-def test_removed_member_is_forgotten_by_the_others(folder: Path) -> None:
-    """No other folder contains its key or a PSK with it. Its own folder is kept."""
-    result = operations.remove(folder, "drone2")
-    assert set(result.changed) == {"drone1", "drone3", "ground-station", "observer"}
+def test_new_contact_is_written_into_the_files_that_are_here(folder: Path, tmp_path: Path) -> None:
+    """The command names the members whose files are elsewhere."""
+    (folder / "drone1").rename(tmp_path / "drone1")
+    result = operations.add(folder, "other", RELAY, unasked)
     check_fleet(folder)
-    key = keys.public_key_text((folder / "drone2" / "drone2.key").read_text())
-    left = {path: content for path, content in snapshot(folder).items() if not path.startswith("drone2/")}
-    assert not [path for path, content in left.items() if key.encode() in content]
-    assert not [path for path in left if path.endswith("drone2.psk")]
+    assert [contact.name for contact in read_manifest(folder).contacts_of("drone2")] == ["relay", "other"]
+    assert {"other", "relay", "drone2", "drone3", "ground-station", "observer"} == set(result.changed)
+    assert ["For drone1, `uavlinkd fleet sign NAME` prints" in note for note in result.notes] == [True]
+    assert not (folder / "drone1").exists()
+    line = operations.line_of(folder, "drone1")
+    assert [contact.addresses for contact in parse_reply(line).contacts][1] == ("198.51.100.9:5790",)
 
 
-def test_removed_key_is_found_under_another_name(folder: Path) -> None:
-    """The user renamed a peer, or added one: the error names file and section, and the command changes nothing."""
-    path = folder / "drone2" / "drone2.toml"
-    path.write_text(path.read_text().replace('name = "drone1"', 'name = "scout"'))
-    with refused(folder, r"drone2\.toml: peer\[0\] \(scout\) has the key of drone1"):
-        operations.remove(folder, "drone1")
-    with refused(folder, r"drone2\.toml: it has no \[\[peer\]\] with the name .drone1."):
-        operations.rotate(folder, "drone1")
-    text = path.read_text().replace('name = "scout"', 'name = "drone1"')
-    key = read_manifest(folder).member("drone1").public_key
-    path.write_text(f'{text}\n[[peer]]\nname = "second"\npublic_key = " {key}"\nrole = "all"\nsystem_ids = [9]\n')
-    with pytest.raises(FleetError, match=r"peer\[4\] \(second\) has the key of drone1"):
-        operations.rotate(folder, "drone1")
-    path.write_text(text)
-    operations.remove(folder, "drone1")
-    check_fleet(folder)
+def test_signed_request_is_in_the_manifest_before_its_line_is_printed(folder: Path) -> None:
+    """The same request again changes nothing, and gets the same certificate."""
+    request = Request("v7", keys.decode_key(keys.public_key_text(keys.generate_private_key())))
+    result, line = operations.sign(folder, request, Identity(ids=(70, 79)), unasked)
+    fleet = read_manifest(folder)
+    assert fleet == result.fleet
+    assert fleet.member("v7").ids == "70-79"
+    assert line == reply_for(fleet, fleet.member("v7")).line() == operations.line_of(folder, "v7")
+    assert operations.sign(folder, request, Identity(), unasked) == (operations.Result(fleet), line)
+    with refused(folder, "already"):
+        operations.sign(folder, request, Identity(ids=(7, 7)), unasked)
+    operations.revoke(folder, "v7", unasked)
+    with refused(folder, "is that of v7, which is revoked"):
+        operations.sign(folder, request, Identity(), unasked)
+
+
+def test_revoked_member_frees_its_name(folder: Path) -> None:
+    """Its folder is kept; a new member may have its name and id, with another key."""
+    operations.revoke(folder, "drone2", unasked)
+    fleet = check_fleet(folder)
+    assert fleet.bulletin.revoked == (4,)
+    assert "drone2" not in [member.name for member in fleet.current]
+    assert (folder / "drone2" / "drone2.key").exists()
+    with refused(folder, 'has no "drone2"'):
+        operations.rotate(folder, "drone2", unasked)
+    (folder / "drone2").rename(folder / "away")
+    operations.add(folder, "drone2", Identity(ids=(2, 2)), unasked)
+    assert check_fleet(folder).member("drone2").certificate.serial == 7
+
+
+def test_key_of_another_authority_is_refused(folder: Path, tmp_path: Path) -> None:
+    """It would sign what no member accepts."""
+    create(tmp_path / "other", relays=(Address("198.51.100.9", 5790),))
+    shutil.copyfile(tmp_path / "other" / AUTHORITY_FILE, folder / AUTHORITY_FILE)
+    with refused(folder, "is the key of another fleet's authority"):
+        operations.revoke(folder, "drone1", unasked)
 
 
 def test_edits_of_the_user_are_kept(folder: Path) -> None:
-    """Changed keys and comments in a file are kept when members are added, removed and rotated."""
+    """Changed keys and comments in a file are kept when contacts and its own key change."""
     path = folder / "drone1" / "drone1.toml"
-    text = path.read_text().replace(
-        'role = "operator"\n',
-        'role = "operator"  # our captain\ndeny_in = ["files",\n  "MAV_CMD_DO_FLIGHTTERMINATION"]\n',
-    )
-    path.write_text(text + "\n[log]\nlevel = 'warning'  # quiet\n")
-    operations.add(folder, "scout", MemberKind.DRONE)
-    operations.remove(folder, "drone3")
-    operations.rotate(folder, "drone2")
+    text = path.read_text().replace("[fleet]\n", '[fleet]  # ours\ndeny = ["drone9",\n  "drone8"]\n')
+    path.write_text(text.replace("confidential = true", "confidential = false  # amateur radio"))
+    path.write_text(path.read_text() + "\n[log]\nlevel = 'warning'  # quiet\n")
+    operations.add(folder, "other", RELAY, unasked)
+    operations.rotate(folder, "drone1", unasked)
+    operations.revoke(folder, "relay", unasked, resign=True)
     after = path.read_text()
-    assert "# our captain" in after
-    assert "level = 'warning'  # quiet" in after
+    for kept in ("[fleet]  # ours", "confidential = false  # amateur radio", "level = 'warning'  # quiet"):
+        assert kept in after
     table = tomllib.loads(after)
-    assert [peer["name"] for peer in table["peer"]] == ["drone2", "ground-station", "observer", "scout"]
-    assert table["peer"][1]["deny_in"] == ["files", "MAV_CMD_DO_FLIGHTTERMINATION"]
-    assert table["log"] == {"level": "warning"}
+    assert table["fleet"]["deny"] == ["drone9", "drone8"]
+    assert [contact["addresses"] for contact in table["contact"]] == [["198.51.100.9:5790"]]
     check_fleet(folder)
 
 
 def test_files_that_cannot_be_edited_safely_are_refused(folder: Path) -> None:
     """The command changes nothing if editing by lines would change something else."""
     path = folder / "drone3" / "drone3.toml"
-    path.write_text(path.read_text() + 'description = """\n[[peer]]\nname = "drone1"\n[x]\n"""\n')
+    path.write_text(path.read_text().replace("[link]", '[link]\nx = """\n[[contact]]\n[x]\n"""', 1))
     with refused(folder, "cannot be kept"):
-        operations.remove(folder, "drone1")
-
-
-def test_folders_on_their_vehicles_are_not_needed(folder: Path, tmp_path: Path) -> None:
-    """A missing configuration is written completely, so that it can replace the one on the vehicle."""
-    (folder / "drone1").rename(tmp_path / "drone1")
-    operations.add(folder, "scout", MemberKind.DRONE)
-    (folder / "drone1" / "drone1.toml").replace(tmp_path / "drone1" / "drone1.toml")
-    (folder / "drone1" / "scout.psk").replace(tmp_path / "drone1" / "scout.psk")
-    (folder / "drone1").rmdir()
-    (tmp_path / "drone1").rename(folder / "drone1")
-    check_fleet(folder)
+        operations.add(folder, "other", RELAY, unasked)
+    path.write_text("[fleet")
+    with refused(folder, r"drone3\.toml: it is not a configuration"):
+        operations.add(folder, "other", RELAY, unasked)
 
 
 ACTIONS: dict[str, Callable[[Path], object]] = {
-    "add": lambda folder: operations.add(folder, "scout", MemberKind.DRONE),
-    "remove": lambda folder: operations.remove(folder, "drone1"),
-    "rotate": lambda folder: operations.rotate(folder, "drone1"),
+    "add": lambda folder: operations.add(folder, "scout", RELAY, unasked),
+    "revoke": lambda folder: operations.revoke(folder, "drone1", unasked, resign=True),
+    "rotate": lambda folder: operations.rotate(folder, "drone1", unasked),
 }
 
 
@@ -320,48 +343,30 @@ def test_interrupted_command_changes_nothing(folder: Path, monkeypatch: pytest.M
 
     monkeypatch.setattr(keys, "_sync_folder", interrupt)  # the longest wait of the command
     with pytest.raises(KeyboardInterrupt):
-        operations.rotate(folder, "drone1")
+        operations.rotate(folder, "drone1", unasked)
     assert snapshot(folder) == before
 
 
 def test_rotation_works_without_the_old_key(folder: Path, tmp_path: Path) -> None:
     """It is on the vehicle only. The new files replace those there."""
     (folder / "drone1").rename(tmp_path / "drone1")
-    result = operations.rotate(folder, "drone1")
-    assert any("drone1.toml was not here" in note for note in result.notes)
+    result = operations.rotate(folder, "drone1", unasked)
+    assert result.changed == ("drone1",)
     check_fleet(folder)
-
-
-def test_rotation_that_an_earlier_version_began_is_refused(folder: Path) -> None:
-    """The message says what to delete."""
-    path = folder / "fleet.toml"
-    key = read_manifest(folder).member("drone1").public_key
-    path.write_text(
-        path.read_text().replace('name = "drone1"\n', f'name = "drone1"\nprevious_public_key = "{key}"\n')
-    )
-    with refused(folder, "the key of drone1 was being rotated, .* delete previous_public_key"):
-        operations.remove(folder, "drone2")
-
-
-@pytest.mark.parametrize("address", ["0.0.0.0:5790", "10.13.0.200:14550"])
-def test_member_with_a_configuration_that_is_not_valid_is_not_added(folder: Path, address: str) -> None:
-    """The command refuses configurations that `uavlinkd check` refuses, and changes nothing."""
-    with refused(folder, "not valid"):
-        operations.add(folder, "scout", MemberKind.DRONE, address=parse_address(address, allow_names=False))
-    with refused(folder, "1 to 255"):
-        operations.add(folder, "scout", MemberKind.DRONE, system_id=0)
 
 
 def test_rotated_key_is_removed_everywhere(folder: Path) -> None:
-    """A rotation replaces the key and the member's PSKs in all folders."""
-    old = {path: content for path, content in snapshot(folder).items() if path.startswith("drone1/")}
-    operations.rotate(folder, "drone1")
-    check_fleet(folder)
-    secrets = [content for path, content in old.items() if not path.endswith(".toml")]
-    public = keys.public_key_text(old["drone1/drone1.key"].decode())
-    for content in snapshot(folder).values():
-        assert public.encode() not in content
-        assert content not in secrets
+    """Its certificate is revoked by the same bulletin; name and ids stay."""
+    old = read_manifest(folder).member("drone1")
+    secret = (folder / "drone1" / "drone1.key").read_bytes()
+    operations.rotate(folder, "drone1", unasked)
+    fleet = check_fleet(folder)
+    new = fleet.member("drone1")
+    assert (new.certificate.system_ids, new.certificate.serial) == (old.certificate.system_ids, 7)
+    assert fleet.bulletin.revoked == (old.certificate.serial,)
+    for path, content in snapshot(folder).items():
+        assert content != secret
+        assert path == "fleet.toml" or base64_of(old.public_key).encode() not in content
 
 
 @pytest.mark.parametrize(
@@ -384,8 +389,6 @@ def test_anything_else_in_braces_is_refused(template: str) -> None:
     """Attributes, items, positions, conversions, widths and unpaired braces; the error names the option."""
     with pytest.raises(FleetError, match=r"\{n\} and \{name\}"):
         fill(template, 7, "scout")
-    with pytest.raises(FleetError, match="address plan"):
-        planned_address(f"{{name}}{template}:5790", "scout", 7, is_drone=True)
     for key in ("control_socket", "drone_url", "ground_station_url"):
         settings: dict[str, str] = {key: f"/run/{template}"}
         with pytest.raises(FleetError, match=f"--{key.replace('_', '-')}"):
@@ -397,9 +400,9 @@ def test_anything_else_in_braces_is_refused(template: str) -> None:
 def test_second_command_waits_for_the_first(tmp_path: Path, is_interrupted: bool) -> None:
     """It reads the files only when it has the lock, so it keeps the first's change. Ctrl-C ends the wait."""
     fleet, changed = tmp_path / "fleet", tmp_path / "changed"
-    operations.init(fleet, FleetSettings(), drones=2, ground_stations=0, observers=0)
+    create(fleet, drones=1, relays=(Address("198.51.100.7", 5790),))
     shutil.copytree(fleet, changed)
-    operations.add(changed, "relay", MemberKind.DRONE)
+    operations.add(changed, "other", Identity(), unasked)
     with ExitStack() as stack:
         held = stack.enter_context(ExitStack())
         held.enter_context(lock(fleet))
@@ -416,6 +419,6 @@ def test_second_command_waits_for_the_first(tmp_path: Path, is_interrupted: bool
             held.close()
         assert second.wait(PATIENCE_S) == is_interrupted
     members = read_manifest(fleet).members
-    assert [member.name for member in members] == ["drone1", "drone2", "relay", *["scout"] * (not is_interrupted)]
-    assert len({member.system_id for member in members}) == len(members)
+    assert [member.name for member in members] == ["relay", "drone1", "other", *["scout"] * (not is_interrupted)]
+    assert len({member.certificate.serial for member in members}) == len(members)
     check_members(fleet, members)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.fleet.vehicles import Vehicles, flying
+from tests.fleet.vehicles import RELAY, Vehicles, flying
 from tests.kernel_queues import cpu_s as cpu_s_of
 from uavlinkd.fleet.manifest import read_manifest
 
@@ -31,7 +31,9 @@ OWN_BYTES = 96 << 20
 async def test_every_pair_of_a_swarm_is_linked() -> None:
     """Each pair has a session at a limited cost, and a daemon's memory grows little with its peers."""
     async with flying(drones=DRONES, started=False) as vehicles:
-        names = [member.name for member in read_manifest(vehicles.fleet).members]
+        names = [member.name for member in read_manifest(vehicles.fleet).members if member.name != RELAY]
+        vehicles.carry(RELAY)
+        await vehicles.start(RELAY)
         for name in names:
             config = vehicles.fleet / name / f"{name}.toml"
             config.write_text(config.read_text().replace("[link]\n", PATIENT_LINK))
@@ -50,9 +52,10 @@ async def test_every_pair_of_a_swarm_is_linked() -> None:
 
 async def until_linked(vehicles: Vehicles) -> None:
     """Wait until each daemon reports all others that run as up."""
-    for name in vehicles.pids:
+    running = vehicles.pids.keys() - {RELAY}
+    for name in running:
         while True:
-            if sum(peer["state"] == "up" for peer in vehicles.peers(name).values()) >= len(vehicles.pids) - 1:
+            if vehicles.up(name) >= running - {name}:
                 break
             await asyncio.sleep(0.25)
 

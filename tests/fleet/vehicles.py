@@ -7,7 +7,7 @@ import shutil
 import signal
 import sys
 import tempfile
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -15,8 +15,10 @@ from typing import Any
 from tests.waiting import until
 from uavlinkd.config import Config
 from uavlinkd.config.load import load_config
+from uavlinkd.core.certificates import MemberRole
+from uavlinkd.core.crypto import Secret
 from uavlinkd.fleet import operations
-from uavlinkd.fleet.manifest import NO_PLAN, FleetSettings, read_manifest
+from uavlinkd.fleet.manifest import FleetSettings, base64_of, read_manifest
 from uavlinkd.lab.child_processes import end_with_parent
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.ops.control import ControlError, ask
@@ -33,16 +35,36 @@ def loaded(folder: Path, name: str) -> Config:
     return load_config(folder / name / f"{name}.toml", {})
 
 
+def unasked(what: str) -> Secret:
+    """In place of a passphrase: the keys of these tests have none."""
+    raise AssertionError(what)
+
+
+def create(
+    folder: Path,
+    settings: FleetSettings | None = None,
+    *,
+    relays: Sequence[Address] = (),
+    at: Sequence[Address] = (),
+    **counts: int,
+) -> None:
+    """A fleet of so many ``drones``, ``stations`` and ``observers``, with a key that is not encrypted.
+
+    ``at``: addresses of the first ground stations.
+    """
+    roles = {"drones": MemberRole.VEHICLE, "stations": MemberRole.OPERATOR, "observers": MemberRole.OBSERVER}
+    members = {role: counts.get(name, 0) for name, role in roles.items()}
+    operations.init(folder, settings or FleetSettings(), members, (relays, at), None)
+
+
 class Vehicles:
     """Daemons with their own folders. Files are copied there from the fleet's folder."""
 
-    def __init__(self, folder: Path, drones: int, *, with_relay: bool = False) -> None:
+    def __init__(self, folder: Path, drones: int) -> None:
         self._folder = folder
         self.fleet = folder / "fleet"
-        plan = NO_PLAN if with_relay else f"127.0.14.{{n}}:{free_port()}"
-        settings = FleetSettings(address_plan=plan, drone_url=f"udpin:127.0.14.{{n}}:{free_port()}", psk=True)
-        relays = [Address("127.0.0.1", free_port())] if with_relay else []
-        operations.init(self.fleet, settings, drones, 0, 0, relays)
+        settings = FleetSettings(swarm=True, drone_url=f"udpin:127.0.14.{{n}}:{free_port()}")
+        create(self.fleet, settings, drones=drones, relays=[Address("127.0.0.1", free_port())])
         self._processes: dict[str, asyncio.subprocess.Process] = {}
 
     @property
@@ -57,7 +79,7 @@ class Vehicles:
     def carry(self, name: str) -> None:
         """Replace the files on a vehicle."""
         for path in self.place(name).glob("*") if self.place(name).exists() else ():
-            if path.suffix != ".sock":
+            if path.suffix in (".toml", ".key"):
                 path.unlink()
         shutil.copytree(self.fleet / name, self.place(name), dirs_exist_ok=True)
 
@@ -99,14 +121,27 @@ class Vehicles:
         peers: dict[str, dict[str, Any]] = self.status(name).get("peers", {})
         return peers
 
+    def up(self, name: str) -> set[str]:
+        """The peers and members that are up, as a daemon says."""
+        status = self.status(name)
+        members = (status.get("relay") or {}).get("members", {})
+        up = {peer for peer, facts in self.peers(name).items() if facts["state"] == "up"}
+        return up | {member for member, facts in members.items() if facts["is_up"]}
+
+    def drops(self, name: str) -> int:
+        """The number of initiations of revoked members that a daemon dropped."""
+        return int(self.status(name).get("drops", {}).get("certificate_revoked", 0))
+
     async def until_linked(self) -> None:
         """Wait until both ends of every pair are linked by the keys of the fleet's folder."""
-        public = {member.name: member.public_key for member in read_manifest(self.fleet).members}
+        public = {member.name: base64_of(member.public_key) for member in read_manifest(self.fleet).current}
 
         def is_linked(name: str) -> bool:
             peers = self.peers(name)
-            return len(peers) == len(NAMES) - 1 and all(
-                status["state"] == "up" and status["public_key"] == public[peer] for peer, status in peers.items()
+            return all(
+                other in peers and peers[other]["state"] == "up" and peers[other]["public_key"] == public[other]
+                for other in NAMES
+                if other != name
             )
 
         await until(lambda: all(map(is_linked, NAMES)))
@@ -133,17 +168,15 @@ async def end(process: asyncio.subprocess.Process) -> int:
 
 
 @asynccontextmanager
-async def flying(
-    *, drones: int = len(NAMES), with_relay: bool = False, started: bool = True
-) -> AsyncIterator[Vehicles]:
-    """Linked drones; ``with_relay``: they have no addresses, and meet at a relay.
+async def flying(*, drones: int = len(NAMES), started: bool = True) -> AsyncIterator[Vehicles]:
+    """Linked drones, which meet at a relay.
 
     Their folder has a short name, because the path of a Unix socket has to be short.
     """
     with tempfile.TemporaryDirectory(prefix="uavlinkd-") as folder:
-        vehicles = Vehicles(Path(folder), drones, with_relay=with_relay)
+        vehicles = Vehicles(Path(folder), drones)
         try:
-            for name in (*NAMES, *([RELAY] if with_relay else [])) if started else ():
+            for name in (RELAY, *NAMES) if started else ():
                 vehicles.carry(name)
                 await vehicles.start(name)
             if started:

@@ -252,61 +252,48 @@ def _fleet(*arguments: str) -> Make:
 
     async def make(scene: Scene) -> None:
         folder = scene.stage.folder / f"fleet{scene.row}"
-        said("fleet", "init", "--drones", "2", "--out", str(folder))
+        said("fleet", "init", *_RELAY, "--drones", "2", "--no-passphrase", "--out", str(folder))
         out = [] if "--out" in arguments else ["--out", str(folder)]
         scene.command = said("fleet", *(word.replace("FLEET", str(folder)) for word in arguments), *out)
 
     return make
 
 
-_NEW = ("--out", "FLEET/new")
+_RELAY = ("--relay", "relay.example.org:5790")
+_NEW = ("--no-passphrase", "--out", "FLEET/new")
 _FLEET: tuple[tuple[str, str, str, Make], ...] = (
     (
         "56a",
         "fleet init over a fleet",
         r"exists already: choose the name of a new folder",
-        _fleet("init", "--drones", "2", "--out", "FLEET"),
+        _fleet("init", "--no-passphrase", "--out", "FLEET"),
     ),
-    (
-        "56b",
-        "fleet without members",
-        r"at least one member",
-        _fleet("init", "--drones", "0", "--ground-stations", "0", *_NEW),
-    ),
+    ("56b", "fleet whose members would not meet", r"needed \(init --relay", _fleet("init", "--drones", "2", *_NEW)),
     ("56c", "fleet of 300", r"at most 255 members", _fleet("init", "--drones", "300", *_NEW)),
     (
         "56d",
         "unknown suite",
         r"does not exist: use one of x25519",
-        _fleet("init", "--drones", "2", "--suite", "rsa", *_NEW),
+        _fleet("init", "--suite", "rsa", *_NEW),
     ),
-    (
-        "56e",
-        "address plan without numbers",
-        r"nor a template such as 10\.13\.0\.\{n\}:5790",
-        _fleet("init", "--drones", "2", "--address-plan", "10.13.0", *_NEW),
-    ),
-    (
-        "56f",
-        "address plan with one address",
-        r"nor a template such as 10\.13\.0\.\{n\}:5790",
-        _fleet("init", "--drones", "2", "--address-plan", "10.13.0.1:5790", *_NEW),
-    ),
+    ("56e", "relay without a port", r"--relay: has no port", _fleet("init", "--relay", "relay.example.org", *_NEW)),
+    ("56f", "address of no machine", r"write the one that the others", _fleet("init", "--relay", "0.0.0.0:1", *_NEW)),
     (
         "56g",
-        "network that is too small",
-        r"use a larger one",
-        _fleet("init", "--drones", "9", "--address-plan", "10.13.0.0/30", *_NEW),
+        "address without a ground station",
+        r"more --station-address than --ground-stations",
+        _fleet("init", "--station-address", "10.13.0.254:5790", *_NEW),
     ),
     ("56h", "name that exists", r'has a "drone1" already', _fleet("add", "drone1")),
-    ("56i", "name with a space", r"write up to 63 letters", _fleet("add", "drone 9")),
+    ("56i", "name with a space", r"write 1 to 21 of a-z", _fleet("add", "drone 9")),
     (
         "56j",
         "system id that is taken",
         r"would have the system id of drone1",
-        _fleet("add", "scout", "--system-id", "1"),
+        _fleet("add", "scout", "--id", "1"),
     ),
-    ("56k", "unknown member", r'has no "drone9": its members are', _fleet("remove", "drone9")),
+    ("56k", "unknown member", r'has no "drone9": its members are', _fleet("revoke", "drone9")),
+    ("56l", "name that looks like another", r'looks like "drone1"', _fleet("add", "dronel")),
 )
 
 

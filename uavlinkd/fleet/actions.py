@@ -1,80 +1,233 @@
-"""The fleet commands: they take the parsed options, print the changes, and return the exit status."""
+"""The fleet commands: they take the parsed options, print what changed, and return the exit status.
+
+Lines for pipes go to standard output, all else about them to standard error.
+"""
 
 from __future__ import annotations
 
 import argparse
-import os
+import sys
+from collections.abc import Callable, Iterable
 from dataclasses import fields
+from pathlib import Path
 
-from uavlinkd.fleet import operations
-from uavlinkd.fleet.manifest import DEFAULT_PLAN, NO_PLAN, FleetError, FleetSettings, MemberKind
+from uavlinkd.authority.enrolment import LONGEST_LINE, EnrolmentError, fingerprint_of, parse_request
+from uavlinkd.core.certificates import MemberRole
+from uavlinkd.fleet import enrolling, operations
+from uavlinkd.fleet.authority_key import (
+    AUTHORITY_FILE,
+    SUCCESSOR_FILE,
+    Passphrase,
+    paper_copy,
+    passphrase_from,
+    read_paper,
+)
+from uavlinkd.fleet.files import config_file
+from uavlinkd.fleet.manifest import (
+    Fleet,
+    FleetError,
+    FleetSettings,
+    Member,
+    base64_of,
+    parse_addresses,
+    read_manifest,
+)
 from uavlinkd.fleet.operations import Result
+from uavlinkd.fleet.publishing import publish
+from uavlinkd.fleet.signing import Identity
 from uavlinkd.mavlink.dialect import SYSTEM_ID
-from uavlinkd.system.addresses import Address, AddressError, parse_address
+from uavlinkd.ops.commands import control_socket
 from uavlinkd.system.terminal import OK, printable
+
+_SET_IDS = f"Set {SYSTEM_ID} of each autopilot, and the id of each ground control station, to the id above"
 
 
 def act(options: argparse.Namespace) -> int:
-    """Run ``options.action``, and print the fleet and what to do next."""
-    _print_result(options, _run(options))
+    """Run ``options.action``."""
+    _ACTIONS[options.action](options)
     return OK
 
 
-def _run(options: argparse.Namespace) -> Result:
-    if options.action == "add":
-        address = None if options.address is None else _address("--address", options.address)
-        kind = MemberKind(options.kind)
-        return operations.add(options.out, options.name, kind, address=address, system_id=options.system_id)
-    if options.action == "remove":
-        return operations.remove(options.out, options.name)
-    if options.action == "rotate":
-        return operations.rotate(options.out, options.name)
-    relays = [_address("--relay", text) for text in options.relay]
-    given = {key.name: getattr(options, key.name) for key in fields(FleetSettings)}
-    given["address_plan"] = options.address_plan or (NO_PLAN if relays else DEFAULT_PLAN)
-    counts = options.drones, options.ground_stations, options.observers
-    return operations.init(options.out, FleetSettings(**given), *counts, relays)
+def _init(options: argparse.Namespace) -> None:
+    settings = FleetSettings(**{key.name: getattr(options, key.name) for key in fields(FleetSettings)})
+    counts = {
+        MemberRole.VEHICLE: options.drones,
+        MemberRole.OPERATOR: options.ground_stations,
+        MemberRole.OBSERVER: options.observers,
+    }
+    places = parse_addresses("--relay", options.relay), parse_addresses("--station-address", options.station_address)
+    result, private = operations.init(options.out, settings, counts, places, _new_passphrase(options))
+    _print_result(options, result)
+    _say(f"\n{options.out / AUTHORITY_FILE} signs members: back it up. Its paper copy, for a safe:")
+    _say(paper_copy(private) if sys.stdout.isatty() else "(printed on a terminal only)")
+    _say(f"Carry {options.out / SUCCESSOR_FILE} to another place: it can follow the authority's key after a theft.")
 
 
-def _address(option: str, text: str) -> Address:
+def _new_passphrase(options: argparse.Namespace) -> Passphrase | None:
+    if not options.no_passphrase:
+        return passphrase_from(options.passphrase_file, is_new=True)
+    _note(f"{options.out / AUTHORITY_FILE} has no passphrase: each copy of it can sign members of this fleet")
+    return None
+
+
+def _sign(options: argparse.Namespace) -> None:
+    if options.name is not None:
+        print(operations.line_of(options.out, options.name))
+        return
     try:
-        return parse_address(text, allow_names=True)
-    except AddressError as error:
-        raise FleetError(f"{option}: {error}") from None
+        request = parse_request(_line())
+    except EnrolmentError as error:
+        raise FleetError(f"the line {error}") from None
+    ask = passphrase_from(options.passphrase_file)
+    result, line = operations.sign(options.out, request, _identity(options), ask, replaces=options.replace)
+    print(line)
+    member = result.fleet.member(request.name)
+    _note(f"signed {member.name}: {_role(member.role)}, system id {member.ids}, serial {member.certificate.serial}")
+    _note(
+        f"fleet {fingerprint_of(result.fleet.authority.public)}: `enroll --finish` prints the same on {member.name}"
+    )
+    for note in (*_to_carry(options, result), *result.notes):
+        _note(note)
+
+
+def _identity(options: argparse.Namespace) -> Identity:
+    try:
+        ends = [int(end) for end in (options.ids or f"{options.id or 0}").split("-")]
+    except ValueError:
+        raise FleetError("--ids is not a range of system ids: write it as 10-12") from None
+    role = None if options.role is None else MemberRole[options.role.upper()]
+    is_given = options.id is not None or options.ids is not None
+    return Identity(role, (ends[0], ends[-1]) if is_given else None, parse_addresses("--address", options.address))
+
+
+def _change(options: argparse.Namespace) -> None:
+    """Run ``add``, ``rotate``, ``revoke`` or ``remove``."""
+    ask = passphrase_from(options.passphrase_file)
+    if options.action == "add":
+        result = operations.add(options.out, options.name, _identity(options), ask)
+    elif options.action == "rotate":
+        result = operations.rotate(options.out, options.name, ask)
+    else:
+        socket = control_socket(options) if options.action == "remove" else None
+        resign = options.action == "revoke" and options.resign
+        result = operations.revoke(options.out, options.name, ask, resign=resign)
+        if socket is not None:
+            _published(publish(options.out, socket, ask))
+    _print_result(options, result)
+    if options.action in ("revoke", "rotate"):
+        _say("Now publish the bulletin with `uavlinkd fleet publish`: until then members accept the old certificate.")
+
+
+def _publish(options: argparse.Namespace) -> None:
+    ask = passphrase_from(options.passphrase_file)
+    _published(publish(options.out, control_socket(options), ask, merges=options.merge))
+
+
+def _published(fleet: Fleet) -> None:
+    _say(f"The daemon has bulletin {fleet.bulletin.number}, and passes it on.")
+
+
+def _restore(options: argparse.Namespace) -> None:
+    text = sys.stdin.read(LONGEST_LINE)
+    operations.restore(options.out, read_paper(text), _new_passphrase(options))
+    _say(f"{options.out / AUTHORITY_FILE} is the fleet's authority.")
+
+
+def _enroll(options: argparse.Namespace) -> None:
+    if options.finish is None:
+        if options.name is None:
+            raise FleetError("name the new member: `uavlinkd enroll NAME`")
+        place = enrolling.MemberFiles(options.config or Path(config_file(options.name)), options.keys)
+        line, key = enrolling.request(options.name, place)
+        print(line)
+        _note(f"the private key is {key}. Give this line to `uavlinkd fleet sign`, and its line to `enroll --finish`")
+        return
+    line = options.finish or _line()
+    done = enrolling.finish(line, options.config, options.keys, options.url, options.listen)
+    certificate = done.certificate
+    first, last = certificate.system_ids
+    ids = f"system id {first}" + (f" to {last}" if last > first else "")
+    _say(f"{certificate.name} is a member of fleet {done.fingerprint}: compare this with the line of `fleet sign`.")
+    _say(f"{done.config}: {_role(certificate.role)}, contacts {', '.join(done.contacts) or 'none'}")
+    if first:
+        _say(f"Set {SYSTEM_ID} of the autopilot, or the id of the ground control station, to {ids}.")
+    _say(f"Then: uavlinkd run --config {done.config}; if the daemon runs already, restart it.")
+    if done.former_key is not None:
+        _say(f"The former key, {done.former_key}, was deleted.")
+
+
+def _line() -> str:
+    try:
+        return sys.stdin.readline(LONGEST_LINE)
+    except UnicodeDecodeError:
+        return ""
 
 
 def _print_result(options: argparse.Namespace, result: Result) -> None:
     """Print the fleet as a table, and what to do next."""
-    rows = [("name", "kind", "id", "address", "public key")]
-    for member in result.fleet.members:
-        address = "(initiates)" if member.address is None else str(member.address)
-        key = f"{member.public_key[:8]}..."
-        rows.append((member.name, member.kind.value, str(member.system_id or "-"), address, key))
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        _print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
-    is_all = {member.name for member in result.fleet.members} <= set(result.changed)
-    changed = "all folders" if is_all else ", ".join(result.changed)
+    _print_table(result.fleet, result.fleet.current)
     if result.changed:
-        _print(f"\nChanged in {options.out}: {changed}. Carry each to its owner so that no other person can read it.")
-        _print(
-            f"Set {SYSTEM_ID} of each autopilot, and the id of each ground control station, to the id above: peers"
-            " refuse frames with another id."
-        )
+        _say("")
+    for text in _to_carry(options, result):
+        _say(text)
+    if result.changed:
+        _say(f"{_SET_IDS}: others refuse frames with another id.")
         # The units make this folder.
         is_service = result.fleet.settings.control_socket.startswith("/run/uavlinkd/{name}/")
         start = "systemctl enable --now uavlinkd@NAME" if is_service else "uavlinkd run --config NAME.toml"
-        _print(
-            f"On each machine: {start}. If the daemon runs already: uavlinkd reload, or SIGHUP"
-            " (restart it if systemd gives it new keys)."
-        )
+        _say(f"On each machine: {start}. If the daemon runs already, restart it.")
     for note in result.notes:
-        _print(note)
-    if options.action == "rotate":
-        _print(f"Restart {options.name}: its links are down until it and the others have their files.")
-    if options.action == "remove" and os.path.exists(folder := options.out / options.name):
-        _print(f"{folder} was kept: delete it when you no longer need it.")
+        _say(note)
 
 
-def _print(text: str) -> None:
+def _to_carry(options: argparse.Namespace, result: Result) -> list[str]:
+    is_all = {member.name for member in result.fleet.current} <= set(result.changed)
+    changed = "all folders" if is_all else ", ".join(result.changed)
+    carry = f"Changed in {options.out}: {changed}. Carry each to its owner so that no other person can read it."
+    return [carry] if result.changed else []
+
+
+def _list(options: argparse.Namespace) -> None:
+    fleet = read_manifest(options.out)
+    _say(f"fleet {fingerprint_of(fleet.authority.public)}, bulletin {fleet.bulletin.number}")
+    _print_table(fleet, fleet.members)
+
+
+def _print_table(fleet: Fleet, members: Iterable[Member]) -> None:
+    rows = [("name", "role", "id", "serial", "key", "addresses", "")]
+    for member in members:
+        addresses = ", ".join(map(str, member.addresses)) or "-"
+        state = "revoked" if fleet.is_revoked(member) else ""
+        key = f"{base64_of(member.public_key)[:8]}..."
+        rows.append(
+            (member.name, _role(member.role), member.ids, str(member.certificate.serial), key, addresses, state)
+        )
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        _say("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+
+
+def _role(role: MemberRole) -> str:
+    return role.name.lower()
+
+
+def _say(text: str) -> None:
     print(printable(text, keep="\n"))
+
+
+def _note(text: str) -> None:
+    print(printable(text), file=sys.stderr)
+
+
+_ACTIONS: dict[str, Callable[[argparse.Namespace], None]] = {
+    "init": _init,
+    "sign": _sign,
+    "add": _change,
+    "rotate": _change,
+    "revoke": _change,
+    "remove": _change,
+    "publish": _publish,
+    "list": _list,
+    "restore": _restore,
+    "enroll": _enroll,
+}

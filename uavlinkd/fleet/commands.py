@@ -1,82 +1,121 @@
-"""The arguments of ``uavlinkd fleet``. The actions are in :mod:`uavlinkd.fleet.actions`."""
+"""The arguments of ``uavlinkd fleet`` and ``uavlinkd enroll``. What they do is in :mod:`uavlinkd.fleet.actions`."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-_KINDS = ("drone", "ground-station", "observer", "relay")
+_ROLES = ("vehicle", "operator", "observer", "relay")
 
 
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command ``fleet``."""
+    """Add the commands ``enroll`` and ``fleet``."""
+    _add_enroll(commands)
     fleet = commands.add_parser(
         "fleet",
-        help="make and maintain the keys and configurations of a whole fleet",
-        description="Make and maintain the keys and configurations of a whole fleet, one folder for each member. The"
-        " public facts are in fleet.toml. A private key is in its member's folder only.",
+        help="sign and revoke the members of a fleet",
+        description="Sign and revoke the members of a fleet. One key, the authority, signs each member's key. The"
+        " public facts are in fleet.toml, the authority's key in authority.pem.",
     )
     actions = fleet.add_subparsers(title="commands", metavar="COMMAND", required=True)
 
-    init = actions.add_parser("init", help="create a fleet", description="Create a fleet.")
-    init.set_defaults(command=_act, action="init")
-    init.add_argument(
-        "--drones", type=int, required=True, metavar="N", help="drone1 to droneN, with system ids from 1 up"
-    )
-    init.add_argument(
-        "--ground-stations", type=int, default=1, metavar="N", help="system ids from 255 down (default: %(default)s)"
-    )
-    init.add_argument("--observers", type=int, default=0, metavar="N", help="members that only receive (default: 0)")
+    def add(name: str, text: str, *, signs: bool = True) -> argparse.ArgumentParser:
+        action = actions.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+        action.set_defaults(command=_act, action=name)
+        action.add_argument(
+            "--out", type=Path, default=Path("fleet"), metavar="DIR", help="the fleet's folder (default: %(default)s)"
+        )
+        if signs:
+            action.add_argument(
+                "--passphrase-file", type=Path, metavar="FILE", help="read the passphrase there, not on the terminal"
+            )
+        return action
+
+    init = add("init", "create a fleet: its authority, and folders for the members that are asked for")
+    init.add_argument("--no-passphrase", action="store_true", help="for tests: each copy of authority.pem can sign")
     init.add_argument(
         "--relay",
         action="append",
         default=[],
         metavar="HOST:PORT",
-        help="a relay with this public address; all links are encrypted (may be repeated, up to three times)",
+        help="a relay with this public address (may be repeated, up to three times)",
     )
+    counts = {
+        "drones": "drone1 to droneN, with system ids from 1 up",
+        "ground-stations": "system ids from 255 down",
+        "observers": "members that only receive",
+    }
+    for name, text in counts.items():
+        init.add_argument(f"--{name}", type=int, default=0, metavar="N", help=f"{text} (default: 0)")
     init.add_argument(
-        "--address-plan",
-        metavar="PLAN",
-        help="a network, or a template with {n} or {name}: 10.13.0.{n}:5790; none: no member has an address"
-        " (default: 10.13.0.0/24, with --relay none)",
+        "--station-address",
+        action="append",
+        default=[],
+        metavar="HOST:PORT",
+        help="where vehicles reach a ground station (may be repeated); without a relay, the first one is one too",
     )
-    init.add_argument("--psk", action="store_true", help="a pre-shared key for each pair")
+    init.add_argument("--swarm", action="store_true", help="vehicles connect to each other too")
     init.add_argument("--suite", default="x25519", metavar="NAME", help="key exchange (default: %(default)s)")
-    init.add_argument(
-        "--control-socket",
-        default="{name}.sock",
-        metavar="FILE",
-        help="may contain {n} or {name} (default: %(default)s)",
-    )
-    init.add_argument(
-        "--drone-url",
-        default="udpin:127.0.0.1:14550",
-        metavar="URL",
-        help="of the autopilot; may contain {n} or {name} (default: %(default)s)",
-    )
-    init.add_argument(
-        "--ground-station-url",
-        default="udpout:127.0.0.1:14550",
-        metavar="URL",
-        help="of each ground control station, observers' too (default: %(default)s)",
-    )
-    init.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder")
+    templates = {
+        "control-socket": ("{name}.sock", "FILE", ""),
+        "drone-url": ("udpin:127.0.0.1:14550", "URL", "of the autopilot; "),
+        "ground-station-url": ("udpout:127.0.0.1:14550", "URL", "of each ground control station, observers' too; "),
+    }
+    for name, (default, metavar, text) in templates.items():
+        help_ = f"{text}may contain {{n}} or {{name}} (default: %(default)s)"
+        init.add_argument(f"--{name}", default=default, metavar=metavar, help=help_)
 
-    def add(name: str, text: str) -> argparse.ArgumentParser:
-        action = actions.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
-        action.set_defaults(command=_act, action=name)
-        action.add_argument("name", metavar="NAME")
+    sign = add("sign", "read the line of `uavlinkd enroll NAME`, and print the one for `uavlinkd enroll --finish`")
+    sign.add_argument("name", nargs="?", metavar="NAME", help="print the line of this member once more")
+    sign.add_argument(
+        "--replace", action="store_true", help="the name exists: replace its key, and revoke the old one"
+    )
+    new = add("add", "make a folder for a new member, with its key and configuration")
+    for action in (sign, new):
+        action.add_argument("--role", choices=_ROLES, help="(default: vehicle)")
+        ids = action.add_mutually_exclusive_group()
+        ids.add_argument("--id", type=int, metavar="N", help="MAVLink system id (default: the next free one)")
+        ids.add_argument("--ids", metavar="A-B", help="a range of them")
         action.add_argument(
-            "--out", type=Path, default=Path(), metavar="DIR", help="the fleet's folder (default: the current one)"
+            "--address",
+            action="append",
+            default=[],
+            metavar="HOST:PORT",
+            help="where members reach it from the start",
         )
-        return action
+    revoke = add("revoke", "sign a bulletin that refuses a member")
+    remove = add("remove", "revoke a member, and publish the bulletin")
+    for action in (new, revoke, remove, add("rotate", "make a new key for a member, and revoke the old one")):
+        action.add_argument("name", metavar="NAME")
+    revoke.add_argument("--resign", action="store_true", help="sign all others again, which empties the bulletin")
+    publish = add("publish", "hand the bulletin to a running daemon, which passes it on")
+    publish.add_argument("--merge", action="store_true", help="the fleet has a newer bulletin: sign the union")
+    for action in (publish, remove):
+        daemon = action.add_mutually_exclusive_group()
+        daemon.add_argument("--config", metavar="FILE", type=Path, help="the daemon's configuration")
+        daemon.add_argument("--socket", metavar="PATH", type=Path, help="the daemon's control socket")
+    add("list", "list the members, also revoked ones", signs=False)
+    add("restore", "write authority.pem from its paper copy on standard input").add_argument(
+        "--no-passphrase", action="store_true", help="as of init"
+    )
 
-    new = add("add", "add a member, and add it to its peers' configurations")
-    new.add_argument("--kind", choices=_KINDS, default="drone", help="kind of member (default: %(default)s)")
-    new.add_argument("--address", metavar="HOST:PORT", help="to which others initiate (default: by the address plan)")
-    new.add_argument("--system-id", type=int, metavar="ID", help="1 to 255 (default: the next free one)")
-    add("remove", "remove a member: its peers refuse it from then on")
-    add("rotate", "give a member a new key and new PSKs: its peers refuse the old key from then on")
+
+def _add_enroll(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    enroll = commands.add_parser(
+        "enroll",
+        help="make this machine a member of a fleet, with one line each way",
+        description="Make this machine a member of a fleet: `enroll NAME` makes the private key, which stays, and"
+        " prints a line for `uavlinkd fleet sign`. `enroll --finish` reads the line that this prints.",
+    )
+    enroll.set_defaults(command=_act, action="enroll")
+    enroll.add_argument("name", nargs="?", metavar="NAME")
+    enroll.add_argument("--finish", nargs="?", const="", metavar="LINE", help="(default: from standard input)")
+    enroll.add_argument("--config", metavar="FILE", type=Path, help="the configuration (default: NAME.toml)")
+    enroll.add_argument("--keys", metavar="DIR", type=Path, help="for a service: the folder of its keys")
+    enroll.add_argument("--url", metavar="URL", help="endpoint of a new configuration")
+    enroll.add_argument(
+        "--listen", action="append", default=[], metavar="IP:PORT", help="where members reach it (default: as signed)"
+    )
 
 
 def _act(options: argparse.Namespace) -> int:

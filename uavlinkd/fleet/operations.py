@@ -1,35 +1,39 @@
-"""The operations on a fleet: init, add, remove and rotate.
+"""The operations on a fleet's folder: init, sign, add, rotate, revoke and restore.
 
-A fleet's folder contains the manifest and a folder for each member. Only that folder contains the member's private
-key. The commands do not need the key again: if a folder was moved to its vehicle, they write the changed files only.
-An operation that raises FleetError changed nothing.
+A fleet's folder contains the manifest, the authority's key, and a folder for each member whose key was made here. The
+commands do not need that again: it may have been moved to its vehicle. An operation that raises FleetError changed
+nothing.
 """
 
 from __future__ import annotations
 
 import errno
+import os
+import secrets
 import shutil
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from functools import partial
-from itertools import combinations
+from dataclasses import dataclass
 from pathlib import Path
 
+from uavlinkd.authority.enrolment import Request
 from uavlinkd.config import keys
-from uavlinkd.fleet import files
+from uavlinkd.core.certificates import MemberRole
+from uavlinkd.core.crypto import Secret, SigningKey, sha256, signing_key_pem
+from uavlinkd.fleet import authority_key, files, signing
+from uavlinkd.fleet.authority_key import AUTHORITY_FILE, SUCCESSOR_FILE, Passphrase
 from uavlinkd.fleet.manifest import (
     Fleet,
     FleetError,
     FleetFileError,
     FleetSettings,
     Member,
-    MemberKind,
     check_settings,
     read_manifest,
 )
-from uavlinkd.fleet.transaction import FileChanges, apply, is_loadable, lock
+from uavlinkd.fleet.signing import Identity
+from uavlinkd.fleet.transaction import FileChanges, apply, lock
 from uavlinkd.system.addresses import Address
 
 
@@ -41,26 +45,24 @@ class Result:
     """
 
     fleet: Fleet
-    changed: tuple[str, ...]
+    changed: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
 
 def init(
     folder: Path,
     settings: FleetSettings,
-    drones: int,
-    ground_stations: int,
-    observers: int,
-    relays: Sequence[Address] = (),
-) -> Result:
-    """Create a fleet in a new folder. If a step fails, the folder is not created.
+    counts: dict[MemberRole, int],
+    places: tuple[Sequence[Address], Sequence[Address]],
+    ask: Passphrase | None,
+) -> tuple[Result, Secret]:
+    """Create a fleet in a new folder; also returns the authority's key. If a step fails, there is no folder.
 
-    ``relays``: the public address of each.
+    ``places``: the addresses of the relays, and of the first operators. ``ask`` is called for a new passphrase; None:
+    the key is not encrypted.
     """
     check_settings(settings)
-    if min(drones, ground_stations, observers) < 0 or not drones + ground_stations + observers:
-        raise FleetError("a fleet has at least one member")
-    if drones + ground_stations + observers > 255:
+    if min(counts.values()) < 0 or sum(counts.values()) > 255:
         raise FleetError("a fleet has at most 255 members: MAVLink has no more system ids")
     try:
         is_taken = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
@@ -68,21 +70,22 @@ def init(
         raise _cannot_create(folder, error) from None
     if is_taken:
         raise _exists(folder)
-    fleet = Fleet(settings)
+    private, successor = (Secret(secrets.token_bytes(32)) for _ in range(2))
+    signer = SigningKey(private)
+    fleet = signing.new_fleet(signer, sha256(SigningKey(successor).public), settings)
     private_keys: dict[str, str] = {}
-    for kind, places in (
-        (MemberKind.DRONE, [None] * drones),
-        (MemberKind.GROUND_STATION, [None] * ground_stations),
-        (MemberKind.OBSERVER, [None] * observers),
-        (MemberKind.RELAY, relays),
+    for role, name, each in (
+        (MemberRole.RELAY, "relay", [(address,) for address in places[0]]),
+        (MemberRole.OPERATOR, "ground-station", _places(counts[MemberRole.OPERATOR], places[1])),
+        (MemberRole.VEHICLE, "drone", _places(counts[MemberRole.VEHICLE])),
+        (MemberRole.OBSERVER, "observer", _places(counts[MemberRole.OBSERVER])),
     ):
-        for number, address in enumerate(places, 1):
+        for number, addresses in enumerate(each, 1):
             # "ground-station" if it is the only one, but always "drone1": most fleets grow.
-            is_only = len(places) == 1 and kind is not MemberKind.DRONE
-            name = kind.value if is_only else f"{kind.value}{number}"
-            private_keys[name] = keys.generate_private_key()
-            public = keys.public_key_text(private_keys[name])
-            fleet = fleet.with_member(fleet.new_member(name, kind, public, address=address))
+            full = name if len(each) == 1 and role is not MemberRole.VEHICLE else f"{name}{number}"
+            private_keys[full] = keys.generate_private_key()
+            fleet = signing.certify(fleet, signer, _public(private_keys[full]), full, Identity(role, None, addresses))
+    passphrase = None if ask is None else ask(AUTHORITY_FILE)
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         building = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
@@ -90,9 +93,10 @@ def init(
         raise _cannot_create(folder, error) from None
     try:
         changes = FileChanges(building, fleet)
+        for file, key in ((AUTHORITY_FILE, private), (SUCCESSOR_FILE, successor)):
+            changes.secrets[building / file] = signing_key_pem(key, passphrase, os.urandom)
         for member in fleet.members:
             _write(changes, member, private_keys[member.name])
-        _add_psks(changes, (pair for pair in combinations(fleet.members, 2) if pair[0].section_of(pair[1])))
         apply(changes, fleet.members)
         building.chmod(0o755)
         building.rename(folder)
@@ -102,7 +106,13 @@ def init(
         raise _cannot_create(folder, error) from None
     finally:
         shutil.rmtree(building, ignore_errors=True)
-    return Result(fleet, tuple(member.name for member in fleet.members))
+    return Result(fleet, tuple(member.name for member in fleet.members)), private
+
+
+def _places(count: int, addresses: Sequence[Address] = ()) -> list[tuple[Address, ...]]:
+    if len(addresses) > count:
+        raise FleetError("there are more --station-address than --ground-stations")
+    return [*((address,) for address in addresses), *[()] * (count - len(addresses))]
 
 
 def _exists(folder: Path) -> FleetError:
@@ -113,57 +123,99 @@ def _cannot_create(folder: Path, error: OSError) -> FleetFileError:
     return FleetFileError(f"{folder} cannot be created: {error.strerror}")
 
 
-def add(
-    folder: Path, name: str, kind: MemberKind, *, address: Address | None = None, system_id: int | None = None
-) -> Result:
-    """Add a member, and add it as a peer to the others' configurations."""
+def sign(
+    folder: Path, request: Request, identity: Identity, ask: Passphrase, *, replaces: bool = False
+) -> tuple[Result, str]:
+    """Sign a request; also returns the reply line. The same request again, for the same identity, changes nothing."""
     with _open_fleet(folder) as before:
+        known = next((member for member in before.current if member.public_key == request.public_key), None)
+        if known is not None and known.name == request.name and _is_of(known, identity):
+            return Result(before), files.reply_for(before, known).line()
+        signer = _signer(folder, before, ask)
+        fleet = signing.certify(before, signer, request.public_key, request.name, identity, replaces=replaces)
+        changes = FileChanges(folder, fleet)
+        changed = _refresh(changes, before, "")
+        apply(changes)
+    line = files.reply_for(changes.fleet, changes.fleet.member(request.name)).line()
+    return Result(changes.fleet, changed, tuple(changes.notes)), line
+
+
+def _is_of(member: Member, identity: Identity) -> bool:
+    return (
+        identity.role in (None, member.role)
+        and identity.ids in (None, member.certificate.system_ids)
+        and identity.addresses in ((), member.addresses)
+    )
+
+
+def line_of(folder: Path, name: str) -> str:
+    """The reply line of a member once more, with the present bulletin and contacts."""
+    fleet = read_manifest(folder)
+    return files.reply_for(fleet, fleet.member(name)).line()
+
+
+def add(folder: Path, name: str, identity: Identity, ask: Passphrase) -> Result:
+    """Make a key and a folder for a new member."""
+    return _with_new_key(folder, name, identity, ask, replaces=False)
+
+
+def rotate(folder: Path, name: str, ask: Passphrase) -> Result:
+    """Make a new key for a member, in its folder, and revoke the old certificate."""
+    return _with_new_key(folder, name, Identity(), ask, replaces=True)
+
+
+def _with_new_key(folder: Path, name: str, identity: Identity, ask: Passphrase, *, replaces: bool) -> Result:
+    with _open_fleet(folder) as before:
+        if replaces:
+            before.member(name)
         private = keys.generate_private_key()
-        member = before.new_member(name, kind, keys.public_key_text(private), address=address, system_id=system_id)
-        changes = FileChanges(folder, before.with_member(member))
-        _write(changes, member, private)
-        peers = changes.fleet.peers_of(member)
-        loadable = [peer for peer in peers if is_loadable(folder, peer)]
-        _add_psks(changes, ((member, peer) for peer in peers))
-        for peer in peers:
-            _edit(changes, peer, partial(_with_peer, changes.fleet, peer, member))
-        apply(changes, (member, *loadable))
-    return _result(changes, member, *peers)
+        signer = _signer(folder, before, ask)
+        changes = FileChanges(
+            folder, signing.certify(before, signer, _public(private), name, identity, replaces=replaces)
+        )
+        member = changes.fleet.member(name)
+        path = folder / name / files.config_file(name)
+        if path.exists():
+            key = path.with_name(files.key_file(name))
+            _edit(changes, member, {"private_key_file": key.name})
+            changes.deleted.append(key)
+            changes.secrets[key] = private
+        else:
+            _write(changes, member, private)
+        changed = _refresh(changes, before, name)
+        apply(changes, [member])
+    return Result(changes.fleet, (name, *changed), tuple(changes.notes))
 
 
-def remove(folder: Path, name: str) -> Result:
-    """Remove a member: the others refuse it once they have their files. Its own folder is kept."""
+def revoke(folder: Path, name: str, ask: Passphrase, *, resign: bool = False) -> Result:
+    """Sign a bulletin that refuses a member. Its own folder is kept."""
     with _open_fleet(folder) as before:
         member = before.member(name)
-        changes = FileChanges(folder, replace(before, members=tuple(one for one in before.members if one != member)))
-        peers = before.peers_of(member)
-        for peer in peers:
-            _edit(changes, peer, partial(files.set_section, kind=peer.section_of(member), name=name))
-            changes.deleted.append(folder / peer.name / files.psk_file(member))
-        _check_unused(changes, member)
+        changes = FileChanges(folder, signing.revoke(before, _signer(folder, before, ask), [member], resign=resign))
+        changed = _refresh(changes, before, name) if resign else ()
         apply(changes)
-    return _result(changes, *peers)
+    return Result(changes.fleet, changed, tuple(changes.notes))
 
 
-def rotate(folder: Path, name: str) -> Result:
-    """Give a member a new key and new PSKs: the others refuse the old key once they have their files."""
+def restore(folder: Path, private: Secret, ask: Passphrase | None) -> None:
+    """Write the authority's key from its paper copy, with a new passphrase. The old file is replaced."""
+    with _open_fleet(folder) as fleet:
+        if SigningKey(private).public != fleet.authority.public:
+            raise FleetError("this paper copy is of another authority than this fleet's")
+        changes = FileChanges(folder, fleet)
+        passphrase = None if ask is None else ask(AUTHORITY_FILE)
+        changes.deleted.append(folder / AUTHORITY_FILE)
+        changes.secrets[folder / AUTHORITY_FILE] = signing_key_pem(private, passphrase, os.urandom)
+        apply(changes)
+
+
+def merge(folder: Path, bulletin: bytes, ask: Passphrase) -> Fleet:
+    """Sign the union of the folder's bulletin and another one of the same authority, which a daemon has."""
     with _open_fleet(folder) as before:
-        old, private = before.member(name), keys.generate_private_key()
-        member = replace(old, public_key=keys.public_key_text(private))
-        changes = FileChanges(folder, before.with_member(member))
-        own = folder / name / files.key_file(member)
-        changes.deleted.append(own)
-        changes.secrets[own] = private
-        _edit(changes, member, partial(files.set_private_key, member=member))
-        peers = changes.fleet.peers_of(member)
-        for peer in peers:
-            _edit(changes, peer, partial(files.set_public_key, kind=peer.section_of(member), peer=member))
-            if before.settings.psk:
-                changes.deleted += [folder / peer.name / files.psk_file(member), folder / name / files.psk_file(peer)]
-        _add_psks(changes, ((member, peer) for peer in peers))
-        _check_unused(changes, old)
+        other = signing.verified_bulletin(before, bulletin)
+        changes = FileChanges(folder, signing.merge(before, _signer(folder, before, ask), other))
         apply(changes)
-    return _result(changes, member, *peers)
+    return changes.fleet
 
 
 @contextmanager
@@ -173,57 +225,63 @@ def _open_fleet(folder: Path) -> Iterator[Fleet]:
         yield read_manifest(folder)
 
 
-def _result(changes: FileChanges, *changed: Member) -> Result:
-    return Result(changes.fleet, tuple(member.name for member in changed), tuple(changes.notes))
+def _signer(folder: Path, fleet: Fleet, ask: Passphrase) -> SigningKey:
+    signer = authority_key.load_key(folder / AUTHORITY_FILE, ask)
+    if signer.public != fleet.authority.public:
+        raise FleetError(f"{folder / AUTHORITY_FILE} is the key of another fleet's authority")
+    return signer
+
+
+def _public(private: str) -> bytes:
+    return keys.decode_key(keys.public_key_text(private))
 
 
 def _write(changes: FileChanges, member: Member, private: str) -> None:
-    """Write the key and the configuration of a new member."""
-    own = changes.folder / member.name
-    changes.secrets[own / files.key_file(member)] = private
-    changes.texts[own / files.config_file(member)] = files.write_config(changes.fleet, member)
+    """Write the key and the configuration of a member."""
+    own, fleet, name = changes.folder / member.name, changes.fleet, member.name
+    changes.secrets[own / files.key_file(name)] = private
+    text = files.write_config(files.reply_for(fleet, member), fleet.settings, files.key_file(name), _listen(member))
+    changes.texts[own / files.config_file(name)] = text
 
 
-def _add_psks(changes: FileChanges, pairs: Iterable[tuple[Member, Member]]) -> None:
-    for a, b in pairs if changes.fleet.settings.psk else ():
-        psk = keys.generate_psk()
-        changes.secrets[changes.folder / a.name / files.psk_file(b)] = psk
-        changes.secrets[changes.folder / b.name / files.psk_file(a)] = psk
+def _listen(member: Member) -> list[str]:
+    listen: list[str] = []
+    for address in member.addresses:
+        if address.ip is not None and address.is_loopback:
+            listen.append(str(address))
+        else:  # others may have either family
+            listen += [f"0.0.0.0:{address.port}", f"[::]:{address.port}"]
+    return list(dict.fromkeys(listen))
 
 
-def _with_peer(fleet: Fleet, member: Member, peer: Member, text: str) -> str:
-    """A member's configuration with another member in it. Links that may go along a relay are encrypted."""
-    text = files.set_section(text, member.section_of(peer), peer.name, files.peer_section(fleet, member, peer))
-    return files.set_confidential(text) if peer.is_relay else text
+def _refresh(changes: FileChanges, before: Fleet, but: str) -> tuple[str, ...]:
+    """If the contacts changed, write them into the configurations that are here. Returns the names of all others."""
+    fleet = changes.fleet
+    contacts = [[member for member in each.current if member.addresses] for each in (before, fleet)]
+    if contacts[0] == contacts[1]:
+        return ()
+    others = [member for member in fleet.current if member.name != but]
+    for member in others:
+        _edit(changes, member)
+    elsewhere = [member.name for member in others if not (changes.folder / member.name).exists()]
+    if elsewhere:
+        changes.notes.append(
+            f"The contacts changed. For {', '.join(elsewhere)}, `uavlinkd fleet sign NAME` prints a line for"
+            " `uavlinkd enroll --finish`."
+        )
+    return tuple(member.name for member in others if member.name not in elsewhere)
 
 
-def _edit(changes: FileChanges, member: Member, change: Callable[[str], str]) -> None:
-    """Change a member's configuration. If the file is not here, write a new one."""
-    path = changes.folder / member.name / files.config_file(member)
+def _edit(changes: FileChanges, member: Member, top: dict[str, object] | None = None) -> None:
+    """Change a member's configuration, if it is here."""
+    path = changes.folder / member.name / files.config_file(member.name)
+    if not path.exists():
+        return
     try:
         text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        changes.texts[path] = files.write_config(changes.fleet, member)
-        changes.notes.append(f"{path} was not here: the new file does not contain edits made to another copy.")
-        return
+        changes.texts[path] = files.with_fleet(text, files.reply_for(changes.fleet, member), top)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "it is not text"
         raise FleetFileError(f"{path} cannot be read: {reason}") from None
-    try:
-        changes.texts[path] = change(text)
     except FleetError as error:
         raise FleetError(f"{path}: {error}") from None
-
-
-def _check_unused(changes: FileChanges, former: Member) -> None:
-    """Check that no member's configuration contains the key of a former member, under any peer's name."""
-    for member in changes.fleet.members:
-        path = changes.folder / member.name / files.config_file(member)
-        try:
-            text = changes.texts[path] if path in changes.texts else path.read_text(encoding="utf-8")
-        except (OSError, ValueError):  # on its vehicle only, or not text
-            continue
-        if section := files.section_with_key(text, former.public_key):
-            raise FleetError(
-                f"{path}: {section} has the key of {former.name}, which would stay valid: delete it there first"
-            )

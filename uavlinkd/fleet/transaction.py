@@ -134,15 +134,6 @@ class Rollback:
                     path.unlink(missing_ok=True)
 
 
-def is_loadable(folder: Path, member: Member) -> bool:
-    """Whether a daemon would accept a member's files as they are here. Some may be on the vehicle only."""
-    try:
-        check_members(folder, [member])
-    except FleetError:
-        return False
-    return True
-
-
 def check_members(folder: Path, members: Iterable[Member]) -> None:
     """Load the configurations of these members as their daemons would.
 
@@ -151,7 +142,7 @@ def check_members(folder: Path, members: Iterable[Member]) -> None:
     """
     for member in members:
         try:
-            load_config(folder / member.name / config_file(member), {})
+            load_config(folder / member.name / config_file(member.name), {})
         except ConfigError as error:
             problems = "\n".join(f"{member.name}: {problem.key}: {problem.message}" for problem in error.problems)
             raise FleetError(f"the resulting configuration is not valid:\n{problems}") from None

@@ -1,0 +1,190 @@
+"""Enrolments by the commands, as an operator pipes them: what is written, and what is refused."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.fleet.vehicles import create
+from uavlinkd.authority.enrolment import fingerprint_of
+from uavlinkd.cli import main
+from uavlinkd.config.load import load_config
+from uavlinkd.core.certificates import MemberRole
+from uavlinkd.fleet.manifest import read_manifest
+from uavlinkd.system.addresses import Address
+
+Say = Callable[..., str]
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working folder with a fleet that has a relay."""
+    monkeypatch.chdir(tmp_path)
+    create(tmp_path / "fleet", relays=(Address("relay.example.org", 5790),))
+    return tmp_path
+
+
+@pytest.fixture
+def say(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Say:
+    """Runs a command; returns its standard output, or its error after `refused: `."""
+
+    def run(command: str, line: str = "") -> str:
+        monkeypatch.setattr("sys.stdin", io.StringIO(line))
+        status = main(command.split())
+        out, err = capsys.readouterr()
+        return out if status == 0 else f"refused: {err}"
+
+    return run
+
+
+def enrolled(say: Say, name: str, how: str = "", finish: str = "") -> str:
+    return say(f"enroll --finish {finish}", say(f"fleet sign {how}", say(f"enroll {name}")))
+
+
+def test_one_line_goes_each_way(place: Path, say: Say) -> None:
+    """The result is a working file; the private key did not move, and both ends can compare the authority."""
+    request = say("enroll v7")
+    assert request == say("enroll v7")
+    assert request.count("\n") == 1
+    line = say("fleet sign --id 7", request)
+    assert line.count("\n") == 1
+    done = say("enroll --finish --url udpin:127.0.0.1:14551", line)
+    fleet = read_manifest(place / "fleet")
+    assert f"v7 is a member of fleet {fingerprint_of(fleet.authority.public)}" in done
+    assert "system id 7" in done
+    config = load_config(place / "v7.toml", {})
+    assert config.fleet is not None
+    assert config.fleet.own.certificate == fleet.member("v7").certificate
+    assert [(contact.name, str(contact.addresses[0])) for contact in config.fleet.contacts] == [
+        ("relay", "relay.example.org:5790")
+    ]
+    assert config.warnings == ()
+    assert (place / "v7.key").stat().st_mode & 0o777 == 0o600
+    private = (place / "v7.key").read_text().strip()
+    assert all(private not in text for text in (request, line, done, (place / "v7.toml").read_text()))
+    assert say("enroll --finish", line) == done
+
+
+def test_address_in_the_line_is_listened_on(place: Path, say: Say) -> None:
+    """A ground station with an address needs nothing more; `--listen` overrides it."""
+    enrolled(say, "station", "--role operator --address 198.51.100.7:6000")
+    assert list(map(str, load_config(place / "station.toml", {}).listen)) == ["0.0.0.0:6000", "[::]:6000"]
+    enrolled(say, "other", "--role operator --address 198.51.100.8:6000", "--listen 127.0.0.1:6000")
+    assert list(map(str, load_config(place / "other.toml", {}).listen)) == ["127.0.0.1:6000"]
+
+
+def test_keys_of_a_service_are_in_their_folder(place: Path, say: Say) -> None:
+    """As `check --keys`."""
+    (place / "keys").mkdir()
+    line = say("fleet sign", say("enroll v7 --keys keys"))
+    assert "v7.toml" in say("enroll --finish --keys keys", line)
+    assert (place / "keys" / "v7.key").exists()
+    assert 'control_socket = "/run/uavlinkd/v7/control.sock"' in (place / "v7.toml").read_text()
+
+
+def test_existing_configuration_keeps_its_edits(place: Path, say: Say) -> None:
+    """It becomes a member's with its own key; its pinned peers stay."""
+    text = """\
+name = "v7"
+private_key_file = "mine.key"  # since 2024
+[link]
+suites = ["x25519"]
+
+[[endpoint]]
+name = "autopilot"
+url = "udpin:127.0.0.1:14550"
+"""
+    (place / "v7.toml").write_text(text)
+    enrolled(say, "v7")
+    after = (place / "v7.toml").read_text()
+    assert after.startswith('name = "v7"\nprivate_key_file = "mine.key"\n[link]\nsuites = ["x25519"]\nconfidential')
+    assert (place / "mine.key").exists()
+    assert load_config(place / "v7.toml", {}).fleet is not None
+
+
+def test_new_key_replaces_the_former_one_at_the_end(place: Path, say: Say) -> None:
+    """Until then the daemon could restart with the former one. A line of the former key is refused afterwards."""
+    request = say("enroll v7")
+    first = say("fleet sign", request)
+    say("enroll --finish", first)
+    before = (place / "v7.toml").read_bytes()
+    for _ in range(2):
+        new = say("enroll v7")
+        assert new == say("enroll v7") != request
+        assert (place / "v7.toml").read_bytes() == before
+        assert 'refused: this fleet has a "v7" already' in say("fleet sign", new)
+        line = say("fleet sign --replace", new)
+        assert "The former key, " in say("enroll --finish", line)
+        assert len(list(place.glob("v7*.key"))) == 1
+        before = (place / "v7.toml").read_bytes()
+        assert say("enroll --finish", first).startswith("refused: the line was used or is old")
+        assert (place / "v7.toml").read_bytes() == before
+        request = new
+    assert read_manifest(place / "fleet").bulletin.revoked == (2, 3)
+
+
+def test_lines_that_cannot_be_used_are_refused(
+    place: Path, say: Say, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the reason; no file changes."""
+    other = tmp_path_factory.mktemp("other")
+    create(other / "fleet", relays=(Address("relay.example.org", 5790),))
+    line = say("fleet sign", say("enroll v7"))
+    foreign = say(f"fleet sign --out {other / 'fleet'}", say("enroll v7"))
+    of_v8 = say("fleet sign", say("enroll v8"))
+    say("enroll --finish", line)
+    before = {path: path.read_bytes() for path in place.glob("*.*")}
+    assert "was cut or changed" in say("enroll --finish", line[:300])
+    assert "was cut or changed" in say("enroll --finish")
+    assert "has the certificate of another key, named v8" in say("enroll --finish --config v7.toml", of_v8)
+    assert "the line is of fleet" in say("enroll --finish", foreign)
+    assert "is the request" in say("enroll --finish", say("enroll v7"))
+    (place / "v7.next.key").unlink()
+    assert "copy it again" in say("fleet sign", "uavlink-enroll-1 v7")
+    assert "`uavlinkd enroll NAME`" in say("enroll")
+    assert "is not a name" in say("enroll V7")
+    monkeypatch.chdir(other)
+    assert "there is no v7.key: run `uavlinkd enroll NAME` here first" in say("enroll --finish", line)
+    monkeypatch.chdir(place)
+    assert {path: path.read_bytes() for path in place.glob("*.*")} == before
+
+
+def test_file_that_a_daemon_would_refuse_is_not_changed(place: Path, say: Say) -> None:
+    """The problems are those of `uavlinkd check`."""
+    line = say("fleet sign", say("enroll v7"))
+    for text, reason in (
+        ('name = "v7"\ncolour = 1\n', "colour"),
+        ("name =", "not valid TOML"),
+        ("[fleet]\n", "damaged"),
+    ):
+        (place / "v7.toml").write_text(text)
+        assert reason in say("enroll --finish", line)
+        assert (place / "v7.toml").read_text() == text
+    assert not list(place.glob(".*"))
+
+
+def test_members_are_listed(place: Path, say: Say) -> None:
+    """Former ones too."""
+    enrolled(say, "v7", "--ids 70-79")
+    assert "Now publish the bulletin" in say("fleet revoke v7")
+    rows = [line.split() for line in say("fleet list").splitlines()]
+    assert rows[0][2:] == ["bulletin", "2"]
+    assert [row[:4] for row in rows[2:]] == [["relay", "relay", "-", "1"], ["v7", "vehicle", "70-79", "2"]]
+    assert rows[3][-1] == "revoked"
+    assert 'has no "v7"' in say("fleet sign v7")
+
+
+def test_folder_for_a_card(place: Path, say: Say) -> None:
+    """`add` and `rotate` make the key, for those who carry folders."""
+    assert "Carry each" in say("fleet add v7 --id 7")
+    assert "scout" in say("fleet add scout --role observer")
+    assert "Now publish" in say("fleet rotate v7")
+    fleet = read_manifest(place / "fleet")
+    assert [(member.name, member.role) for member in fleet.current[1:]] == [
+        ("scout", MemberRole.OBSERVER),
+        ("v7", MemberRole.VEHICLE),
+    ]
+    assert "not a range" in say("fleet add v9 --ids 7-x")

@@ -1,0 +1,186 @@
+"""The member's side of an enrolment: its key stays here, and one line goes each way."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from base64 import b64decode
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from uavlinkd.authority.enrolment import (
+    EnrolmentError,
+    Reply,
+    Request,
+    check_name,
+    fingerprint_of,
+    parse_reply,
+    verify_reply,
+)
+from uavlinkd.config import ConfigError, keys
+from uavlinkd.config.load import load_config
+from uavlinkd.core.certificates import Certificate, parse_bulletin, parse_certificate
+from uavlinkd.core.crypto import x25519_public_key
+from uavlinkd.core.drops import Drop
+from uavlinkd.fleet.files import config_file, key_file, with_fleet, write_config
+from uavlinkd.fleet.manifest import FleetError, FleetFileError, FleetSettings
+from uavlinkd.fleet.transaction import Rollback
+
+_NEXT = ".next.key"
+"""No name of a member has a dot."""
+
+
+@dataclass(frozen=True, slots=True)
+class MemberFiles:
+    """Where a member's files are. ``keys``: of a service, else keys are beside the configuration."""
+
+    config: Path
+    keys: Path | None = None
+
+    def key(self, name: str) -> Path:
+        """The path of a key file."""
+        return (self.keys or self.config.parent) / name
+
+    def environ(self) -> dict[str, str]:
+        """As systemd sets it for a service with these keys."""
+        return {} if self.keys is None else {keys.CREDENTIALS: str(self.keys.absolute())}
+
+    def table(self) -> dict[str, Any]:
+        """The present configuration; empty without one."""
+        try:
+            return tomllib.loads(self.config.read_text(encoding="utf-8-sig"))
+        except FileNotFoundError:
+            return {}
+        except OSError as error:
+            raise FleetFileError(f"{self.config} cannot be read: {error.strerror}") from None
+        except ValueError:
+            raise FleetError(f"{self.config} is not valid TOML: `uavlinkd check` names the line") from None
+
+
+def request(name: str, place: MemberFiles) -> tuple[str, Path]:
+    """The line for `uavlinkd fleet sign`, and the file of the key, which is made unless a former request made it.
+
+    A member that has a certificate already asks for another key. Its present one stays until :func:`finish`.
+    """
+    try:
+        check_name(name)
+    except EnrolmentError as error:
+        raise FleetError(str(error)) from None
+    table = place.table()
+    own = str(table.get("private_key_file", key_file(name)))
+    path = place.key(_other(own) if "fleet" in table else own)
+    if not os.path.lexists(path):
+        keys.write_secret_file(path, keys.generate_private_key())
+    public = x25519_public_key(keys.read_secret_file(path).reveal())
+    return Request(name, public).line(), path
+
+
+def _other(own: str) -> str:
+    """The name of the key file that is not used at present."""
+    return f"{own.removesuffix(_NEXT)}.key" if own.endswith(_NEXT) else own.removesuffix(".key") + _NEXT
+
+
+@dataclass(frozen=True, slots=True)
+class Enrolled:
+    """A finished enrolment."""
+
+    certificate: Certificate
+    fingerprint: str
+    config: Path
+    contacts: tuple[str, ...]
+    former_key: Path | None
+
+
+def finish(line: str, config: Path | None, folder: Path | None, url: str | None, listen: Sequence[str]) -> Enrolled:
+    """Write what the line of `uavlinkd fleet sign` says into the configuration, which is created if it is missing.
+
+    Nothing is written unless every signature verifies and a daemon would accept the file. The former key is deleted.
+    """
+    try:
+        reply = parse_reply(line)
+        certificate = parse_certificate(reply.certificate)
+    except EnrolmentError as error:
+        raise FleetError(f"the line {error}") from None
+    except Drop:
+        raise FleetError("the line has no valid certificate: sign the request again") from None
+    place = MemberFiles(config or Path(config_file(certificate.name)), folder)
+    table = place.table()
+    _check_present(table.get("fleet"), reply, certificate, place.config)
+    own = str(table.get("private_key_file", key_file(certificate.name)))
+    path, contacts = _verified(reply, [place.key(own), place.key(_other(own))])
+    ports = [f"0.0.0.0:{reply.port}", f"[::]:{reply.port}"] if reply.port and "listen" not in table else []
+    listen = listen or ports
+    if table:
+        top = {"private_key_file": path.name, **({"listen": listen} if listen else {})}
+        text = with_fleet(place.config.read_text(encoding="utf-8-sig"), reply, top)
+    else:
+        settings = FleetSettings(
+            control_socket="{name}.sock" if folder is None else "/run/uavlinkd/{name}/control.sock"
+        )
+        if url is not None:
+            settings = replace(settings, drone_url=url, ground_station_url=url)
+        text = write_config(reply, settings, path.name, listen)
+    _replace(place, text)
+    former = place.key(own) if path.name != own else place.key(_other(own))
+    has_former = path.name != own and former.exists()
+    if has_former:
+        former.unlink()
+    fingerprint = fingerprint_of(reply.authority)
+    return Enrolled(certificate, fingerprint, place.config, contacts, former if has_former else None)
+
+
+def _check_present(fleet: Any, reply: Reply, certificate: Certificate, config: Path) -> None:
+    """Check that a line is not older than the file, nor of another fleet."""
+    if fleet is None:
+        return
+    try:
+        authority, signed, published = (
+            b64decode(fleet[key], validate=True) for key in ("authority", "certificate", "bulletin")
+        )
+        present, bulletin, new = parse_certificate(signed), parse_bulletin(published), parse_bulletin(reply.bulletin)
+        number = 0 if bulletin is None else bulletin.number
+    except (LookupError, TypeError, ValueError, Drop):
+        raise FleetError(f"{config}: [fleet] is damaged: `uavlinkd check` says how; or move the file away") from None
+    if authority != reply.authority:
+        raise FleetError(
+            f"the line is of fleet {fingerprint_of(reply.authority)}, and {config} is of {fingerprint_of(authority)}:"
+            " to leave that fleet, delete [fleet] and each [[contact]] from the file"
+        )
+    if present.serial > certificate.serial or (new is not None and number > new.number):
+        raise FleetError(
+            f"the line was used or is old: {config} has serial {present.serial} and bulletin {number} already:"
+            f" `uavlinkd fleet sign {certificate.name}` prints a newer one"
+        )
+
+
+def _verified(reply: Reply, paths: list[Path]) -> tuple[Path, tuple[str, ...]]:
+    """The key file whose key was certified, and the names of the contacts."""
+    reason = f"there is no {paths[0]}: run `uavlinkd enroll NAME` here first, and sign its line"
+    for path in reversed(paths):
+        if path.exists():
+            try:
+                trust = verify_reply(reply, x25519_public_key(keys.read_secret_file(path).reveal()))
+            except EnrolmentError as error:
+                reason = f"the line {error}"
+            else:
+                return path, tuple(held.certificate.name for held in trust.held.values())
+    raise FleetError(reason)
+
+
+def _replace(place: MemberFiles, text: str) -> None:
+    rollback = Rollback()
+    try:
+        new = rollback.prepare(place.config, text)
+        load_config(new, place.environ())
+        rollback.replace(place.config, new)
+        rollback.finish()
+    except BaseException as error:
+        rollback.undo()
+        if isinstance(error, OSError):
+            raise FleetFileError(f"{place.config} cannot be written: {error.strerror}") from None
+        if isinstance(error, ConfigError):
+            problems = "\n".join(f"{problem.key}: {problem.message}" for problem in error.problems)
+            raise FleetError(f"{place.config} would not be valid, and was not changed:\n{problems}") from None
+        raise

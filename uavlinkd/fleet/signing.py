@@ -1,0 +1,198 @@
+"""What the authority signs: certificates and bulletins. Pure: returns another fleet, or a FleetError says why."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import NamedTuple
+
+from uavlinkd.authority.enrolment import EnrolmentError, check_name
+from uavlinkd.config.keys import is_canonical_public_key
+from uavlinkd.core.certificates import (
+    GENERATION,
+    LARGEST_OFFSET,
+    LAST_SERIAL,
+    MOST_REVOKED,
+    Bulletin,
+    Certificate,
+    MemberRole,
+    fleet_id_of,
+    is_published,
+    parse_bulletin,
+)
+from uavlinkd.core.crypto import AuthorityKey, SigningKey, is_usable_public_key
+from uavlinkd.fleet.manifest import Fleet, FleetError, FleetSettings, Member
+from uavlinkd.system.addresses import Address
+
+_ALIKE = str.maketrans({"0": "o", "1": "l", "i": "l", "-": None})
+"""Characters that persons confuse."""
+
+
+class Identity(NamedTuple):
+    """What a certificate says beside the name.
+
+    What is missing is as before; for a new member a vehicle, and its next system id from 1 up, others' from 255 down.
+    """
+
+    role: MemberRole | None = None
+    ids: tuple[int, int] | None = None
+    addresses: tuple[Address, ...] = ()
+
+
+def new_fleet(signer: SigningKey, successor: bytes, settings: FleetSettings) -> Fleet:
+    """A fleet without members."""
+    bulletin = Bulletin(fleet_id_of(signer.public), 1, 1, ())
+    signed = _published(signer, bulletin)
+    return Fleet(AuthorityKey(signer.public), successor, bulletin, signed, settings=settings)
+
+
+def certify(
+    fleet: Fleet,
+    signer: SigningKey,
+    public_key: bytes,
+    name: str,
+    identity: Identity,
+    *,
+    replaces: bool = False,
+) -> Fleet:
+    """Sign a certificate for a new member, or a new key of one: then its former serial is revoked too."""
+    role, ids, addresses = identity
+    former = next((member for member in fleet.current if member.name == name), None)
+    if former is not None:
+        if not replaces:
+            raise FleetError(
+                f'this fleet has a "{name}" already: choose another name, or replace its key (--replace)'
+            )
+        role, ids = (
+            role or former.role,
+            ids or (former.certificate.system_ids if role in (None, former.role) else None),
+        )
+        addresses = addresses or former.addresses
+    role = role or MemberRole.VEHICLE
+    others = [member for member in fleet.current if member is not former]
+    _check(fleet, others, public_key, name, addresses)
+    certificate = Certificate(
+        fleet_id_of(signer.public), fleet.next_serial, role, _system_ids(others, name, role, ids, addresses), name
+    )
+    relays = role is MemberRole.RELAY or (
+        role is MemberRole.OPERATOR and addresses != () and not any(member.relays for member in others)
+    )
+    member = Member(public_key, certificate, _certified(signer, certificate, public_key), addresses, relays)
+    if former is not None:
+        fleet = revoke(fleet, signer, [former])
+    kept = [other for other in fleet.members if other.public_key != public_key]
+    fleet = replace(fleet, members=(*kept, member), next_serial=fleet.next_serial + 1)
+    if not addresses and not fleet.contacts_of(name):
+        raise FleetError(
+            f"{name} would find no other member: a relay is needed (init --relay HOST:PORT, or add --role relay), or"
+            " an operator with an address that vehicles reach (init --station-address, or --address)"
+        )
+    return fleet
+
+
+def _check(fleet: Fleet, others: list[Member], public_key: bytes, name: str, addresses: tuple[Address, ...]) -> None:
+    try:
+        check_name(name)
+    except EnrolmentError as error:
+        raise FleetError(str(error)) from None
+    if not is_usable_public_key(public_key) or not is_canonical_public_key(public_key):
+        raise FleetError(f"the key of {name} is not a public key of X25519")
+    if any(address.is_wildcard for address in addresses):
+        raise FleetError(f"{name} has an address of no machine: write the one that the others reach")
+    for member in fleet.members:
+        if member.public_key == public_key and fleet.is_revoked(member):
+            raise FleetError(f"the key of {name} is that of {member.name}, which is revoked: make a new one")
+    for other in others:
+        if other.public_key == public_key:
+            raise FleetError(f"the key of {name} is that of {other.name}: each member has its own")
+        if _look(other.name) == _look(name):
+            raise FleetError(f'"{name}" looks like "{other.name}": choose a name that no person confuses with it')
+        if shared := set(other.addresses) & set(addresses):
+            raise FleetError(f"{name} would have the address of {other.name}, {shared.pop()}")
+
+
+def _look(name: str) -> str:
+    return name.translate(_ALIKE)
+
+
+def _system_ids(
+    others: list[Member], name: str, role: MemberRole, ids: tuple[int, int] | None, addresses: tuple[Address, ...]
+) -> tuple[int, int]:
+    if role is MemberRole.RELAY:
+        if not addresses or (ids is not None and ids != (0, 0)):
+            raise FleetError(f"{name}: a relay needs --address HOST:PORT, and has no system id")
+        return 0, 0
+    taken = {number: member for member in others for number in _range(member.certificate.system_ids)}
+    if ids is None:
+        order: Iterable[int] = range(1, 256) if role is MemberRole.VEHICLE else range(255, 0, -1)
+        free = next((number for number in order if number not in taken), 0)
+        ids = (free, free)
+    if not 1 <= ids[0] <= ids[1] <= 255:
+        raise FleetError("a system id is a number from 1 to 255, and each member has its own")
+    for number in _range(ids):
+        if number in taken:
+            raise FleetError(f"{name} would have the system id of {taken[number].name}, {number}")
+    return ids
+
+
+def _range(ids: tuple[int, int]) -> range:
+    return range(ids[0], ids[1] + 1) if ids[1] else range(0)
+
+
+def revoke(fleet: Fleet, signer: SigningKey, members: Iterable[Member], *, resign: bool = False) -> Fleet:
+    """Sign a bulletin that refuses these members' certificates too.
+
+    ``resign``: sign a new certificate for each other member, and a bulletin that refuses all older ones.
+    """
+    revoked = {member.certificate.serial for member in members}
+    if not resign:
+        return _publish(fleet, signer, fleet.bulletin.least, revoked)
+    least, renewed = fleet.next_serial, dict[int, Member]()
+    for member in fleet.current:
+        if (serial := member.certificate.serial) not in revoked:
+            certificate = member.certificate._replace(serial=least + len(renewed))
+            signed = _certified(signer, certificate, member.public_key)
+            renewed[serial] = replace(member, certificate=certificate, signed=signed)
+    members = tuple(renewed.get(member.certificate.serial, member) for member in fleet.members)
+    return _publish(replace(fleet, members=members, next_serial=least + len(renewed)), signer, least, set())
+
+
+def verified_bulletin(fleet: Fleet, data: bytes) -> Bulletin:
+    """The bulletin of this fleet in these bytes."""
+    bulletin = parse_bulletin(data)
+    if bulletin is None or bulletin.fleet != fleet.bulletin.fleet or not is_published(data, fleet.authority):
+        raise FleetError("the daemon has no bulletin of this fleet: is it a member of another one?")
+    return bulletin
+
+
+def merge(fleet: Fleet, signer: SigningKey, other: Bulletin) -> Fleet:
+    """Sign the union of the fleet's bulletin and another one, which another copy of the folder signed."""
+    newest = other if other.number > fleet.bulletin.number else fleet.bulletin
+    least = max(fleet.bulletin.least, other.least)
+    serial = max(fleet.next_serial, least, *(serial + 1 for serial in other.revoked), 1)
+    fleet = replace(fleet, next_serial=serial)
+    return _publish(fleet, signer, least, {*other.revoked}, number=newest.number)
+
+
+def _publish(fleet: Fleet, signer: SigningKey, least: int, revoked: set[int], number: int = 0) -> Fleet:
+    number = (number or fleet.bulletin.number) + 1
+    serials = tuple(sorted(serial for serial in {*fleet.bulletin.revoked, *revoked} if serial >= least))
+    if len(serials) > MOST_REVOKED or (serials and serials[-1] - least > LARGEST_OFFSET):
+        raise FleetError(
+            f"the bulletin is full, with {MOST_REVOKED} certificates: `uavlinkd fleet revoke NAME --resign` signs a"
+            " new one for each other member, and empties it"
+        )
+    if number % GENERATION == 0:
+        raise FleetError("this authority has signed its last bulletin: create a new fleet")
+    bulletin = Bulletin(fleet.bulletin.fleet, number, least, serials)
+    return replace(fleet, bulletin=bulletin, published=_published(signer, bulletin))
+
+
+def _published(signer: SigningKey, bulletin: Bulletin) -> bytes:
+    return bulletin.encode() + signer.sign(bulletin.to_be_signed())
+
+
+def _certified(signer: SigningKey, certificate: Certificate, public_key: bytes) -> bytes:
+    if certificate.serial > LAST_SERIAL:
+        raise FleetError("this authority has signed its last certificate: create a new fleet")
+    return certificate.encode() + signer.sign(certificate.to_be_signed(public_key))
