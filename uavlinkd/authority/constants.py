@@ -19,7 +19,8 @@ WHO_INTERVAL_S = 20.0
 WHO = Rate(4.0, 16)
 CERTIFICATES_PER_ANSWER = 8
 CERTIFICATES = Rate(32.0, 256)
-INTRODUCTIONS = Rate(8.0, 32)
+INTRODUCTIONS = Rate(8.0, 200)
+"""A ground station that starts behind a relay learns of its whole fleet at once."""
 INTRODUCED_AFTER_S = 0.5
 """After a session a member binds those that it knows. Until then no other is introduced to it."""
 INTRODUCED_AGAIN_S = 2.5

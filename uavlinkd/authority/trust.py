@@ -13,6 +13,7 @@ from uavlinkd.core.certificates import (
     GENERATION,
     Bulletin,
     Certificate,
+    MemberRole,
     digest_of,
     fleet_id_of,
     is_certified,
@@ -121,10 +122,8 @@ class Trust:
         if key == self.own_key or not self._is_signed(certificate, key, data):
             raise Drop(DropReason.BAD_CERTIFICATE)
         held = self.held.get(key)
-        if (
-            held is not None and certificate.serial < held.certificate.serial
-        ):  # the member may not have its new one yet
-            certificate = held.certificate
+        if held is not None and certificate.serial < held.certificate.serial:
+            certificate = held.certificate  # the member may not have its new one yet
         label = f"{certificate.name}, serial {certificate.serial}"
         if self.bulletin.refuses(certificate.serial) or certificate.name in self.pinned.denied:
             raise Drop(DropReason.CERTIFICATE_REVOKED, label)
@@ -152,7 +151,7 @@ class Trust:
         for other in ended:
             del self.held[other]
         self.held[key] = HeldCertificate(certificate, data)
-        self._claims |= dict.fromkeys(_claims_of(certificate), key)
+        self._claims |= dict.fromkeys(self._claims_of(certificate), key)
         return ended
 
     def reserve(self, pinned: Pinned) -> list[bytes]:
@@ -175,7 +174,7 @@ class Trust:
         for system_id, name in pinned.system_ids.items():
             if system_id in ids and certificate.system_ids[1]:
                 return f"{name}, which has system id {system_id} in the configuration"
-        if self.own is not None and _overlap(self.own.certificate, certificate):
+        if self.own is not None and self._overlap(self.own.certificate, certificate):
             return "this daemon's own certificate"
         for _, held in self._rivals(key, certificate):
             if held.serial >= certificate.serial or not _same(held, certificate):
@@ -184,9 +183,20 @@ class Trust:
 
     def _rivals(self, key: bytes, certificate: Certificate) -> list[tuple[bytes, Certificate]]:
         """Other keys that are held with the same name or a system id of it, and their certificates."""
-        claimants = dict.fromkeys(filter(None, map(self._claims.get, _claims_of(certificate))))
+        claimants = dict.fromkeys(filter(None, map(self._claims.get, self._claims_of(certificate))))
         rivals = [(other, self.held[other].certificate) for other in claimants if other != key and other in self.held]
-        return [(other, held) for other, held in rivals if _overlap(held, certificate)]
+        return [(other, held) for other, held in rivals if self._overlap(held, certificate)]
+
+    def _claims_of(self, certificate: Certificate) -> Iterator[str | int]:
+        """What no other member may have: its name, and its system ids. A relay carries no frames of its own."""
+        yield certificate.name
+        is_relay = self.own is not None and self.own.certificate.role is MemberRole.RELAY
+        if certificate.system_ids[1] and not is_relay:
+            yield from range(certificate.system_ids[0], certificate.system_ids[1] + 1)
+
+    def _overlap(self, one: Certificate, other: Certificate) -> bool:
+        """Whether two certificates have a name or a system id in common."""
+        return not {*self._claims_of(one)}.isdisjoint(self._claims_of(other))
 
     def _is_signed(self, certificate: Certificate, key: bytes, data: bytes) -> bool:
         held = self.held.get(key)
@@ -234,18 +244,3 @@ class Trust:
 def _same(one: Certificate, other: Certificate) -> bool:
     """Whether two certificates are of the same member."""
     return one._replace(serial=0) == other._replace(serial=0)
-
-
-def _claims_of(certificate: Certificate) -> Iterator[str | int]:
-    """What no other member may have."""
-    yield certificate.name
-    if certificate.system_ids[1]:
-        yield from range(certificate.system_ids[0], certificate.system_ids[1] + 1)
-
-
-def _overlap(one: Certificate, other: Certificate) -> bool:
-    """Whether two certificates have a name or a system id in common."""
-    has_ids = one.system_ids[1] and other.system_ids[1]
-    return one.name == other.name or bool(
-        has_ids and one.system_ids[0] <= other.system_ids[1] and other.system_ids[0] <= one.system_ids[1]
-    )

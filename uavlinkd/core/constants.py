@@ -79,8 +79,6 @@ RETRY_MIN_S = 0.25
 RETRIES_PER_WAIT = 12
 """Tries before the wait doubles. If a link loses 30 % in each direction, a try fails in 51 % of cases: all of ten
 tries in the first 3 s fail once in 800 links, all of two dozen in the first 10 s once in ten million."""
-SHORT_TRIES = 2
-"""Tries without the own certificate before it is shown again: the peer may have restarted."""
 RETRY_MAX_S = 1.5
 """Longest wait between tries, which never end. With the jitter it stays under 2 s, so a link that comes back after
 any outage carries frames within that; a try each 1.5 s costs a dead link about 1 kbit/s with x25519."""

@@ -35,7 +35,8 @@ def initiate(peer: Peer, now: float) -> list[Output]:
     paths = unmetered + initiator.take_metered(metered, now)
     if initiator.attempts < c.REKEYS_ALONG_BEST and is_answering and peer.paths.works:
         paths = paths[:1]
-    paths, slow_at = initiator.take_slow(paths, now)
+    shown = initiator.shown(is_answering=is_answering)
+    paths, slow_at = initiator.take_slow(paths, shown, now)
     initiator.begin_try(now, is_metered=not unmetered, slow_at=slow_at)
     peer.set_initiate()
     if not paths:
@@ -44,7 +45,7 @@ def initiate(peer: Peer, now: float) -> list[Output]:
         index = peer.indices.pick(now)
     except Drop as drop:  # every index is taken: as if the initiation had been lost
         return peer.drop(drop.reason, 1)
-    pending, datagrams = initiator.initiate(index, paths, peer.sessions.generation, now)
+    pending, datagrams = initiator.initiate(index, paths, peer.sessions.generation, shown, now)
     peer.indices.owners[index] = peer, pending
     peer.set_expiry()
     return [sent for datagram, path in datagrams for sent in transmit(peer, datagram, path, is_copy=path != paths[0])]

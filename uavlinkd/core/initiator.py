@@ -82,8 +82,10 @@ class Initiator:
         self._metered_turn += 1
         return [paths[self._metered_turn % len(paths)]]
 
-    def take_slow(self, paths: list[Path], now: float) -> tuple[list[Path], float]:
+    def take_slow(self, paths: list[Path], shown: bytes, now: float) -> tuple[list[Path], float]:
         """Of these paths those along which to initiate now, and when the next try is due if all of them are slow.
+
+        ``shown``: the certificate in this initiation.
 
         On a network with a budget the tries are :data:`c.TRY_AIRTIMES` airtimes apart, whatever other networks do.
         """
@@ -91,7 +93,7 @@ class Initiator:
         slow_at, is_free = c.NEVER, False
         sockets: set[int] = set()
         for path in paths:
-            interval_s = self._try_interval_s(path)
+            interval_s = self._try_interval_s(path, shown)
             if not interval_s:
                 is_free = True
                 taken.append(path)
@@ -103,15 +105,14 @@ class Initiator:
             slow_at = min(slow_at, self._slow_at[path.socket])
         return taken, now if is_free else slow_at
 
-    def _try_interval_s(self, path: Path) -> float:
+    def _try_interval_s(self, path: Path, shown: bytes) -> float:
         """Between tries along a path; 0 if it carries the usual ones."""
-        interval_s = self._facts.try_interval_s(path, self.settings.link.suites[0], len(self._shown()))
+        interval_s = self._facts.try_interval_s(path, self.settings.link.suites[0], len(shown))
         return interval_s if interval_s > self.settings.link.timers.retry_min_s else 0.0
 
-    def _shown(self) -> bytes:
-        """The certificate, if the present attempt shows it: two of three do to a peer that may have restarted."""
-        is_again = self.attempts > c.SHORT_TRIES and self.attempts % 3 != 2
-        return b"" if self.is_known and not is_again else self.certificate
+    def shown(self, *, is_answering: bool) -> bytes:
+        """The certificate, if the next attempt shows it. To a peer that may have restarted, every other one does."""
+        return b"" if self.is_known and (is_answering or self.attempts % 2) else self.certificate
 
     def _jitter(self) -> float:
         return 1.0 + c.RETRY_JITTER * int.from_bytes(self._entropy(2), "big") / 2**16
@@ -138,14 +139,13 @@ class Initiator:
             self.retry_at = max(self.retry_at, self._metered_at)
 
     def initiate(
-        self, index: int, paths: Sequence[Path], generation: int, now: float
+        self, index: int, paths: Sequence[Path], generation: int, shown: bytes, now: float
     ) -> tuple[Pending, list[tuple[bytes, Path]]]:
         """An initiation under this index, and its datagram for each path. They are equal up to mac1."""
-        shown = self._shown()
         initiated = handshake.initiate(self._identity, self.settings, index, generation, self._entropy, shown)
         datagrams = [(self.add_macs(initiated.message, path, now), path) for path in paths]
         mac1 = mac1_of(datagrams[0][0])
-        slowest_s = max(map(self._try_interval_s, paths))
+        slowest_s = max(self._try_interval_s(path, shown) for path in paths)
         expires_at = now + max(c.PENDING_LIFETIME_S, slowest_s)
         while len(self.pending) >= c.PENDING_PER_PEER:
             # Fast tries along one network must not push out the one that a slow network still carries.

@@ -125,6 +125,7 @@ class FleetMembers:
         self._reserve(config, fleet)
         self._hold_contacts()
         self._show_certificate()
+        self._persist()  # the configuration may have a newer bulletin
 
     @property
     def next_at(self) -> float:
@@ -252,7 +253,7 @@ class FleetMembers:
                 self._join(key, peer, now)
             case o.PeerExpired():
                 self.trust.held.pop(key, None)
-            case o.SessionEstablished() if peer.session_with(c.FEATURE_FLEET, now) is not None:
+            case o.SessionEstablished() | o.PeerUp() if peer.session_with(c.FEATURE_FLEET, now) is not None:
                 budget = self._node.facts.pace(peer.path) if peer.path is not None else None
                 self.exchange.on_handshake(key, max(2 * peer.answer_s, 0.0 if budget is None else budget.ask_s), now)
                 if self._fleet.call and any(relay.peer is peer for relay in self._relays.by_name.values()):

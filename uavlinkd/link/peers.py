@@ -58,9 +58,13 @@ class Peers:
         if parts.fleet is not None and config.fleet is not None:
             parts.fleet.follow(config, config.fleet, monotonic())
         for name in changes.removed_relays:
-            perform(parts.relays.remove(name, monotonic()))
+            if (used := parts.relays.by_name.get(name)) is not None:  # else a bulletin revoked it
+                if parts.fleet is not None:
+                    parts.fleet.exchange.forget(used.peer.settings.public_key)
+                perform(parts.relays.remove(name, monotonic()))
         for name in changes.removed_peers:
-            self._remove_peer(name)
+            if name in parts.links:
+                self._remove_peer(name)
         # First of all give up names and keys: what is added may have them.
         if parts.relay is not None and config.relay_server is not None:
             parts.relay.release(config.relay_server.by_key, config.keys_of_others, monotonic())
