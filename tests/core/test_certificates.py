@@ -277,7 +277,7 @@ def test_pinned_peer_does_not_need_its_certificate() -> None:
 
 
 def test_certificate_is_shown_again_without_answers() -> None:
-    """A rekey is short while the peer answers. One that is silent may have restarted: it gets long and short tries."""
+    """A rekey is short while the peer answers. One that is silent may have restarted: it gets both in turn."""
     fleet = Fleet()
     exchange(fleet.b, fleet.a, fleet.a.timeout(0.0), 0.0)
     now, lengths = c.REKEY_AFTER_S + 1, list[int]()
