@@ -200,7 +200,7 @@ def test_introductions_to_one_member_have_a_limit() -> None:
     """Those above it follow with renewed binds. Introductions to others have budgets of their own."""
     relay = CertifiedRelay()
     seekers = relay.join(*range(1, INTRODUCTIONS.burst + 11))
-    one, other = relay.join(100, 101, role=OPERATOR)
+    one, other = relay.join(250, 251, role=OPERATOR)
     for seeker in seekers:
         seeker.bind(one)
     assert one.learnt == [seeker.key for seeker in seekers[: INTRODUCTIONS.burst]]
