@@ -45,8 +45,11 @@ def test_passphrase_from_a_file(file: Path, capsys: pytest.CaptureFixture[str]) 
     """It opens both keys, and is in no output. A wrong one does not."""
     assert main([*INIT, "--passphrase-file", str(file)]) == 0
     ask = passphrase_from(file)
-    public = {load_key(Path("fleet", name), ask).public for name in (AUTHORITY_FILE, SUCCESSOR_FILE)}
-    assert len(public) == 2
+    private, successor = (load_key(Path("fleet", name), ask) for name in (AUTHORITY_FILE, SUCCESSOR_FILE))
+    assert private != successor
+    capsys.readouterr()
+    assert main(["fleet", "paper", "--passphrase-file", str(file)]) == 0
+    assert read_paper(capsys.readouterr().out) == private
     assert main(["fleet", "add", "v7", "--passphrase-file", str(file)]) == 0
     assert PASSPHRASE not in "".join(capsys.readouterr())
     file.write_text("wrong\n")

@@ -90,6 +90,18 @@ async def test_bulletin_reaches_the_daemon(daemon: Daemon) -> None:
     assert daemon.certificates == []
 
 
+def test_removal_without_a_daemon_says_what_is_left_to_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The member is revoked in the folder already."""
+    create(tmp_path / "fleet", drones=1, relays=RELAYS)
+    assert (
+        main(["fleet", "remove", "drone1", "--out", str(tmp_path / "fleet"), "--socket", str(tmp_path / "no")]) == 2
+    )
+    error = capsys.readouterr().err
+    assert "drone1 is revoked in" in error
+    assert "Then run `uavlinkd fleet publish`" in error
+    assert read_manifest(tmp_path / "fleet").bulletin.revoked == (2,)
+
+
 async def test_new_certificates_come_before_the_bulletin_that_ends_the_old_ones(
     daemon: Daemon, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -18,6 +18,7 @@ from uavlinkd.fleet.authority_key import (
     AUTHORITY_FILE,
     SUCCESSOR_FILE,
     Passphrase,
+    load_key,
     paper_copy,
     passphrase_from,
     read_paper,
@@ -37,7 +38,7 @@ from uavlinkd.fleet.publishing import publish
 from uavlinkd.fleet.signing import Identity
 from uavlinkd.mavlink.dialect import SYSTEM_ID
 from uavlinkd.ops.commands import control_socket
-from uavlinkd.system.terminal import OK, printable
+from uavlinkd.system.terminal import OK, CommandError, printable
 
 _SET_IDS = f"Set {SYSTEM_ID} of each autopilot, and the id of each ground control station, to the id above"
 
@@ -59,7 +60,7 @@ def _init(options: argparse.Namespace) -> None:
     result, private = operations.init(options.out, settings, counts, places, _new_passphrase(options))
     _print_result(options, result)
     _say(f"\n{options.out / AUTHORITY_FILE} signs members: back it up. Its paper copy, for a safe:")
-    _say(paper_copy(private) if sys.stdout.isatty() else "(printed on a terminal only)")
+    _say(paper_copy(private) if sys.stdout.isatty() else "(`uavlinkd fleet paper` prints it on a terminal)")
     _say(f"Carry {options.out / SUCCESSOR_FILE} to another place: it can follow the authority's key after a theft.")
 
 
@@ -111,8 +112,12 @@ def _change(options: argparse.Namespace) -> None:
         socket = control_socket(options) if options.action == "remove" else None
         resign = options.action == "revoke" and options.resign
         result = operations.revoke(options.out, options.name, ask, resign=resign)
-        if socket is not None:
-            _published(publish(options.out, socket, ask))
+        try:
+            if socket is not None:
+                _published(publish(options.out, socket, ask))
+        except CommandError as error:
+            reason = f"{options.name} is revoked in {options.out}, but no daemon has the bulletin: {error}"
+            raise FleetError(f"{reason}\nThen run `uavlinkd fleet publish`") from None
     _print_result(options, result)
     if options.action in ("revoke", "rotate"):
         _say("Now publish the bulletin with `uavlinkd fleet publish`: until then members accept the old certificate.")
@@ -125,6 +130,10 @@ def _publish(options: argparse.Namespace) -> None:
 
 def _published(fleet: Fleet) -> None:
     _say(f"The daemon has bulletin {fleet.bulletin.number}, and passes it on.")
+
+
+def _paper(options: argparse.Namespace) -> None:
+    _say(paper_copy(load_key(options.out / AUTHORITY_FILE, passphrase_from(options.passphrase_file))))
 
 
 def _restore(options: argparse.Namespace) -> None:
@@ -228,6 +237,7 @@ _ACTIONS: dict[str, Callable[[argparse.Namespace], None]] = {
     "remove": _change,
     "publish": _publish,
     "list": _list,
+    "paper": _paper,
     "restore": _restore,
     "enroll": _enroll,
 }

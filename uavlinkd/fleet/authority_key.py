@@ -15,7 +15,7 @@ from pathlib import Path
 
 from uavlinkd.config.keys import read_private_file
 from uavlinkd.core.constants import KEY_BYTES
-from uavlinkd.core.crypto import Secret, SigningKey, read_signing_key, sha256
+from uavlinkd.core.crypto import Secret, read_signing_key, sha256
 from uavlinkd.fleet.manifest import FleetError, FleetFileError
 
 AUTHORITY_FILE = "authority.pem"
@@ -60,11 +60,11 @@ def _typed(prompt: str) -> bytes:
         ) from None
 
 
-def load_key(file: Path, ask: Passphrase) -> SigningKey:
+def load_key(file: Path, ask: Passphrase) -> Secret:
     """The key in a file. ``ask`` is called if it is encrypted."""
     pem = read_private_file(file, _LIMIT)
     try:
-        return SigningKey(read_signing_key(pem, ask(str(file)) if b"ENCRYPTED" in pem else None))
+        return read_signing_key(pem, ask(str(file)) if b"ENCRYPTED" in pem else None)
     except ValueError as error:
         raise FleetFileError(f"{file}: {error}") from None
 

@@ -95,6 +95,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         daemon.add_argument("--config", metavar="FILE", type=Path, help="the daemon's configuration")
         daemon.add_argument("--socket", metavar="PATH", type=Path, help="the daemon's control socket")
     add("list", "list the members, also revoked ones", signs=False)
+    add("paper", "print the paper copy of authority.pem, with which each reader can sign")
     add("restore", "write authority.pem from its paper copy on standard input").add_argument(
         "--no-passphrase", action="store_true", help="as of init"
     )

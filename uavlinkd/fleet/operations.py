@@ -226,7 +226,7 @@ def _open_fleet(folder: Path) -> Iterator[Fleet]:
 
 
 def _signer(folder: Path, fleet: Fleet, ask: Passphrase) -> SigningKey:
-    signer = authority_key.load_key(folder / AUTHORITY_FILE, ask)
+    signer = SigningKey(authority_key.load_key(folder / AUTHORITY_FILE, ask))
     if signer.public != fleet.authority.public:
         raise FleetError(f"{folder / AUTHORITY_FILE} is the key of another fleet's authority")
     return signer
