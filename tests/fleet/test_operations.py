@@ -341,7 +341,7 @@ def test_interrupted_command_changes_nothing(folder: Path, monkeypatch: pytest.M
     def interrupt(_: Path) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(keys, "_sync_folder", interrupt)  # the longest wait of the command
+    monkeypatch.setattr(keys, "sync_folder", interrupt)  # the longest wait of the command
     with pytest.raises(KeyboardInterrupt):
         operations.rotate(folder, "drone1", unasked)
     assert snapshot(folder) == before

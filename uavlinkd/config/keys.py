@@ -121,7 +121,7 @@ def write_secret_file(path: Path, text: str) -> None:
             file.write(text.strip() + "\n")
             file.flush()
             os.fsync(file.fileno())
-        _sync_folder(path.parent)
+        sync_folder(path.parent)
     except BaseException as error:
         # Delete half a key: otherwise the next attempt would refuse to overwrite it.
         with suppress(OSError):
@@ -131,7 +131,7 @@ def write_secret_file(path: Path, text: str) -> None:
         raise
 
 
-def _sync_folder(folder: Path) -> None:
+def sync_folder(folder: Path) -> None:
     """Sync the directory entry of a new file."""
     if not _HAS_OWNERS:
         return

@@ -110,6 +110,7 @@ class Rollback:
         """Replace a file by a prepared one, atomically: a reader finds the old or the new content."""
         self.keep(path)
         new.rename(path)
+        keys.sync_folder(path.parent)
 
     def finish(self) -> list[str]:
         """Delete the old contents. Return a sentence about each that cannot be deleted."""
