@@ -26,8 +26,8 @@ CHECK_BYTES = 4
 MOST_CONTACTS = 3
 LONGEST_LINE = 4096
 """More characters than three contacts need. A terminal accepts no longer line."""
-_HEAD = struct.Struct(f">BBBBH{KEY_BYTES}s{KEY_BYTES}s{CERTIFICATE_BYTES}sH")
-_CONTACT = struct.Struct(f">{KEY_BYTES}s{CERTIFICATE_BYTES}sBB")
+_HEAD = struct.Struct(f">BBBB{KEY_BYTES}s{KEY_BYTES}s{CERTIFICATE_BYTES}sH")
+_CONTACT = struct.Struct(f">{KEY_BYTES}s{CERTIFICATE_BYTES}sB")
 _CUT = "is not a whole line of `uavlinkd fleet sign`: it was cut or changed on its way; copy it again, or send a file"
 
 
@@ -91,8 +91,11 @@ class Contact(NamedTuple):
 
     def encode(self) -> bytes:
         """Its bytes in a reply."""
-        texts = [bytes([len(address)]) + address.encode() for address in self.addresses]
-        return _CONTACT.pack(self.public_key, self.certificate, self.relays, len(texts)) + b"".join(texts)
+        return _CONTACT.pack(self.public_key, self.certificate, self.relays) + _encoded(self.addresses)
+
+
+def _encoded(addresses: tuple[str, ...]) -> bytes:
+    return bytes([len(addresses)]) + b"".join(bytes([len(text)]) + text.encode() for text in addresses)
 
 
 class Reply(NamedTuple):
@@ -103,8 +106,8 @@ class Reply(NamedTuple):
     """Members of these roles it connects to."""
     relays: bool
     """Whether it passes datagrams between members."""
-    port: int
-    """Where it listens; 0: it need not."""
+    addresses: tuple[str, ...]
+    """Where others reach it. Without one it need not listen."""
     authority: bytes
     successor: bytes
     """SHA-256 of the key that may follow the authority's."""
@@ -115,9 +118,9 @@ class Reply(NamedTuple):
     def line(self) -> str:
         """The line, without its end."""
         calls = sum(1 << role for role in self.calls)
-        head = (VERSION, self.suite.number, calls, self.relays, self.port, self.authority, self.successor)
-        data = _HEAD.pack(*head, self.certificate, len(self.bulletin)) + self.bulletin + bytes([len(self.contacts)])
-        data += b"".join(contact.encode() for contact in self.contacts)
+        head = (VERSION, self.suite.number, calls, self.relays, self.authority, self.successor)
+        data = _HEAD.pack(*head, self.certificate, len(self.bulletin)) + self.bulletin + _encoded(self.addresses)
+        data += bytes([len(self.contacts)]) + b"".join(contact.encode() for contact in self.contacts)
         return base64.b64encode(data + sha256(data)[:CHECK_BYTES]).decode().rstrip("=")
 
 
@@ -147,26 +150,30 @@ def parse_reply(line: str) -> Reply:
 
 
 def _parsed(data: bytes) -> Reply:
-    _, suite, calls, relays, port, authority, successor, certificate, size = _HEAD.unpack_from(data)
-    at = _HEAD.size + size
+    _, suite, calls, relays, authority, successor, certificate, size = _HEAD.unpack_from(data)
+    addresses, at = _addresses(data, _HEAD.size + size)
     count, at = data[at], at + 1
     contacts = []
     for _ in range(count):
-        key, signed, flag, addresses = _CONTACT.unpack_from(data, at)
-        at += _CONTACT.size
-        texts = []
-        for _ in range(addresses):
-            texts.append(data[at + 1 : at + 1 + data[at]].decode("ascii"))
-            at += 1 + data[at]
-        contacts.append(Contact(key, signed, tuple(texts), bool(flag)))
+        key, signed, flag = _CONTACT.unpack_from(data, at)
+        texts, at = _addresses(data, at + _CONTACT.size)
+        contacts.append(Contact(key, signed, texts, bool(flag)))
     roles = frozenset(role for role in MemberRole if calls >> role & 1)
     bulletin = data[_HEAD.size : _HEAD.size + size]
     parts = (authority, successor, certificate, bulletin, tuple(contacts))
-    reply = Reply(SUITES[suite], roles, bool(relays), port, *parts)
+    reply = Reply(SUITES[suite], roles, bool(relays), addresses, *parts)
     is_same = base64.b64decode(reply.line() + "==")[:-CHECK_BYTES] == data  # one spelling of each reply
     if not is_same or count > MOST_CONTACTS or not all(contact.addresses for contact in contacts):
         raise ValueError("not canonical")
     return reply
+
+
+def _addresses(data: bytes, at: int) -> tuple[tuple[str, ...], int]:
+    texts, count, at = [], data[at], at + 1
+    for _ in range(count):
+        texts.append(data[at + 1 : at + 1 + data[at]].decode("ascii"))
+        at += 1 + data[at]
+    return tuple(texts), at
 
 
 def verify_reply(reply: Reply, own_key: bytes) -> Trust:
@@ -179,11 +186,11 @@ def verify_reply(reply: Reply, own_key: bytes) -> Trust:
         authority = AuthorityKey(reply.authority)
         own = parse_certificate(reply.certificate)
         trust = Trust(authority, own_key, b"", reply.bulletin)
-        for contact in reply.contacts:
-            for address in contact.addresses:
+        for addresses in (reply.addresses, *(contact.addresses for contact in reply.contacts)):
+            for address in addresses:
                 parse_address(address, allow_names=True)
     except AddressError as error:
-        raise EnrolmentError(f"names a contact whose address {error}") from None
+        raise EnrolmentError(f"has an address that {error}") from None
     except Drop:
         raise EnrolmentError("has an invalid certificate: sign the request again") from None
     except ValueError as error:

@@ -24,7 +24,7 @@ from uavlinkd.config.load import load_config
 from uavlinkd.core.certificates import Certificate, parse_bulletin, parse_certificate
 from uavlinkd.core.crypto import x25519_public_key
 from uavlinkd.core.drops import Drop
-from uavlinkd.fleet.files import config_file, key_file, with_fleet, write_config
+from uavlinkd.fleet.files import config_file, key_file, listen_on, with_fleet, write_config
 from uavlinkd.fleet.manifest import FleetError, FleetFileError, FleetSettings
 from uavlinkd.fleet.transaction import Rollback
 
@@ -110,8 +110,7 @@ def finish(line: str, config: Path | None, folder: Path | None, url: str | None,
     _check_present(table.get("fleet"), reply, certificate, place.config)
     own = str(table.get("private_key_file", key_file(certificate.name)))
     path, contacts = _verified(reply, [place.key(own), place.key(_other(own))])
-    ports = [f"0.0.0.0:{reply.port}", f"[::]:{reply.port}"] if reply.port and "listen" not in table else []
-    listen = listen or ports
+    listen = listen or ([] if "listen" in table else listen_on(reply))
     if table:
         top = {"private_key_file": path.name, **({"listen": listen} if listen else {})}
         text = with_fleet(place.config.read_text(encoding="utf-8-sig"), reply, top)

@@ -16,6 +16,7 @@ from uavlinkd.authority.enrolment import Contact, Reply
 from uavlinkd.core.certificates import MemberRole, parse_certificate
 from uavlinkd.core.suites import SUITES_BY_NAME
 from uavlinkd.fleet.manifest import Fleet, FleetError, FleetSettings, Member, base64_of, fill, toml_lines
+from uavlinkd.system.addresses import parse_address
 
 _HEADER = re.compile(r"[ \t]*(\[{1,2})[ \t]*([A-Za-z0-9_-]+)[ \t]*\]|[ \t]*\[")
 _KEY = re.compile(r"[ \t]*(?:\"([^\"]*)\"|'([^']*)'|([A-Za-z0-9_-]+))[ \t]*=")
@@ -40,7 +41,7 @@ def reply_for(fleet: Fleet, member: Member) -> Reply:
         SUITES_BY_NAME[fleet.settings.suite],
         fleet.settings.calls(member.role),
         member.relays,
-        member.addresses[0].port if member.addresses else 0,
+        tuple(map(str, member.addresses)),
         fleet.authority.public,
         fleet.successor,
         member.signed,
@@ -50,6 +51,18 @@ def reply_for(fleet: Fleet, member: Member) -> Reply:
             for contact in fleet.contacts_of(member.name)
         ),
     )
+
+
+def listen_on(reply: Reply) -> list[str]:
+    """Where a member listens, so that others reach it at its addresses."""
+    listen: list[str] = []
+    for text in reply.addresses:
+        address = parse_address(text, allow_names=True)
+        if address.ip is not None:  # a loopback address is for tests
+            listen.append(text if address.is_loopback else address.wildcard().strip('"'))
+        else:  # a name may have addresses of both families
+            listen += [f"0.0.0.0:{address.port}", f"[::]:{address.port}"]
+    return list(dict.fromkeys(listen))
 
 
 def write_config(reply: Reply, settings: FleetSettings, private_key_file: str, listen: Sequence[str]) -> str:

@@ -240,18 +240,9 @@ def _write(changes: FileChanges, member: Member, private: str) -> None:
     """Write the key and the configuration of a member."""
     own, fleet, name = changes.folder / member.name, changes.fleet, member.name
     changes.secrets[own / files.key_file(name)] = private
-    text = files.write_config(files.reply_for(fleet, member), fleet.settings, files.key_file(name), _listen(member))
+    reply = files.reply_for(fleet, member)
+    text = files.write_config(reply, fleet.settings, files.key_file(name), files.listen_on(reply))
     changes.texts[own / files.config_file(name)] = text
-
-
-def _listen(member: Member) -> list[str]:
-    listen: list[str] = []
-    for address in member.addresses:
-        if address.ip is not None and address.is_loopback:
-            listen.append(str(address))
-        else:  # others may have either family
-            listen += [f"0.0.0.0:{address.port}", f"[::]:{address.port}"]
-    return list(dict.fromkeys(listen))
 
 
 def _refresh(changes: FileChanges, before: Fleet, but: str) -> tuple[str, ...]:
