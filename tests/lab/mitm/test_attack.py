@@ -14,7 +14,7 @@ from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Deliver, Output, Transmit
 from uavlinkd.core.path import Path
 from uavlinkd.core.settings import PeerSettings
-from uavlinkd.lab.mitm.anatomy import mavlink_frame
+from uavlinkd.lab.mitm.anatomy import has_certificate, mavlink_frame
 from uavlinkd.lab.mitm.attack import CATCH_UP_LIMIT, NEVER, Action, AttackContext, AttackObject, Direction, Send
 from uavlinkd.lab.mitm.attacks import ATTACKS, parse_attack
 
@@ -167,6 +167,19 @@ def test_bit_flip_goes_through_every_bit() -> None:
     flipped = [sent.datagram for _ in range(bits) for sent in sends(attack.on_datagram(ENVELOPE, AB, 0.0))]
     differences = [int.from_bytes(ENVELOPE, "big") ^ int.from_bytes(datagram, "big") for datagram in flipped]
     assert sorted(differences) == [1 << n for n in range(bits)]
+
+
+def test_length_of_a_certificate() -> None:
+    """It is cut off, with a valid mac1, from an initiation that has its length, and added to another one."""
+    short = next(datagram for datagram, _ in CONVERSATION.said if datagram[0] == 1)
+    attack = parse_attack("certificate-length").make(CONVERSATION.context, 1)
+    (long,) = sends(attack.on_datagram(short, AB, 0.0))
+    assert (has_certificate(short), has_certificate(long.datagram)) == (False, True)
+    (again,) = sends(attack.on_datagram(long.datagram, AB, 0.0))
+    assert again.datagram == short
+    drop = parse_attack("drop,kinds=certificate").make(CONVERSATION.context, 1)
+    assert sends(drop.on_datagram(short, AB, 0.0))
+    assert not sends(drop.on_datagram(long.datagram, AB, 0.0))
 
 
 # What an attacker without keys cannot do: the full relay (H2), group keys and stolen keys (H6, H7, D19, D20), clocks

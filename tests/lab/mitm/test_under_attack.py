@@ -32,6 +32,7 @@ EXPECTED: dict[str, set[Reason]] = {
     "replace-key": {Reason.BAD_HANDSHAKE},
     "random": {Reason.BAD_HANDSHAKE},
     "suite-downgrade": {Reason.BAD_HANDSHAKE},
+    "certificate-length": {Reason.BAD_HANDSHAKE},
     "invalid-element": {Reason.INVALID_KEY_SHARE},
     "corrupt-share": {Reason.BAD_HANDSHAKE},
     "alter-indices": {Reason.HEADER_MISMATCH},

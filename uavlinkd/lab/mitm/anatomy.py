@@ -97,8 +97,14 @@ def parts_of(datagram: bytes) -> Parts | None:
     )
 
 
+def has_certificate(datagram: bytes) -> bool:
+    """Whether an initiation carries a certificate, by its length."""
+    parts = parts_of(datagram)
+    return parts is not None and len(datagram) == message_bytes(parts.kind, parts.suite) + wire.CERTIFICATE_BYTES
+
+
 def message_bytes(kind: DatagramKind, suite: Suite) -> int:
-    """The length of an initiation or a response of a suite."""
+    """The length of an initiation without a certificate or a response of a suite."""
     return wire.initiation_bytes(suite) if kind is DatagramKind.INITIATION else wire.response_bytes(suite)
 
 
@@ -120,10 +126,10 @@ def with_mac1(datagram: bytes, public_key: bytes | None) -> bytes:
     return covered + hmac.digest(key, covered, "sha256")[: c.MAC_BYTES] + mac2
 
 
-def random_initiation(rng: Random, suite: Suite, public_key: bytes | None) -> bytes:
-    """An initiation of random bytes; ``mac2`` is zero. With a key, its ``mac1`` is valid."""
+def random_initiation(rng: Random, suite: Suite, public_key: bytes | None, more: int = 0) -> bytes:
+    """An initiation of random bytes, ``more`` than usual; ``mac2`` is zero. With a key, its ``mac1`` is valid."""
     header = wire.initiation_header(suite, rng.randrange(1, 2**16))
-    body = rng.randbytes(wire.initiation_bytes(suite) - len(header) - wire.MACS_BYTES)
+    body = rng.randbytes(wire.initiation_bytes(suite) + more - len(header) - wire.MACS_BYTES)
     return with_mac1(header + body + bytes(wire.MACS_BYTES), public_key)
 
 
@@ -183,6 +189,12 @@ def is_probe(datagram: bytes) -> bool:
     return len(payload) in _PROBE_BYTES or (payload[:1] == bytes((PROBE,)) and parse_probe(payload) is not None)
 
 
+def is_record(datagram: bytes) -> bool:
+    """Whether an envelope seems to carry a record. In a confidential session that is a guess."""
+    envelope = envelope_of(datagram)
+    return envelope is not None and datagram[envelope.header_bytes] == wire.SEALED_RECORD
+
+
 def message_ids(datagram: bytes) -> tuple[int, ...]:
     """The message IDs of the frames in an envelope; empty if it is encrypted or has no frames."""
     envelope = envelope_of(datagram)
@@ -213,10 +225,23 @@ def _frame_at(data: bytes, at: int) -> tuple[int, int]:
 
 # The kinds of datagrams that an attack can be limited to.
 
-KindFilter = Literal["any", "handshake", "initiation", "response", "cookie", "envelope", "report", "probe", "frames"]
+KindFilter = Literal[
+    "any",
+    "handshake",
+    "initiation",
+    "certificate",
+    "response",
+    "cookie",
+    "envelope",
+    "report",
+    "record",
+    "probe",
+    "frames",
+]
 KINDS: Final = (
-    "any, handshake, initiation, response, cookie, envelope, report (a refusal or problem report in the clear), probe"
-    " (by its length, or in the clear before frames), or frames (envelopes that are neither probes nor echoes)"
+    "any, handshake, initiation, certificate (an initiation with one), response, cookie, envelope, report (a refusal"
+    " or problem report in the clear), record (of fleets and relays, likewise), probe (by its length, or in the clear"
+    " before frames), or frames (envelopes that are neither probes nor echoes)"
 )
 
 
@@ -228,8 +253,12 @@ def matches_kind(kinds: KindFilter, datagram: bytes) -> bool:
             return True
         case "handshake":
             return kind in HANDSHAKE
+        case "certificate":
+            return has_certificate(datagram)
         case "report":
             return is_report(datagram)
+        case "record":
+            return is_record(datagram)
         case "probe":
             return is_probe(datagram)
         case "frames":

@@ -48,6 +48,7 @@ class Options(BaseModel):
     )
     rate_per_s: float = Field(10.0, gt=0, le=100_000, description="datagrams per second")
     mac1: Literal["valid", "bad"] = Field("valid", description="valid needs the receiver's public key")
+    certificate: bool = Field(False, description="make initiations as long as those with a certificate")
     sources: int = Field(
         64, ge=0, le=STRANGERS, description="number of strangers that send; 0: send from the other peer's address"
     )

@@ -7,7 +7,7 @@ from collections import deque
 from uavlinkd.core import wire
 from uavlinkd.core.constants import MAC_BYTES
 from uavlinkd.core.suites import X25519
-from uavlinkd.lab.mitm.anatomy import HANDSHAKE, DatagramKind, kind_of, random_initiation
+from uavlinkd.lab.mitm.anatomy import HANDSHAKE, DatagramKind, kind_of, matches_kind, random_initiation
 from uavlinkd.lab.mitm.attack import Action, Attack, AttackError, Direction, Operation, Send, Timed
 
 RECORD_LIMIT = 4096
@@ -35,7 +35,7 @@ class Flood(Timed, rate_per_s=500.0, sources=64):
         raise NotImplementedError
 
 
-class FloodInitiations(Flood, name="flood-initiations", catalogue=("H12",), mac1="valid"):
+class FloodInitiations(Flood, name="flood-initiations", catalogue=("H12",), mac1="valid", certificate=False):
     """Floods with random initiations, with a valid or bad mac1, from many addresses."""
 
     def prepare(self) -> None:
@@ -46,10 +46,11 @@ class FloodInitiations(Flood, name="flood-initiations", catalogue=("H12",), mac1
 
     def make(self, direction: Direction) -> tuple[bytes, str]:
         key = self.context.public_keys[direction.receiver] if self.options.mac1 == "valid" else None
-        return random_initiation(self.rng, X25519, key), f"{self.options.mac1} mac1"
+        more = wire.CERTIFICATE_BYTES if self.options.certificate else 0
+        return random_initiation(self.rng, X25519, key, more), f"{self.options.mac1} mac1"
 
 
-class FloodReplays(Flood, name="flood-replays", catalogue=("H3", "H12")):
+class FloodReplays(Flood, name="flood-replays", catalogue=("H3", "H12"), kinds="initiation"):
     """Floods with recorded initiations, from many addresses."""
 
     def prepare(self) -> None:
@@ -57,7 +58,7 @@ class FloodReplays(Flood, name="flood-replays", catalogue=("H3", "H12")):
         self._recorded = {direction: deque[bytes](maxlen=RECORD_LIMIT) for direction in self.directions}
 
     def observe(self, datagram: bytes, direction: Direction, now: float) -> None:
-        if kind_of(datagram) is DatagramKind.INITIATION:
+        if kind_of(datagram) is DatagramKind.INITIATION and matches_kind(self.options.kinds, datagram):
             self._recorded[direction].append(datagram)
 
     def make(self, direction: Direction) -> tuple[bytes, str] | None:

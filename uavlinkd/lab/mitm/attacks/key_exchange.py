@@ -12,6 +12,7 @@ from uavlinkd.core.suites import SUITES_BY_NAME, X25519
 from uavlinkd.lab.mitm.anatomy import (
     DatagramKind,
     Parts,
+    has_certificate,
     kind_of,
     message_bytes,
     parts_of,
@@ -97,9 +98,23 @@ class SuiteDowngrade(FieldAlteration, name="suite-downgrade", catalogue=("H10", 
     def change(self, parts: Parts) -> tuple[Parts, str]:
         suite = SUITES_BY_NAME["ffdhe2048"] if parts.suite is X25519 else X25519
         changed = parts._replace(header=bytes((parts.header[0], suite.number)) + parts.header[2:])
-        room = message_bytes(parts.kind, suite) - (len(changed.join()) - len(parts.share))
+        certificate = wire.CERTIFICATE_BYTES if has_certificate(parts.join()) else 0
+        room = message_bytes(parts.kind, suite) + certificate - (len(changed.join()) - len(parts.share))
         share = (parts.share + self.rng.randbytes(max(0, room - len(parts.share))))[:room]
         return changed._replace(share=share), f"suite {parts.suite.name} to {suite.name}"
+
+
+class CertificateLength(FieldAlteration, name="certificate-length", catalogue=("H10", "H18"), message="initiation"):
+    """Cuts the bytes of a certificate off initiations that have one, and adds as many to those without.
+
+    The length says whether an initiation carries a certificate.
+    """
+
+    def change(self, parts: Parts) -> tuple[Parts, str]:
+        size = wire.CERTIFICATE_BYTES
+        if has_certificate(parts.join()):
+            return parts._replace(rest=parts.rest[:-size]), "certificate cut off"
+        return parts._replace(rest=parts.rest + self.rng.randbytes(size)), "certificate added"
 
 
 class InvalidElement(FieldAlteration, name="invalid-element", catalogue=("H8", "H9")):
