@@ -16,13 +16,14 @@ import pytest
 from tests.lab.evaluation.quick_runs import run_quickly
 from tests.waiting import PATIENCE_S
 from uavlinkd.lab.evaluation import tampering_plan as plans
+from uavlinkd.lab.evaluation.fleet_plan import FLEET_PLANS, FLEET_RELAY_PLANS
 from uavlinkd.lab.evaluation.middle import MiddleHere
 from uavlinkd.lab.evaluation.paper_attacks import CHANGES
 from uavlinkd.lab.evaluation.stage import DaemonStage
 from uavlinkd.lab.evaluation.tampering_plan import LINE_PLANS, PATH_PLANS, RELAYED_PLANS, SPOILED_PLANS, TrialPlan
 from uavlinkd.lab.evaluation.tampering_records import NOT_IN_TIME, OURS, PAPER, RECOVERY_LIMIT_S, RELAY, Verdict
 from uavlinkd.lab.evaluation.tampering_run import TAMPERING
-from uavlinkd.lab.hostile.relay_attacks import RELAY_ATTACKS
+from uavlinkd.lab.hostile.all_attacks import RELAY_ATTACKS
 from uavlinkd.lab.mitm.anatomy import mavlink_frame
 from uavlinkd.lab.mitm.attack import AttackContext
 from uavlinkd.lab.mitm.attacks import ATTACKS, parse_attack
@@ -95,6 +96,7 @@ ALL_PLANS: tuple[TrialPlan, ...] = (
     *plans.MISROUTE_PLANS,
     *PATH_PLANS,
     *SPOILED_PLANS,
+    *FLEET_PLANS,
 )
 
 
@@ -178,7 +180,7 @@ async def test_quick_run(tmp_path: Path) -> None:
 
     run = TAMPERING.read(tmp_path)
     ours, paper = run.on(OURS), run.on(PAPER)
-    chosen = [plan for plan in (*ALL_PLANS, *LINE_PLANS, *RELAYED_PLANS) if not plan.is_variant]
+    chosen = [plan for plan in (*ALL_PLANS, *LINE_PLANS, *RELAYED_PLANS, *FLEET_RELAY_PLANS) if not plan.is_variant]
     assert {trial.attack for trial in ours} >= {plan.attack for plan in chosen}
     assert len({trial.attack for trial in ours if trial.group == "keys"}) == 7
     for trial in ours:

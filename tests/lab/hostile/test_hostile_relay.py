@@ -15,8 +15,9 @@ from uavlinkd.config.build import TIMERS
 from uavlinkd.core import constants as c
 from uavlinkd.core.crypto import KeyPair, Secret
 from uavlinkd.core.settings import Link, PeerSettings
+from uavlinkd.lab.hostile.all_attacks import ALL_ATTACKS
 from uavlinkd.lab.hostile.hostile_relay import HostileRelay, HostileRelaySettings
-from uavlinkd.lab.hostile.relay_attacks import ALL_ATTACKS, REPLAY_EVERY_S
+from uavlinkd.lab.hostile.relay_attacks import REPLAY_EVERY_S
 from uavlinkd.lab.mitm.attacks import parse_attack
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.relay.forwarding import MemberSettings, RelayLimits

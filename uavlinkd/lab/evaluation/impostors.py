@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import cycle, islice
 from time import monotonic
 
 from uavlinkd.config.keys import decode_key
 from uavlinkd.core import wire
-from uavlinkd.core.constants import PROBLEMS_PER_REPORT, REFUSALS_PER_REPORT
+from uavlinkd.core.constants import FEATURE_FLEET, FEATURE_RECORDS, PROBLEMS_PER_REPORT, REFUSALS_PER_REPORT
 from uavlinkd.core.cookie import CookieJar, MacKeys
 from uavlinkd.core.crypto import KeyPair, Secret
 from uavlinkd.core.drops import DropReason
@@ -24,6 +25,7 @@ from uavlinkd.core.path import Path
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.problem_reports import ProblemReport
 from uavlinkd.core.refusals import RefusalReport, Refused
+from uavlinkd.core.relay_records import FleetRecord
 from uavlinkd.core.send import seal
 from uavlinkd.core.session import Session
 from uavlinkd.core.settings import Class, Link, PeerSettings, Timers
@@ -89,6 +91,7 @@ class Disguise:
     """The peer whose address it uses."""
     identity: KeyPair
     psk: bytes | None = None
+    certificate: bytes = b""
 
 
 @dataclass(slots=True)
@@ -127,17 +130,21 @@ class Impostor(PassiveAttack):
         self.relays = relays
         self._frames = frames
         self._speaks = bool(frames) or lies
+        self.records: Iterator[FleetRecord] = iter(())
+        """To be sent on a session, without an end."""
         self._claimed = 0
         self._speaks_at = now
         self._directions = {disguise.victim: Direction(disguise.pose, disguise.victim) for disguise in disguises}
         self._nodes: dict[str, Node] = {}
         link = Link(suites=(X25519,), timers=Timers(retry_min_s=RETRY_S, retry_max_s=RETRY_S))
+        of_fleet = replace(link, features=FEATURE_RECORDS | FEATURE_FLEET)
         for disguise in disguises:
             node = self._nodes[disguise.victim] = ThievingNode(disguise.identity, now)
-            psk = None if disguise.psk is None else Secret(disguise.psk)
-            node.set_paths(
-                node.add_peer(PeerSettings(disguise.victim, disguise.victim_key, psk, link), now), [_PATH], now
-            )
+            psk, is_certified = None if disguise.psk is None else Secret(disguise.psk), bool(disguise.certificate)
+            node.set_certificate(disguise.certificate)
+            settings = PeerSettings(disguise.victim, disguise.victim_key, psk, link, is_certified=is_certified)
+            settings = replace(settings, link=of_fleet) if is_certified else settings
+            node.set_paths(node.add_peer(settings, now), [_PATH], now)
 
     def on_datagram(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
         """Process a datagram of a victim; pass it, except as a full relay."""
@@ -159,7 +166,11 @@ class Impostor(PassiveAttack):
         for victim, node in self._nodes.items():
             actions += self._perform(victim, node.handle_timeout(now), now)
             peer = node.peers[victim]
-            if self._speaks and now >= self._speaks_at and peer.sessions.current is not None:
+            if now < self._speaks_at or peer.sessions.current is None:
+                continue
+            for record in islice(self.records, REPORTS_AT_ONCE):
+                actions += self._perform(victim, node.send_record(peer, None, record, now), now)
+            if self._speaks:
                 self.achieved[victim].frames_sent += len(self._frames)
                 if self._frames:
                     actions += self._perform(victim, node.send(peer, self._frames, now), now)
@@ -181,7 +192,7 @@ class Impostor(PassiveAttack):
 
     def next_deadline(self) -> float:
         deadlines = [node.next_deadline() for node in self._nodes.values()]
-        return min([*deadlines, *([self._speaks_at] if self._speaks else [])], default=NEVER)
+        return min([*deadlines, self._speaks_at], default=NEVER)
 
     def _perform(self, victim: str, outputs: list[Output], now: float) -> list[Action]:
         actions: list[Action] = []
@@ -236,6 +247,9 @@ class KeyAttack:
     relays: bool = False
     frames: tuple[bytes, ...] = ()
     lies: bool = False
+    records: Sequence[FleetRecord] = ()
+    group: str = KEYS
+    needs: tuple[str, ...] = ()
 
 
 def key_attacks(stage: DaemonStage) -> list[KeyAttack]:
@@ -284,7 +298,15 @@ def key_attacks(stage: DaemonStage) -> list[KeyAttack]:
 
 async def run_key_attack(bench: Bench, attack: KeyAttack) -> None:
     now, lies = monotonic(), attack.lies
-    impostor = Impostor(attack.name, attack.disguises, now, relays=attack.relays, frames=attack.frames, lies=lies)
+    impostor = Impostor(
+        attack.name,
+        attack.disguises,
+        now,
+        relays=attack.relays,
+        frames=attack.frames,
+        lies=lies,
+    )
+    impostor.records = cycle(attack.records)
 
     def total(name: str) -> int:
         return sum(getattr(achieved, name) for achieved in impostor.achieved.values())
@@ -292,12 +314,14 @@ async def run_key_attack(bench: Bench, attack: KeyAttack) -> None:
     attacker = KeyHolder(
         [impostor],
         # As itself, a captured drone has a genuine session: only its frames and reports matter.
-        sessions=lambda: 0 if attack.frames or lies else total("sessions"),
+        sessions=lambda: 0 if attack.frames or lies or attack.records else total("sessions"),
         achieved=lambda: {name: total(name) for name in ("initiations", "answers", "sessions", "frames_read")},
     )
     least_s = 2.0 if attack.relays else 0.5
-    needs = ("problem_began",) if lies else ()
-    plan = TrialPlan(attack.name, KEYS, (), restarts=attack.relays, least_s=least_s, needs=needs, notes=attack.notes)
+    needs = ("problem_began",) if lies else attack.needs
+    plan = TrialPlan(
+        attack.name, attack.group, (), restarts=attack.relays, least_s=least_s, needs=needs, notes=attack.notes
+    )
     await bench.run(plan, attacker)
 
 

@@ -160,7 +160,7 @@ class DaemonStage(Stage):
         ports = free_ports(2 * len(names))
         self.drones = {name: DroneProcess(name, folder / name, *ports[2 * n :][:2]) for n, name in enumerate(names)}
         self.psks: dict[frozenset[str], str] = {}
-        self._link = link
+        self.link = link
         self._silent = frozenset(silent)
         self._clients = Clients(lambda name, datagram: self.ledger.on_received(name, datagram, monotonic()))
         self._before: dict[str, Counter[str]] = {name: Counter() for name in names}
@@ -172,14 +172,18 @@ class DaemonStage(Stage):
     async def open(self) -> None:
         """Configure and start the daemons, the man in the middle, and a client of each daemon."""
         for one in self.names:
-            peers = [self._peer(one, other) for other in self.names if other != one]
-            self.drones[one].configure(self._link, peers, self.networks(one), self.relays(one))
+            self.configure(one)
         await self.middle.start(*self.attacked())
         self._clients.open(self.names)
         for drone in self.drones.values():
             await drone.start()
         for drone in self.drones.values():
             await until(lambda drone=drone: self._is_up(drone), f"{drone.name} did not link")  # type: ignore[misc]
+
+    def configure(self, one: str) -> None:
+        """Write the configuration of a drone."""
+        peers = [self._peer(one, other) for other in self.names if other != one]
+        self.drones[one].configure(self.link, peers, self.networks(one), self.relays(one))
 
     def _peer(self, one: str, other: str) -> dict[str, object]:
         file = f"{other}.psk"
@@ -188,8 +192,10 @@ class DaemonStage(Stage):
         return self.drones[other].as_peer("", file, **settings)
 
     async def _is_up(self, drone: DroneProcess) -> bool:
-        await drone.ask()
-        return bool(drone.peer_statuses) and all(status["state"] == "up" for status in drone.peer_statuses)
+        if not await drone.ask():
+            return False
+        states = [drone.status["peers"].get(name, {}).get("state") for name in self.names if name != drone.name]
+        return set(states) == {"up"}
 
     def attacked(self) -> tuple[dict[str, int], dict[str, bytes]]:
         """The ports and public keys of what the man in the middle is between, by name."""

@@ -14,7 +14,8 @@ from uavlinkd.lab.evaluation.frame import EvaluationSettings
 from uavlinkd.lab.evaluation.tampering_records import PAPER
 
 HANDSHAKE, DATA, FLOOD, TRAFFIC, KEYS = "handshake", "data", "flood", "traffic", "keys"
-PATHS, SPOILED, LINE, RELAYED = "paths", "spoiled", "line", "relay"
+PATHS, SPOILED, LINE, RELAYED, FLEET = "paths", "spoiled", "line", "relay", "fleet"
+_SHORT_GROUPS: Final = (HANDSHAKE, KEYS, FLEET)
 LOAD: Final = "flood-initiations,rate_per_s=600"
 """The load at which daemons require cookies."""
 
@@ -34,14 +35,14 @@ class TamperingSettings(EvaluationSettings):
     def target(self, group: str, system: str) -> int:
         """The number of attempts of an attack. On the paper's protocol a tenth is sufficient."""
         if self.quick:
-            return 5 if group in (HANDSHAKE, KEYS) else 60
-        wanted = 200 if group in (HANDSHAKE, KEYS) else 10_000
+            return 5 if group in _SHORT_GROUPS else 60
+        wanted = 200 if group in _SHORT_GROUPS else 10_000
         return wanted // 10 if system == PAPER else wanted
 
     def most_s(self, group: str) -> float:
         if self.quick:
             return 8.0
-        return 300.0 if group in (HANDSHAKE, KEYS) else 60.0
+        return 300.0 if group in _SHORT_GROUPS else 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +92,7 @@ def with_target(phase: str, target: int) -> str:
     return phase.replace("{target}", str(target)).replace("{more}", str(target + target // 5))
 
 
-def _rows(group: str, table: str, **common: bool | float | str) -> tuple[TrialPlan, ...]:
+def plan_rows(group: str, table: str, **common: bool | float | str) -> tuple[TrialPlan, ...]:
     """The plans in a table: attack, line of attacks (by default the attack's name), and what differs from ``common``.
 
     ``-NAME`` is false. ``paper=same``: the same line on the paper's protocol; ``paper=none``: there is none. An
@@ -131,7 +132,7 @@ HANDSHAKE_PLANS: Final = (
         for name in names
         for paper in ([name] if has_paper else [None])
     ),
-    *_rows(
+    *plan_rows(
         HANDSHAKE,
         """
 alter-macs, mac2 under load | alter-macs,mac=mac2,message=initiation <load>
@@ -162,7 +163,7 @@ cross-initiations | cross-initiations drop-message,message=response,share=0.97 |
 """On a link with a rekey per second and fast retries. With cross-initiations, most responses are dropped too, so that
 both peers continue to initiate."""
 
-STALE_PLANS: Final = _rows(
+STALE_PLANS: Final = plan_rows(
     HANDSHAKE,
     """
 tamper-key, peer restarted | tamper-key | -is_variant
@@ -178,7 +179,7 @@ block-rekey, peer restarted | block-rekey
 )
 """Without a session during the attack, on a link with the default timers: the link recovers after the attack."""
 
-DATA_PLANS: Final = _rows(
+DATA_PLANS: Final = plan_rows(
     DATA,
     """
 bit-flip | bit-flip,beside=true
@@ -209,7 +210,7 @@ roam, then gone | roam,mode=instead | noticed_after_s=<question> takes_away need
 )
 """On a link with a rekey every two seconds. What is held is refused as delayed when it is released."""
 
-FLOOD_PLANS: Final = _rows(
+FLOOD_PLANS: Final = plan_rows(
     FLOOD,
     """
 flood-envelopes | flood-envelopes,rate_per_s=3000 | paper=same is_silent
@@ -224,7 +225,7 @@ forge-hints | forge-hints,rate_per_s=1500
 )
 """On the same link as the attacks on data."""
 
-TRAFFIC_PLANS: Final = _rows(
+TRAFFIC_PLANS: Final = plan_rows(
     TRAFFIC,
     """
 drop, half | drop,share=0.5 | least_s=0.3 targeted takes_away
@@ -241,7 +242,7 @@ blackout, 1 s | blackout,seconds=60 | takes_away needs=envelopes_missing
 """Between three drones, with a rekey per second. In ``stretch`` the delay grows with each envelope; one way, the echo
 records of the other direction are dropped."""
 
-LONG_PLANS: Final = _rows(
+LONG_PLANS: Final = plan_rows(
     TRAFFIC,
     """
 blackout, 4 s | blackout,seconds=60 | least_s=4
@@ -253,7 +254,7 @@ blackout, kept and let go | hold,kinds=any,hold_s=10,seconds=10 | paper=same lea
 )
 """Likewise, only in a full run."""
 
-LAST_PLANS: Final = _rows(
+LAST_PLANS: Final = plan_rows(
     DATA,
     """
 wander
@@ -265,8 +266,8 @@ roam, relaying | roam,mode=relay | least_s=2 -targeted is_variant
 """They validate strangers, so they run after the attacks that count bytes to strangers."""
 
 MISROUTE_PLANS: Final = (
-    *_rows(DATA, "misroute | misroute,kinds=envelope"),
-    *_rows(HANDSHAKE, "misroute handshakes | misroute,kinds=handshake,copies=20 | least_s=1.2"),
+    *plan_rows(DATA, "misroute | misroute,kinds=envelope"),
+    *plan_rows(HANDSHAKE, "misroute handshakes | misroute,kinds=handshake,copies=20 | least_s=1.2"),
 )
 
 PAPER_PLANS: Final = tuple(
@@ -278,7 +279,7 @@ PAPER_PLANS: Final = tuple(
 
 _ON_PATHS: Final[dict[str, Any]] = {"takes_away": True, "keeps_link": True, "targeted": False}
 
-PATH_PLANS: Final = _rows(
+PATH_PLANS: Final = plan_rows(
     PATHS,
     """
 copies on the other path | replay-data,<first>,onto=2 | least_s=0.3 targeted -is_variant needs=duplicate
@@ -320,7 +321,7 @@ roam on one path, relaying | roam,<first>,mode=relay | validates needs=path_chan
 )
 """The first path is the faster one, so it is the best when an attack begins. The last rows validate strangers."""
 
-SPOILED_PLANS: Final = _rows(
+SPOILED_PLANS: Final = plan_rows(
     PATHS,
     """
 both paths spoiled, then one held | hold,kinds=any,direction=both/2,begin_s=7,hold_s=10
@@ -334,7 +335,7 @@ both paths spoiled, then one held | hold,kinds=any,direction=both/2,begin_s=7,ho
 """For 7 s the first path loses half, and all probes; the second one is 1.9 s slow, and becomes the best. With
 heartbeats alone: a stream would show sooner that the best path carries nothing."""
 
-LINE_PLANS: Final = _rows(
+LINE_PLANS: Final = plan_rows(
     LINE,
     """
 bytes injected on the line | line-noise,interval_s=0.1 | needs=line_noise
@@ -353,7 +354,7 @@ line held for 10 s in one direction | line-hold,hold_s=10,interval_s=1000,end=ri
 """On a serial line, with a rekey every ten seconds. The first three add no whole datagram to the recorded ones, from
 which the fourth one selects."""
 
-RELAYED_PLANS: Final = _rows(
+RELAYED_PLANS: Final = plan_rows(
     RELAYED,
     """
 relay drops half | drop,kinds=any,share=0.5 | needs=envelopes_missing

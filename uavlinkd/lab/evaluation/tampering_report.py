@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from uavlinkd.lab.evaluation.frame import NOTHING, THE_PAPER, ReportSection, Table, duration
 from uavlinkd.lab.evaluation.records import Record
-from uavlinkd.lab.evaluation.tampering_plan import DATA, HANDSHAKE, KEYS, LINE, PATHS, RELAYED
+from uavlinkd.lab.evaluation.tampering_plan import DATA, FLEET, HANDSHAKE, KEYS, LINE, PATHS, RELAYED
 from uavlinkd.lab.evaluation.tampering_records import MEANINGS, OURS, PAPER, TamperingFindings, Trial, Verdict
 
 _EFFECT = ["attack", "duration", "attempts", "false frames accepted", "genuine frames lost", "recovery", "noticed by"]
@@ -20,6 +20,7 @@ def sections(run: TamperingFindings) -> list[ReportSection]:
         ReportSection("Two paths", _ON_PATHS, [_paths(run)]),
         ReportSection("On a serial line", _ON_LINE, [_effects(run, LINE)]),
         ReportSection("A hostile relay", _ON_RELAY, [_effects(run, RELAYED)]),
+        ReportSection("A fleet with an authority", _ON_FLEET, [_effects(run, FLEET)]),
         ReportSection("The paper's protocol", _ON_PAPER),
     ]
     return [part for part in parts if not part.tables or part.tables[0].rows]
@@ -62,6 +63,14 @@ _ON_RELAY = [
     "bound the wrong members, it reports the true handles at the end. An attempt is one datagram or record. What a "
     "relay can do is to deny service."
 ]
+_ON_FLEET = [
+    "Members by certificate. First two daemons: the second one has the first as its contact, which knows it only by "
+    "the certificate that it shows. A man in the middle without keys attacks what only a fleet sends; an attempt is "
+    "one datagram. A captured member has a valid key and certificate, or a key and a certificate that do not belong "
+    "together. Then three daemons along a hostile relay of their fleet, which has a relay's certificate and recorded "
+    "older ones; an attempt is one record. No attack may change a bulletin or a certificate that counts at a drone: "
+    "else the run fails."
+]
 _ON_PAPER = [
     "Two drones exchange bare Diffie-Hellman public keys over UDP and authenticate data with an HMAC under the "
     "shared secret. Where the paper is silent, we decided: the keys change every 0.25 s, so that attacks have a "
@@ -87,7 +96,7 @@ def _table(run: TamperingFindings) -> Table:
     order = {HANDSHAKE: 0, KEYS: 1, DATA: 2}
     rows = []
     for trial in sorted(run.on(OURS), key=lambda trial: (order.get(trial.group, 3), trial.attack)):
-        if trial.group in (PATHS, LINE, RELAYED):
+        if trial.group in (PATHS, LINE, RELAYED, FLEET):
             continue
         other = paper.get(trial.attack)
         rows.append(

@@ -16,6 +16,8 @@ from typing import Any, Final
 from uavlinkd.core.drops import DropReason
 from uavlinkd.lab.evaluation import tampering_plan as plans
 from uavlinkd.lab.evaluation.commands import STAGES
+from uavlinkd.lab.evaluation.fleet_plan import FLEET_PLANS, FLEET_RELAY_PLANS
+from uavlinkd.lab.evaluation.fleet_stages import FleetRelayStage, FleetStage, member_attacks
 from uavlinkd.lab.evaluation.frame import Evaluation, Work, duration
 from uavlinkd.lab.evaluation.impostors import key_attacks, run_key_attack, run_paper_relay, run_sealed_cookies
 from uavlinkd.lab.evaluation.middle import MiddleHere
@@ -76,6 +78,7 @@ class _Lane:
 
 
 _KEYS_ROWS: Final = (*plans.TRAFFIC_PLANS, *plans.LONG_PLANS)
+_FLEET_LINK: Final = {**_rekeying(2.0, 10.0), "retry_max_s": 0.1}
 _LANES: Final = {
     "handshake-0": _Lane(PAIR, FAST_LINK, 50.0, plans.HANDSHAKE_PLANS[0::2]),
     "handshake-1": _Lane(PAIR, FAST_LINK, 50.0, plans.HANDSHAKE_PLANS[1::2]),
@@ -86,6 +89,8 @@ _LANES: Final = {
     # The radio carries more than ten frames per second, so a lost frame was lost by the attack.
     "line": _Lane(PAIR, _rekeying(10.0, 60.0), 10.0, plans.LINE_PLANS, LineStage, MiddleLine),
     "relay": _Lane(TRIO, _rekeying(2.0, 10.0), 0.25, plans.RELAYED_PLANS, RelayStage, MiddleRelay),
+    "fleet": _Lane(PAIR, _FLEET_LINK, 50.0, FLEET_PLANS, FleetStage),
+    "fleet-relay": _Lane(TRIO, _FLEET_LINK, 50.0, FLEET_RELAY_PLANS, FleetRelayStage, MiddleRelay),
 }
 
 
@@ -157,6 +162,9 @@ class _Run:
                 for attack in key_attacks(stage):
                     await run_key_attack(bench, attack)
                 await run_sealed_cookies(bench, stage.public_keys)
+            if label == plans.FLEET and isinstance(stage, FleetStage):
+                for attack in member_attacks(stage):
+                    await run_key_attack(bench, attack)
             for plan in rows:
                 await bench.run(plan)
 

@@ -16,6 +16,7 @@ from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.core.suites import SUITES_BY_NAME
 from uavlinkd.lab.evaluation.middle import HOST, Interventions, interventions, silent_log
 from uavlinkd.lab.evaluation.stage import DaemonStage, until
+from uavlinkd.lab.hostile.hostile_fleet import HostileMembership
 from uavlinkd.lab.hostile.hostile_relay import HostileRelay, HostileRelaySettings
 from uavlinkd.lab.mitm.attack import AttackObject, Direction
 from uavlinkd.lab.mitm.line_attacks import parse_line_attack
@@ -30,9 +31,9 @@ SLOWER: Final = ("both/2", RadioSettings(delay_s=0.02))
 """The second path: the election prefers the first one."""
 SIK: Final = ModemSettings()
 _ENDS: Final = dict(zip(ModemEnd, ("drone0", "drone1"), strict=True))
-_AMPLE: Final = RelayLimits(1_000_000, 10**10)
-_RELAY_LINK: Final = Link((SUITES_BY_NAME["x25519"],), features=c.FEATURE_REFUSALS | c.FEATURE_RECORDS)
-_RELAY_PEERS: Final = 16
+AMPLE: Final = RelayLimits(1_000_000, 10**10)
+RELAY_LINK: Final = Link((SUITES_BY_NAME["x25519"],), features=c.FEATURE_REFUSALS | c.FEATURE_RECORDS)
+RELAY_PEERS: Final = 16
 
 
 class TwoPathStage(DaemonStage):
@@ -114,23 +115,26 @@ class MiddleRelay:
         self._names = tuple(names)
         self._log, self._seed = log, seed
         self._private = os.urandom(c.KEY_BYTES)
+        self.public_key = KeyPair(self._private).public
+        self.membership: HostileMembership | None = None
 
     @property
     def section(self) -> dict[str, object]:
-        key = encode_key(KeyPair(self._private).public)
-        return {"name": "vps", "public_key": key, "addresses": [f"{HOST}:{self.port}"]}
+        return {"name": "vps", "public_key": encode_key(self.public_key), "addresses": [f"{HOST}:{self.port}"]}
 
     async def start(self, addresses: Mapping[str, int], public_keys: Mapping[str, bytes]) -> None:
         """Start for members with these keys. They reach the relay; it does not need their ports."""
         del addresses
-        members = (PeerSettings(name, public_keys[name], None, _RELAY_LINK) for name in self._names)
+        names = self._names if self.membership is None else ()
+        members = (PeerSettings(name, public_keys[name], None, RELAY_LINK) for name in names)
         settings = HostileRelaySettings(
             name="vps",
             private_key=Secret(self._private),
             listen=(Address(HOST, self.port),),
-            server=RelayServer(tuple(MemberSettings(member, _RELAY_PEERS, _AMPLE) for member in members), _AMPLE),
+            server=RelayServer(tuple(MemberSettings(member, RELAY_PEERS, AMPLE) for member in members), AMPLE),
             seed=self._seed,
             log=self._log,
+            fleet=self.membership,
         )
         self.relay = HostileRelay(settings)
         self.relay.log = silent_log()

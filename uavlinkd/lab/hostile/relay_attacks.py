@@ -9,18 +9,15 @@ from __future__ import annotations
 import os
 from abc import abstractmethod
 from collections import deque
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import ClassVar, Final, Protocol
 
 from uavlinkd.core import constants as c
-from uavlinkd.core.relay_records import Bound, wrap
+from uavlinkd.core.relay_records import Bound, CertificateRecord, wrap
 from uavlinkd.lab.mitm.anatomy import DatagramKind
 from uavlinkd.lab.mitm.attack import (
     NEVER,
     Action,
-    Attack,
     AttackContext,
     Direction,
     Intervention,
@@ -28,7 +25,6 @@ from uavlinkd.lab.mitm.attack import (
     Send,
     Timed,
 )
-from uavlinkd.lab.mitm.attacks import ATTACKS
 from uavlinkd.lab.mitm.attacks.forgery import COMMAND_FRAMES
 
 RECORDED: Final = 512
@@ -53,7 +49,7 @@ class AttackedRelay(Protocol):
         """Count an attempt."""
 
     def report_all(self) -> None:
-        """Report to each member the handles of its peers, as after a bind."""
+        """Report to each member the handles of its peers, as after a bind, and introduce all members."""
 
     def send_data(self, member: str, handle: int, inner: bytes) -> None:
         """Send data to a member with any handle."""
@@ -63,6 +59,13 @@ class AttackedRelay(Protocol):
 
     def claim_token(self, member: str, token: bytes) -> None:
         """Report to a member that a token was sent from another port, and send it from the relay's own one."""
+
+    @property
+    def certificates(self) -> list[CertificateRecord]:
+        """All certificates that it knows."""
+
+    def send_certificate(self, member: str, record: CertificateRecord) -> None:
+        """Send a certificate to a member."""
 
     def restart(self) -> None:
         """Forget all sessions, bindings and handles."""
@@ -227,11 +230,3 @@ class RestartAndReplay(RelayAttack, name="relay-restart", rate_per_s=0.4):
 
     def next_deadline(self) -> float:
         return min(super().next_deadline(), self._replay_at)
-
-
-_ALL: tuple[type[RelayAttack], ...] = (
-    *(LieAboutAddresses, BindWrongMembers, InventHandles, SendOwnFrames, LieAboutFilters, RestartAndReplay),
-)
-RELAY_ATTACKS: Final[Mapping[str, type[RelayAttack]]] = MappingProxyType({one.name: one for one in _ALL})
-ALL_ATTACKS: Final[Mapping[str, type[Attack]]] = MappingProxyType({**RELAY_ATTACKS, **ATTACKS})
-"""All that a relay can do: its own attacks, and those of the man in the middle on what it forwards."""

@@ -66,14 +66,18 @@ class DroneProcess:
         peers: Sequence[Mapping[str, object]],
         networks: Sequence[Mapping[str, object]] = (),
         relays: Sequence[Mapping[str, object]] = (),
+        others: Sequence[tuple[str, Mapping[str, object]]] = (),
     ) -> None:
-        """Write the configuration: the ``[link]`` section, each ``[[peer]]``, ``[[network]]`` and ``[[relay]]``."""
+        """Write the configuration: the ``[link]`` section, each ``[[peer]]``, ``[[network]]`` and ``[[relay]]``, and
+        ``others`` with their titles.
+        """
         has_interfaces = any("serial" not in network for network in networks)
         endpoint = {"name": "autopilot", "url": f"udpin:127.0.0.1:{self.endpoint_port}"}
         tables = [("[link]", link), ("[[endpoint]]", endpoint)]
         tables += [("[[network]]", network) for network in networks]
         tables += [("[[relay]]", relay) for relay in relays]
         tables += [("[[peer]]", peer) for peer in peers]
+        tables += others
         self.write(tables, "0.0.0.0" if has_interfaces else "127.0.0.1")
 
     def write(self, sections: Sequence[tuple[str, Mapping[str, object]]], host: str = "127.0.0.1") -> None:
