@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from base64 import b64decode, b64encode
+from collections.abc import Sequence
 
 from tests.authority.signing import AUTHORITY, FLEET, bulletin, signed
 from tests.daemon.process import DaemonProcess
@@ -37,16 +38,19 @@ class CertifiedFleet:
             "certificate": text(self.certificates[daemon.name][1]),
             "bulletin": text(self.bulletin),
         }
-        daemon.config["contact"] = [
-            {
-                "public_key": contact.public_key,
-                "certificate": text(self.certificates[contact.name][1]),
-                "addresses": [contact.address],
-            }
-            for contact in contacts
-        ]
+        for contact in contacts:
+            self.add_contact(daemon, contact, [contact.address])
         if role is MemberRole.RELAY:
             daemon.config["relay_server"] = {}
+
+    def add_contact(self, daemon: DaemonProcess, contact: DaemonProcess, addresses: Sequence[object]) -> None:
+        """Write another member into a daemon's configuration."""
+        section = {
+            "public_key": contact.public_key,
+            "certificate": text(self.certificates[contact.name][1]),
+            "addresses": list(addresses),
+        }
+        daemon.config.setdefault("contact", []).append(section)
 
     def revoke(self, *names: str) -> str:
         """The request that publishes a bulletin which revokes these members too."""

@@ -71,7 +71,7 @@ async def test_station_that_relays(
     await two.start()
     await two.until(lambda status: is_up(status, "ground") and status["fleet"]["number"] == 2)
     assert "v1" not in (await two.status())["peers"]
-    assert not two.events("link_up", peer="v1")
+    assert not two.events("peer_up", peer="v1")
 
 
 async def test_member_gets_a_new_key(

@@ -1,6 +1,7 @@
 """``python -m tests.natlab``: connect all pairs of kinds of NAT, and print how long it takes. As root.
 
-Daemons know only a relay on the internet. ``--faults`` lets NATs, networks and the relay fail instead.
+Daemons know only a relay on the internet. ``--faults`` lets NATs, networks and the relay fail instead. ``--members``
+makes a fleet with an authority, lets vehicles join it and revokes them.
 """
 
 from __future__ import annotations
@@ -12,11 +13,14 @@ from collections.abc import Iterable
 from contextlib import redirect_stdout
 from io import StringIO
 from statistics import median
+from time import monotonic
 
+from tests.daemon.harness import Stage
 from tests.namespaces import why_not
 from tests.natlab import daemons, faults
 from tests.natlab.kinds import KINDS, PAIRED
 from tests.natlab.laboratory import Laboratory
+from tests.natlab.members import Fleet, Joined, Revocation, Scenario, Spread
 from tests.natlab.pairs import make_ipv6_pairs, make_pairs
 from uavlinkd.lab.child_processes import interrupted_by_signals
 
@@ -31,13 +35,19 @@ def main() -> int:
     parser.add_argument("--ipv6", action="store_true", help="pairs of which both or one have IPv6")
     parser.add_argument("--faults", type=int, default=0, metavar="TRIES", help="let each fault happen so often")
     parser.add_argument("--at-once", type=int, default=4, help="pairs of daemons that run at the same time")
+    parser.add_argument("--members", type=int, default=0, metavar="COUNT", help="a fleet with so many vehicles")
+    parser.add_argument("--swarm", action="store_true", help="its vehicles call each other, not only the operator")
+    parser.add_argument("--tries", type=int, default=20, help="vehicles that join it and are revoked")
+    parser.add_argument("--idle-s", type=float, default=0, help="measure what it costs while idle, then pinned peers")
     options = parser.parse_args()
     reason = why_not("nft")
     if reason is not None:
         print(f"needs {reason}", file=sys.stderr)
         return 1
     with interrupted_by_signals():
-        if options.faults:
+        if options.members:
+            asyncio.run(_meet(options))
+        elif options.faults:
             asyncio.run(_fail(options.faults))
         else:
             _connect(options)
@@ -79,6 +89,44 @@ async def _fail(tries: int) -> None:
             f"{name}: back {_spread(outcome.back_s for outcome in outcomes)}; frames lost: {', '.join(lost)}",
             flush=True,
         )
+
+
+async def _meet(options: argparse.Namespace) -> None:
+    line = options.delay_ms / 1000, options.loss_percent / 100
+    scenario = Scenario(options.members, options.swarm, *line)
+    for is_pinned in (False, True) if options.idle_s else (False,):
+        with Laboratory() as laboratory, redirect_stdout(StringIO()):
+            async with Stage() as stage:
+                began = monotonic()
+                fleet = Fleet(laboratory, stage, scenario, is_pinned=is_pinned)
+                await fleet.start()
+                _say(f"{len(fleet.members)} members, all linked {monotonic() - began:.0f} s after the start")
+                if options.idle_s:
+                    cpu_s, sent = await fleet.idle(options.idle_s)
+                    title = "pinned" if is_pinned else "by certificate"
+                    _say(f"{title}, idle: {1000 * cpu_s:.1f} ms of processor time and {sent:.0f} bytes a second")
+                else:
+                    await _revoke_each(fleet, options.tries)
+
+
+async def _revoke_each(fleet: Fleet, tries: int) -> None:
+    joined, spreads, revocations = list[Joined](), list[Spread](), list[Revocation]()
+    for _ in range(tries):
+        joined.append(await fleet.join())
+        spreads.append(await fleet.publish())
+        revocations.append(await fleet.revoke(joined[-1].vehicle))
+        _say(f"{joined[-1][1:]} {spreads[-1]} {revocations[-1]}")
+    _say(f"a new member's links, since its process started: {_spread(one.since_start_s for one in joined)}")
+    _say(f"the same since it listened: {_spread(one.since_ready_s for one in joined)}")
+    _say(f"last member has a bulletin: {_spread(one.to_last_s for one in spreads)}")
+    _say(f"bytes for it: median {median(one.sent_bytes for one in spreads):.0f}")
+    _say(f"last member has a revocation: {_spread(one.to_last_s for one in revocations)}")
+    before, after = (sum(one[field] for one in revocations) for field in (1, 2))
+    _say(f"frames of the revoked member, before a member had the bulletin: {before}, after: {after}")
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
 
 
 sys.exit(main())
