@@ -11,7 +11,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
-from pathlib import Path
 from time import monotonic
 
 import pytest
@@ -21,6 +20,7 @@ from tests.daemon.frames import frame
 from tests.daemon.harness import Stage
 from tests.daemon.process import DaemonProcess
 from tests.faults import network
+from tests.faults.clocks import faked_clock
 from tests.faults.network import FAULT_S
 from tests.faults.talk import Log, Outcome, Talk, grew, prepare, reported
 from tests.namespaces import why_not as why_no_namespaces
@@ -40,14 +40,6 @@ async def _linked(stage: Stage, a: DaemonProcess, b: DaemonProcess, talk: Talk) 
 
 
 # Clocks.
-
-
-def faked_clock(at: str) -> dict[str, str]:
-    """The environment in which a process believes that it is another time; its monotonic clock is genuine."""
-    folders = [Path("/usr/lib"), Path("/usr/lib64"), Path("/usr/local/lib")]
-    libraries = [library for folder in folders for library in sorted(folder.glob("**/faketime/libfaketime.so.1"))]
-    need(bool(libraries), "libfaketime (Debian: faketime)")
-    return {"LD_PRELOAD": str(libraries[0]), "FAKETIME": f"@{at}", "FAKETIME_DONT_FAKE_MONOTONIC": "1", "TZ": "UTC"}
 
 
 async def clock_jumps(stage: Stage) -> Outcome:

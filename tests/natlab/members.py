@@ -117,27 +117,28 @@ class Fleet:
         return [self.ground, *self.vehicles]
 
     async def start(self) -> None:
-        """Wait until each has the links that it asks for."""
-        await self._stage.start(self.relay, linked=False)
-        for member in self.members:
-            await member.start()
-        for vehicle in self.vehicles:
-            await self._until_linked(vehicle)
-        await _until_up(self.ground, {vehicle.name for vehicle in self.vehicles})
+        """Start one after the other, each when those before have their links: they share few processors."""
+        await self._stage.start(self.relay, self.ground, linked=False)
+        for number, vehicle in enumerate(self.vehicles):
+            await vehicle.start()
+            others = self.vehicles[:number] if self._has_link(vehicle) else []
+            await _until_up(vehicle, {one.name for one in (self.ground, *others)})
+            await _until_up(self.ground, {vehicle.name})
 
     # A new member.
 
     async def join(self) -> Joined:
         """One more vehicle. Only its own machine is touched."""
-        others = (self.relay, *self.members)
-        before = _hashes(others)
+        present = (self.relay, *self.members)
+        before = _hashes(present)
         vehicle = self._vehicle()
         began, began_at = monotonic(), time.time()
         await vehicle.start()
-        await self._until_linked(vehicle)
+        others = self.members if self._has_link(vehicle) else [self.ground]
+        await _until_up(vehicle, {one.name for one in others if one is not vehicle})
         await _until_up(self.ground, {vehicle.name})
         took_s = monotonic() - began
-        assert _hashes(others) == before, "a file of another member has changed"
+        assert _hashes(present) == before, "a file of another member has changed"
         (started,) = vehicle.events("daemon_started")
         return Joined(vehicle, took_s, took_s - (_seconds(started["timestamp"]) - began_at))
 
@@ -267,11 +268,6 @@ class Fleet:
 
     def _has_link(self, one: DaemonProcess) -> bool:
         return one is self.ground or self._scenario.is_swarm
-
-    async def _until_linked(self, vehicle: DaemonProcess) -> None:
-        """Wait until a vehicle has the links that it asks for."""
-        others = self.members if self._has_link(vehicle) else [self.ground]
-        await _until_up(vehicle, {one.name for one in others if one is not vehicle})
 
 
 async def _until_up(daemon: DaemonProcess, names: set[str]) -> None:

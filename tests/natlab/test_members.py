@@ -1,4 +1,4 @@
-"""A small fleet with an authority behind NATs: the laboratory of ``python -m tests.natlab --members``, and its claims."""
+"""A small fleet with an authority behind NATs, as ``python -m tests.natlab --members`` makes it."""
 
 from __future__ import annotations
 
