@@ -73,16 +73,16 @@ async def play(stage: Stage, *, settle_s: float = SETTLE_S) -> Outcome:
         await until(lambda: bool(vehicle.events("peer_up") and ground.events("peer_up")))
         (ready,) = vehicle.events("daemon_started")
         linked_s = max(_at(one.events("peer_up")[0]) for one in (vehicle, ground)) - _at(ready)
-        await until(lambda: all(_heard(*pair) for pair in zip(clients, (GROUND, VEHICLE), strict=True)))
+        await until(lambda: all(_arrivals(*pair) for pair in zip(clients, (GROUND, VEHICLE), strict=True)))
         began = time.monotonic()
         await asyncio.sleep(settle_s)
         few_s = await _publish(fleet, FEW, ground, vehicle)
         await asyncio.sleep(settle_s)
         most_s = await _publish(fleet, MOST_REVOKED, ground, vehicle)
         await asyncio.sleep(settle_s)
-        heard = [_heard(*pair) for pair in zip(clients, (GROUND, VEHICLE), strict=True)]
-        assert all(times[-1] > began + 3 * settle_s - HEARTBEAT_S * 4 for times in heard), "heartbeats have ended"
-        return Outcome(linked_s, few_s, most_s, max(after - at for times in heard for at, after in pairwise(times)))
+        arrived = [_arrivals(*pair) for pair in zip(clients, (GROUND, VEHICLE), strict=True)]
+        assert all(times[-1] > began + 3 * settle_s - HEARTBEAT_S * 4 for times in arrived), "heartbeats have ended"
+        return Outcome(linked_s, few_s, most_s, max(after - at for times in arrived for at, after in pairwise(times)))
     finally:
         if talking is not None:
             talking.cancel()
@@ -116,7 +116,7 @@ async def _talk(clients: tuple[Client, Client], ways: tuple[Sockaddr, Sockaddr])
         await asyncio.sleep(HEARTBEAT_S)
 
 
-def _heard(client: Client, system: int) -> list[float]:
+def _arrivals(client: Client, system: int) -> list[float]:
     return [at for at, raw in client.arrivals if sender_of(raw) == system]
 
 
