@@ -29,7 +29,7 @@ from uavlinkd.authority.enrolment import fingerprint_of
 from uavlinkd.authority.exchange import BulletinExchange, Reaction
 from uavlinkd.authority.places import longest_down
 from uavlinkd.authority.state_file import FleetState
-from uavlinkd.authority.trust import Pinned, Trust
+from uavlinkd.authority.trust import BulletinVerdict, Pinned, Trust
 from uavlinkd.config import Config, PeerConfig
 from uavlinkd.config.members import member_peer, relay_member
 from uavlinkd.config.model import FleetConfig
@@ -46,6 +46,7 @@ from uavlinkd.core.relay_records import CertificateRecord, FleetRecord, Have, Wh
 from uavlinkd.core.settings import PeerSettings
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.relays import Relays
+from uavlinkd.mavlink.policy.settings import read_settings
 from uavlinkd.relay.service import RelayService
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.tasks import Threads
@@ -123,7 +124,7 @@ class FleetMembers:
         self._written_at = c.NEVER
         """When a state that could not be written is written again."""
         self._reserve(config, fleet)
-        self._hold_contacts()
+        self._hold_contacts(monotonic())
         self._show_certificate()
         self._persist()  # the configuration may have a newer bulletin
 
@@ -150,29 +151,32 @@ class FleetMembers:
 
     def follow(self, config: Config, fleet: FleetConfig, now: float) -> None:
         """Apply a new configuration. Call it before its peers are added, which may have names and keys of members."""
-        for contact in self._fleet.contacts:
-            if contact not in fleet.contacts:
-                self.trust.held.pop(contact.key, None)  # its peer leaves with the configuration
-        self._fleet = fleet
-        self.trust.replace_own(fleet.own.data)
-        for key in self._reserve(config, fleet):
+        before, self._fleet = self._fleet, fleet
+        old, new = ({contact.key for contact in one.contacts} for one in (before, fleet))
+        for key in old - new:
+            self.trust.held.pop(key, None)  # its peer leaves with the configuration
+            if self._relay is not None:
+                self._relay.end(key, now)
+        if self.trust.replace_own(fleet.own.data):
+            self.exchange.note_own_certificate(now)
+        self._show_certificate()
+        met = [key for key in new - old if key in self.trust.held]  # from now on the configuration has their peers
+        for key in (*self._reserve(config, fleet), *met):
             self._end(key, now)
-        self._react(self.exchange.publish(fleet.bulletin, now)[1], now)
-        for contact in fleet.contacts:
-            if (peer := self._node.find(contact.key)) is not None and self._links.get(contact.name) is not None:
-                continue
-            if peer is not None:
-                self._end(contact.key, now)
-        self._hold_contacts()
+        self._publish(fleet.bulletin, now)
+        self._hold_contacts(now)
         for key, held in list(self.trust.held.items()):
-            if self._is_contact(key):
+            link, has_policy = self._links.get(held.certificate.name), held.certificate.role in fleet.policies
+            if key in new:
                 continue
-            if not self._is_wanted(held.certificate):
+            if not self._is_wanted(held.certificate) or has_policy is (link is None) or fleet.link != before.link:
                 del self.trust.held[key]
                 self._end(key, now)
-            elif (link := self._links.get(held.certificate.name)) is not None and link.key == key:
-                self._membership.change_member(self._config_of(key))
-        self._show_certificate()
+                continue
+            if link is not None and (config_now := self._config_of(key)) != link.config:
+                self._membership.change_member(config_now)
+            if self._relay is not None and key in self._relay.members:
+                self._serve(key, now)
 
     def _reserve(self, config: Config, fleet: FleetConfig) -> list[bytes]:
         pinned = [peer for peer in config.peers if not peer.settings.is_certified]
@@ -183,17 +187,16 @@ class FleetMembers:
             Pinned(
                 keys={one.public_key for one in reserved},
                 names={one.name for one in reserved},
-                system_ids={number: peer.name for peer in pinned for number in numbers_of(peer)},
+                system_ids={number: peer.name for peer in pinned for number in _systems_of(peer)},
                 denied=fleet.denied,
             )
         )
 
-    def _hold_contacts(self) -> None:
+    def _hold_contacts(self, now: float) -> None:
         for contact in self._fleet.contacts:
-            try:
-                self.trust.hold(contact.key, contact.certificate)
-            except Drop as drop:
-                self._log.warning("contact_refused", contact=contact.name, reason=drop.reason.value)
+            with suppress(Drop):  # a finding shows it
+                for ended in self.trust.hold(contact.key, contact.certificate):
+                    self._end(ended, now)
 
     def _is_contact(self, key: bytes) -> bool:
         return any(contact.key == key for contact in self._fleet.contacts)
@@ -255,6 +258,7 @@ class FleetMembers:
                 self.trust.held.pop(key, None)
             case o.SessionEstablished() | o.PeerUp() if peer.session_with(c.FEATURE_FLEET, now) is not None:
                 budget = self._node.facts.pace(peer.path) if peer.path is not None else None
+                self._serve(key, now)  # a contact comes without an admission
                 self.exchange.on_handshake(key, max(2 * peer.answer_s, 0.0 if budget is None else budget.ask_s), now)
                 if self._fleet.call and any(relay.peer is peer for relay in self._relays.by_name.values()):
                     self._askings[key] = _Asking(now)
@@ -266,13 +270,16 @@ class FleetMembers:
         """A member is here, or is introduced: make a link with it, and let it use the relay of this daemon."""
         if peer is not None:
             self._node.accept(peer)
-        held = self.trust.held[key]
-        has_link = held.certificate.role in self._fleet.policies
-        if has_link:
+        if self.trust.held[key].certificate.role in self._fleet.policies:
             self._membership.add_member(self._config_of(key), peer)
-        if self._relay is not None and (known := self._node.find(key)) is not None:
-            member = relay_member(self._fleet, key, held.certificate)
-            self._relay.admit(known, member, held, now, is_own=not has_link)
+        self._serve(key, now)
+
+    def _serve(self, key: bytes, now: float) -> None:
+        """Let a member use the relay of this daemon, if there is one, within the present limits."""
+        peer, held = self._node.find(key), self.trust.held.get(key)
+        if self._relay is not None and peer is not None and held is not None:
+            is_own = held.certificate.role not in self._fleet.policies and not self._is_contact(key)
+            self._relay.admit(peer, relay_member(self._fleet, key, held.certificate), held, now, is_own=is_own)
 
     # Records.
 
@@ -329,9 +336,12 @@ class FleetMembers:
                 for ended in self.trust.hold(key, certificate) if key in self.trust.held else ():
                     self._end(ended, now)
         self.exchange.note_own_certificate(now)
+        return {"verdict": self._publish(bulletin, now).value, "number": self.trust.bulletin.number}
+
+    def _publish(self, bulletin: bytes, now: float) -> BulletinVerdict:
         verdict, reaction = self.exchange.publish(bulletin, now)
         self._react(reaction, now)
-        return {"verdict": verdict.value, "number": self.trust.bulletin.number}
+        return verdict
 
     def _react(self, reaction: Reaction, now: float) -> None:
         for key in reaction.ended:
@@ -419,7 +429,6 @@ class FleetMembers:
         self._perform([])
 
 
-def numbers_of(peer: PeerConfig) -> list[int]:
-    """The system ids that a peer of the configuration has alone."""
-    ids = peer.policy.get("system_ids", ())
-    return [number for number in ids if isinstance(number, int)] if isinstance(ids, tuple) else []
+def _systems_of(peer: PeerConfig) -> frozenset[int]:
+    """The system ids that a peer of the configuration has alone: none if it may have any."""
+    return read_settings(peer.policy, is_local=False).systems or frozenset()

@@ -54,6 +54,7 @@ class Peers:
     def follow(self, config: Config, changes: ConfigChanges) -> None:
         """Apply the changes of a new configuration."""
         parts, perform = self._parts, self._carriage.perform
+        keys = {peer.name: peer.settings.public_key for peer in parts.config.peers}
         parts.config = config
         if parts.fleet is not None and config.fleet is not None:
             parts.fleet.follow(config, config.fleet, monotonic())
@@ -63,18 +64,22 @@ class Peers:
                     parts.fleet.exchange.forget(used.peer.settings.public_key)
                 perform(parts.relays.remove(name, monotonic()))
         for name in changes.removed_peers:
-            if name in parts.links:
+            if (link := parts.links.get(name)) is not None and link.key == keys[name]:
                 self._remove_peer(name)
         # First of all give up names and keys: what is added may have them.
         if parts.relay is not None and config.relay_server is not None:
             parts.relay.release(config.relay_server.by_key, config.keys_of_others, monotonic())
         for relay in changes.changed_relays:
-            parts.relays.change(relay)
+            if relay.name in parts.relays.by_name:
+                parts.relays.change(relay)
         for peer in changes.changed_peers:
-            self._change_peer(peer)
-        for peer in changes.added_peers:
-            self._add_peer(peer)
-        self._add_relays(changes.added_relays)
+            if (link := parts.links.get(peer.name)) is not None and link.key == peer.settings.public_key:
+                self._change_peer(peer)
+        # Also those that a bulletin or a name in `deny` had ended, and that are accepted again.
+        for peer in config.peers:
+            if peer.name not in parts.links:
+                self._add_peer(peer)
+        self._add_relays([relay for relay in config.relays if relay.name not in parts.relays.by_name])
         self._follow_members()
 
     def summary(self) -> str:

@@ -1,0 +1,144 @@
+"""Members by certificate come and go, as processes: by the file of a daemon, and by bulletins."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from tests.daemon.frames import frame
+from tests.daemon.harness import Stage
+from tests.daemon.members import CertifiedFleet, text
+from tests.daemon.process import DaemonProcess, Status
+from tests.daemon.test_members import is_up
+from uavlinkd.core.certificates import MemberRole
+
+Fleet = tuple[CertifiedFleet, DaemonProcess, DaemonProcess, DaemonProcess]
+
+
+@pytest.fixture
+async def fleet(stage: Stage) -> Fleet:
+    """A ground station that records and relays; two vehicles that call it and each other."""
+    fleet = CertifiedFleet()
+    ground, one, two = stage.daemon("ground"), stage.daemon("v1"), stage.daemon("v2")
+    fleet.join(ground, MemberRole.OPERATOR, 255)
+    ground.config |= {"relay_server": {}, "recording": {"folder": "recordings"}}
+    for system_id, vehicle in enumerate((one, two), 1):
+        fleet.join(vehicle, MemberRole.VEHICLE, system_id, ground)
+        vehicle.config["contact"][0]["relays"] = True
+        vehicle.config["fleet"]["call"] = ["operator", "vehicle"]
+        vehicle.add_endpoint("autopilot")
+    ground.add_endpoint("screen")
+    await stage.start(ground, one, two, linked=False)
+    await one.until(lambda status: is_up(status, "ground", "v2"))
+    await two.until(lambda status: is_up(status, "ground", "v1"))
+    await ground.until(lambda status: is_up(status, "v1", "v2"))
+    return fleet, ground, one, two
+
+
+async def reload(daemon: DaemonProcess) -> Status:
+    """Its status right after it read its file again."""
+    daemon.write_config()
+    assert (await daemon.ask("reload"))["problems"] == []
+    return await daemon.status()
+
+
+async def test_names_and_keys_in_the_file_win(fleet: Fleet) -> None:
+    """A name that is denied, and a member's key in a [[peer]], at a station that relays; and back."""
+    _, ground, one, two = fleet
+    ground.config["fleet"]["deny"] = ["v1"]
+    status = await reload(ground)
+    assert set(status["peers"]) == set(status["relay"]["members"]) == {"v2"}
+    await one.until(lambda status: not is_up(status, "ground"))
+    del ground.config["fleet"]["deny"]
+    ground.add_peer(two, [], role="vehicle", system_ids=[2])
+    ground.config["relay_server"]["member_max_peers"] = 7
+    assert "v2" not in (await reload(ground))["fleet"]["held"]
+    await ground.until(lambda status: is_up(status, "v1", "v2") and set(status["relay"]["members"]) == {"v1"})
+    ground.config["peer"] = []
+    assert "v2" not in (await reload(ground))["peers"]
+    await ground.until(lambda status: is_up(status, "v1", "v2") and len(status["relay"]["members"]) == 2)
+
+
+def edit_policy(config: dict[str, Any]) -> None:
+    config["fleet"]["operator"], config["fleet"]["call"] = "pinned", ["vehicle"]
+
+
+def edit_link(config: dict[str, Any]) -> None:
+    config["link"]["confidential"] = True
+
+
+def edit_contacts(config: dict[str, Any]) -> None:
+    config["contact"] = []
+
+
+@pytest.mark.parametrize(("edit", "left"), [(edit_policy, {"v2"}), (edit_link, {"ground"}), (edit_contacts, {"v2"})])
+async def test_rules_of_the_fleet_change(
+    fleet: Fleet, edit: Callable[[dict[str, Any]], None], left: set[str]
+) -> None:
+    """No certificate makes an operator; other settings of links; no contact. Then everything is as before."""
+    _, _, one, _ = fleet
+    before = {section: {**one.config[section]} for section in ("fleet", "link")}, list(one.config["contact"])
+    edit(one.config)
+    assert set((await reload(one))["peers"]) == left
+    one.config |= before[0]
+    one.config["contact"] = before[1]
+    await reload(one)
+    await one.until(lambda status: is_up(status, "ground", "v2"))
+
+
+async def test_member_becomes_a_contact(fleet: Fleet) -> None:
+    """A member that was introduced gets its address from the file. A bulletin revokes it, then it leaves the file."""
+    signed, ground, one, two = fleet
+    contact = {"public_key": two.public_key, "addresses": [two.address]}
+    one.config["contact"].append(contact | {"certificate": text(signed.certificates["v2"][1])})
+    await reload(one)
+    await one.until(lambda status: is_up(status, "v2") and status["peers"]["v2"]["path"] == two.address)
+    await ground.ask(signed.revoke("v2"))
+    await one.until(lambda status: "v2" not in status["peers"])
+    assert set((await reload(one))["peers"]) == {"ground"}
+    one.config["contact"].pop()
+    assert set((await reload(one))["peers"]) == {"ground"}
+
+
+async def test_contact_is_revoked_and_signed_again(fleet: Fleet) -> None:
+    """Its link and its relay end at once. A newer certificate in the file brings both back."""
+    signed, ground, one, _ = fleet
+    await one.ask(signed.revoke("ground"))
+    status = await one.until(lambda status: "ground" not in status["peers"] and not status["relays"])
+    assert status["fleet"]["number"] == 2
+    signed.renew(ground)
+    one.config["contact"][0]["certificate"] = text(signed.certificates["ground"][1])
+    await reload(one)
+    ground.config["fleet"]["certificate"] = one.config["contact"][0]["certificate"]
+    ground.config["fleet"]["bulletin"] = text(signed.bulletin)
+    await reload(ground)
+    await one.until(lambda status: is_up(status, "ground") and status["relays"]["ground"]["state"] == "up")
+
+
+async def test_member_is_revoked_while_it_is_recorded(fleet: Fleet, stage: Stage) -> None:
+    """Its recording stays, the others go on, and a metric counts the members."""
+    signed, ground, one, two = fleet
+    clients = {vehicle: await stage.client() for vehicle in (one, two)}
+    recorded = ground.folder / "recordings"
+
+    async def fly(number: int, *vehicles: DaemonProcess) -> None:
+        for vehicle in vehicles:
+            port = vehicle.config["endpoint"][0]["url"].rpartition(":")[2]
+            clients[vehicle].send(frame(number, int(vehicle.name[1:])), ("127.0.0.1", int(port)))
+
+    async def sizes() -> dict[str, int]:
+        return {name: sum(file.stat().st_size for file in recorded.glob(f"*{name}*")) for name in ("v1", "v2")}
+
+    await fly(1, one, two)
+    await ground.until(lambda status: status["recording"]["frames"] >= 2)
+    before = await sizes()
+    await ground.ask(signed.revoke("v1"))
+    frames = (await ground.status())["recording"]["frames"]
+    await fly(2, one, two)
+    await ground.until(lambda status: status["recording"]["frames"] > frames)
+    after = await sizes()
+    assert after["v1"] == before["v1"] > 0
+    assert after["v2"] > before["v2"] > 0
+    assert not ground.events("problem_began", name="v1")
