@@ -77,6 +77,7 @@ class Daemon(Scene):
             history=self.history,
             relays=SimpleNamespace(by_name={}),
             relay=None,
+            fleet=None,
             recorder=None,
             local=SimpleNamespace(endpoints=self.local),
             switch=SimpleNamespace(router=self.router),
@@ -137,7 +138,8 @@ def test_every_cause_is_documented_with_its_severity() -> None:
     assert set(documented) == set(causes)
     assert all(documented[cause].startswith(severity) for cause, severity in causes.items())
     assert {cause for cause, severity in causes.items() if severity == "security"} == {
-        *("own_key_elsewhere", "key_on_two_machines", "hidden_frame", "impersonation")
+        *("own_key_elsewhere", "key_on_two_machines", "hidden_frame", "impersonation"),
+        *("bulletin_conflict", "bulletin_shrinks"),
     }
 
 

@@ -58,9 +58,9 @@ def test_flood_formats_text_for_written_lines_only(
     described: list[Fact] = []
     describe = drop_summary._describe
 
-    def counted(fact: Fact) -> str:
+    def counted(fact: Fact, reason: str) -> str:
         described.append(fact)
-        return describe(fact)
+        return describe(fact, reason)
 
     monkeypatch.setattr(drop_summary, "_describe", counted)
     for _ in range(1000):

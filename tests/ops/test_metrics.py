@@ -96,6 +96,7 @@ ENDPOINT = {
     "refused": {"in": {}, "out": {"PING": numbered("setup_signing")}},
 }
 STATUS: dict[str, Any] = {
+    "fleet": {"held": {"v1": 3}, "problem": "", **numbered("number")},
     "relay": {
         **numbered("connections"),
         "dropped": numbered("relay_over_limit"),

@@ -7,14 +7,19 @@ from typing import Any
 
 from tests.daemon.frames import frame
 from tests.daemon.harness import Stage
+from tests.daemon.members import CertifiedFleet
 from tests.ops.schema import golden
 from tests.test_readmes import ROOT, names_in_table
+from uavlinkd.core.certificates import MemberRole
 from uavlinkd.endpoints.line_framing import RADIO_FIGURES
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.ops import STATUS_SCHEMA
 from uavlinkd.ops.findings import Finding, Severity, Subject
 
-MAPS = ("peers", "relays", "relays.*.peers", "endpoints", "endpoints.*.clients", "networks", "relay.members")
+MAPS = (
+    *("peers", "relays", "relays.*.peers", "endpoints", "endpoints.*.clients", "networks", "relay.members"),
+    *("fleet.held", "fleet.bulletins", "fleet.events"),
+)
 """Objects whose keys are names of the configuration or addresses."""
 COUNTS: Mapping[str, int] = {
     "drops": 1,
@@ -51,6 +56,7 @@ ALSO = {
     "relays.*.paths[].network": "string",
     "endpoints.*.clients.*.last_received_s": "null",
     "recording": "null",
+    "fleet.events.*": "number",
     "networks.*.serial.radio": "object",
     **{f"networks.*.serial.radio.{name}": "integer" for name in RADIO_FIGURES},
 }
@@ -112,6 +118,14 @@ async def observed() -> dict[str, str]:
             return bool(status["peers"][a.name]["refused_there"])
 
         statuses.append(await b.until(is_refused_there))
+        station, vehicle, fleet = stage.daemon("station"), stage.daemon("v1"), CertifiedFleet()
+        fleet.revoked = [77]
+        fleet.join(station, MemberRole.OPERATOR, 255)
+        fleet.join(vehicle, MemberRole.VEHICLE, 1, station)
+        await stage.start(vehicle, linked=False)
+        statuses.append(await vehicle.status())
+        await station.start()
+        statuses.append(await vehicle.until(lambda status: status["fleet"]["bulletins"] == {"station": 1}))
     findings = [Finding("cause", Severity.FAULT, Subject.PEER, "name", "text", "remedy").as_json()]
     types: dict[str, set[str]] = {name: {kind} for name, kind in ALSO.items()}
     for status in statuses:

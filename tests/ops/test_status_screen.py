@@ -74,6 +74,7 @@ def status_of(peers: dict[str, dict[str, Any]], **facts: object) -> dict[str, An
         "peers": peers,
         **{key: {} for key in ("endpoints", "networks", "relays", "drops", "send_failures", "stale")},
         "relay": None,
+        "fleet": None,
         **facts,
     }
 
@@ -106,6 +107,14 @@ def refused(**reasons: int) -> dict[str, Any]:
 LINE = {"device": "/dev/ttyUSB0", "baud": 57600, "rate_bits_s": 9600, "line_noise": 3, "radio": None}
 RADIO = {"rssi": 200, "remrssi": 190, "noise": 50, "remnoise": 60, "txbuf": 90}
 SERIAL = {"interface": None, "address": None, "is_metered": False, "is_present": True, "addresses": ["serial"]}
+FLEET = {
+    "fleet": "k7qd2m4x",
+    "name": "v1",
+    "role": "vehicle",
+    "serial": 3,
+    "number": 5,
+    "bulletins": {"ground": 5, "v2": 4, "v3": None},
+}
 USED = {"state": "up", "peer": None, "round_trip_s": 0.0123, "peers": {"drone1": "bound", "drone2": "waiting"}}
 
 
@@ -131,6 +140,7 @@ USED = {"state": "up", "peer": None, "round_trip_s": 0.0123, "peers": {"drone1":
             {},
             "1 of 1 peers up, frames stop, as reported by d0, d1, d2, d3, d4, d5, d6, d7 and 1 more",
         ),
+        ({"fleet": FLEET}, {}, "fleet k7qd2m4x: v1, vehicle, serial 3; bulletin 5, but v2 has 4 "),
         ({"relays": {"vps": USED}}, {}, "relay vps: up, 12 ms; drone1 bound, drone2 waiting"),
     ],
 )

@@ -108,6 +108,11 @@ class BulletinExchange:
         peer = self._peers.get(key)
         return None if peer is None or peer.stated is None else max(peer.has, peer.stated)
 
+    def serial(self, key: bytes) -> int | None:
+        """The serial of its own certificate that a peer stated on the present link; 0 if it has none."""
+        peer = self._peers.get(key)
+        return None if peer is None or peer.have is None else peer.have.serial
+
     # Receipt.
 
     def receive(self, key: bytes, record: FleetRecord, order: int, now: float) -> Reaction:

@@ -124,13 +124,13 @@ class Trust:
         held = self.held.get(key)
         if held is not None and certificate.serial < held.certificate.serial:
             certificate = held.certificate  # the member may not have its new one yet
-        label = f"{certificate.name}, serial {certificate.serial}"
+        label = _label(certificate)
         if self.bulletin.refuses(certificate.serial) or certificate.name in self.pinned.denied:
             raise Drop(DropReason.CERTIFICATE_REVOKED, label)
         if key in self.pinned.keys:
-            raise Drop(DropReason.MEMBER_CONFLICT, f"{label}, and a key of the configuration")
+            raise Drop(DropReason.MEMBER_CONFLICT, f"{label} and a key of the configuration")
         if (other := self._conflict(key, certificate)) is not None:
-            raise Drop(DropReason.MEMBER_CONFLICT, f"{label}, and {other}")
+            raise Drop(DropReason.MEMBER_CONFLICT, f"{label} and {other}")
         return certificate
 
     def hold(self, key: bytes, data: bytes) -> list[bytes]:
@@ -178,7 +178,7 @@ class Trust:
             return "this daemon's own certificate"
         for _, held in self._rivals(key, certificate):
             if held.serial >= certificate.serial or not _same(held, certificate):
-                return f"{held.name}, serial {held.serial}"
+                return _label(held)
         return None
 
     def _rivals(self, key: bytes, certificate: Certificate) -> list[tuple[bytes, Certificate]]:
@@ -239,6 +239,10 @@ class Trust:
         bulletin = parse_bulletin(data)
         is_ours = bulletin is not None and bulletin.fleet == self.fleet and is_published(data, self._authority)
         return bulletin if is_ours else None
+
+
+def _label(certificate: Certificate) -> str:
+    return f"{certificate.name} (serial {certificate.serial})"
 
 
 def _same(one: Certificate, other: Certificate) -> bool:

@@ -329,8 +329,8 @@ class Drop(Exception):  # noqa: N818  not an error of ours: the ordinary fate of
         super().__init__(reason)
         self.reason = reason
         self.detail = detail
-        """The public key that is not configured (bytes), the name of the suite that the peer offered (str), or the
-        version of the protocol that the sender speaks (int).
+        """The public key of the sender (bytes), the name of the suite that the peer offered or of the member in its
+        certificate (str), or the version of the protocol that the sender speaks (int).
 
         The log formats it when it writes a line, not for each drop.
         """

@@ -16,7 +16,8 @@ from uavlinkd.core.sessions import Twin
 from uavlinkd.link import traffic_problems as traffic
 from uavlinkd.link.down_problems import down_problems, is_deaf, relay_warnings, silence, versions
 from uavlinkd.link.evidence import ELSEWHERE, EVIDENCE_S
-from uavlinkd.link.facts import EndpointFacts, Found, Moment, PeerFacts, fault, keys_at, listed, security, warning
+from uavlinkd.link.facts import EndpointFacts, Found, Moment, PeerFacts, details_at, fault, listed, security, warning
+from uavlinkd.link.fleet_problems import fleet_problems, pinned_problems
 from uavlinkd.link.parts import DaemonParts
 from uavlinkd.link.serial_networks import RECENT_S
 from uavlinkd.ops.findings import Finding, Subject
@@ -113,7 +114,7 @@ def member_problems(moment: Moment) -> Iterator[Found]:
     if unknown is not None:
         yield warning(
             "not_a_member",
-            f"a sender has a key of no [[member]] here: {keys_at(unknown)}",
+            f"a sender has a key of no [[member]] here: {details_at(unknown)}",
             "if it is yours, run `uavlinkd pubkey` there, write into its [[member]] what that prints, and run"
             " `uavlinkd reload` here: a key that arrives proves nothing",
         )
@@ -179,11 +180,11 @@ def find(daemon: DaemonParts, now: float) -> list[Finding]:
         for severity, cause, text, remedy in problems:
             findings.append(Finding(cause, severity, subject, name, text, remedy))
 
-    of_daemon = (daemon_problems, relay_warnings, member_problems, line_problems)
+    of_daemon = (daemon_problems, fleet_problems, relay_warnings, member_problems, line_problems)
     add(Subject.DAEMON, "", chain.from_iterable(problems(moment) for problems in of_daemon))
     for link in daemon.links.values():
         peer = PeerFacts(moment, link)
-        add(Subject.PEER, link.name, traffic.peer_problems(peer))
+        add(Subject.PEER, link.name, chain(traffic.peer_problems(peer), pinned_problems(peer)))
         if link.peer.is_up:
             add(Subject.PEER, link.name, traffic.up_problems(peer))
         else:

@@ -23,9 +23,9 @@ from uavlinkd.link.facts import (
     Moment,
     PeerFacts,
     at,
+    details_at,
     fault,
     hosts_of,
-    keys_at,
     listed,
     warning,
 )
@@ -251,7 +251,7 @@ def _unknown_keys(peer: PeerFacts, sighting: Sighting) -> Iterator[Found]:
         which = "the key" if count == 1 else f"{count} keys, so at least one is not {peer.name}:"
         yield fault(
             "wrong_key_here",
-            f"a sender uses {which} {keys_at(sighting)}, which this file does not have",
+            f"a sender uses {which} {details_at(sighting)}, which this file does not have",
             f"run `uavlinkd pubkey` at {peer.name}, and write into this file what that prints: a key that arrives"
             " proves nothing. After a change of keys, restart it with its new files; if the former key was stolen,"
             " this may be the thief",

@@ -11,7 +11,7 @@ from structlog.typing import FilteringBoundLogger
 
 from uavlinkd.config.keys import encode_key
 from uavlinkd.core.constants import PROTOCOL_VERSION
-from uavlinkd.core.drops import Attention, Detail, Reason
+from uavlinkd.core.drops import Attention, Detail, DropReason, Reason
 from uavlinkd.core.outputs import Dropped
 from uavlinkd.core.path import Path
 from uavlinkd.endpoints.ports import failure_name
@@ -175,7 +175,7 @@ class DropSummary:
             "reason": kind.reason,
             "who": key[2],
             "meaning": "" if not with_meaning else meaning,
-            "last": _describe(kind.last),
+            "last": _describe(kind.last, kind.reason),
         }
         return {field: fact for field, fact in facts.items() if fact}
 
@@ -188,7 +188,7 @@ class DropSummary:
             loop.default_exception_handler(context)
 
 
-def _describe(fact: Fact) -> str:
+def _describe(fact: Fact, reason: str) -> str:
     match fact:
         case str():
             return fact
@@ -199,5 +199,6 @@ def _describe(fact: Fact) -> str:
         case int(version), path:
             age = f"{'older' if version < PROTOCOL_VERSION else 'newer'} than uavlink/{PROTOCOL_VERSION}"
             return f"uavlink/{version}, {age} of this daemon, from {shown(path.address)}"
-        case suite, path:
-            return f"suite {suite} from {shown(path.address)}" if suite else f"from {shown(path.address)}"
+        case detail, path:
+            what = f"suite {detail}" if reason == DropReason.SUITE_NOT_ACCEPTED else detail
+            return f"{what} from {shown(path.address)}" if detail else f"from {shown(path.address)}"

@@ -40,7 +40,8 @@ _HINTS: Final = frozenset(
     {
         *(DropReason.RAW_MAVLINK, DropReason.BAD_MAC1, DropReason.UNKNOWN_PEER, DropReason.BAD_HANDSHAKE),
         *(DropReason.SUITE_NOT_ACCEPTED, DropReason.COOKIE_REQUIRED, DropReason.RATE_LIMITED),
-        DropReason.OTHER_VERSION,
+        *(DropReason.OTHER_VERSION, DropReason.BAD_CERTIFICATE, DropReason.CERTIFICATE_REVOKED),
+        *(DropReason.MEMBER_CONFLICT, DropReason.ROLE_NOT_ACCEPTED),
     }
 )
 
@@ -96,7 +97,7 @@ class Evidence:
         reason, peer, path, _, detail = dropped
         if reason in _HINTS:
             address = None if path is None else path.address
-            if detail == self._own_key and reason is DropReason.UNKNOWN_PEER:
+            if detail == self._own_key:
                 self.own_key_elsewhere = now, address
                 return
             place = self._place(address, now) if peer is None else _place_of(peer.name)

@@ -249,10 +249,10 @@ def place(address: SocketAddress | None) -> str:
     return "its address" if address is None else shown(address)
 
 
-def keys_at(sighting: Sighting) -> str:
-    """The public keys of senders, each with the address where it was seen last."""
-    keys = ((key, address) for key, address in sighting.details.items() if isinstance(key, bytes))
-    return ", ".join(f"{encode_key(key)} at {place(address)}" for key, address in keys)
+def details_at(sighting: Sighting) -> str:
+    """The public keys or certificates of senders, each with the address where it was seen last."""
+    details = ((encode_key(one) if isinstance(one, bytes) else one, at) for one, at in sighting.details.items())
+    return ", ".join(f"{detail} at {place(address)}" for detail, address in details)
 
 
 def listed(names: Iterable[str], most: int = 4) -> str:

@@ -9,12 +9,10 @@ from __future__ import annotations
 import asyncio
 import os
 from base64 import b64decode
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final, Protocol
-
-from structlog.typing import FilteringBoundLogger
 
 from uavlinkd.authority import state_file
 from uavlinkd.authority.constants import (
@@ -44,6 +42,7 @@ from uavlinkd.core.outputs import Output
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.relay_records import CertificateRecord, FleetRecord, Have, Who
 from uavlinkd.core.settings import PeerSettings
+from uavlinkd.link.evidence import Evidence
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.relays import Relays
 from uavlinkd.mavlink.policy.settings import read_settings
@@ -53,8 +52,8 @@ from uavlinkd.system.tasks import Threads
 
 WHO_SOON_S: Final = 0.5
 """A question to a relay is repeated after this, and each time after twice as long: it, or an answer, may be lost."""
-EVENT_S: Final = 60.0
-"""An event of bulletins is shown for so long."""
+EVENT_S: Final = 600.0
+"""An event of bulletins is shown for so long, or until a newer bulletin counts."""
 _THREAD = Threads(1, "fleet state")
 
 
@@ -79,9 +78,9 @@ class FleetShell:
     links: Mapping[str, PeerLink]
     relays: Relays
     relay: RelayService | None
+    evidence: Evidence
     membership: Membership
     perform: Callable[[list[Output]], None]
-    log: FilteringBoundLogger
 
 
 @dataclass(slots=True)
@@ -110,13 +109,12 @@ class FleetMembers:
         self._relay = daemon.relay
         self._membership = daemon.membership
         self._perform = daemon.perform
-        self._log = daemon.log
+        self._evidence = daemon.evidence
         self.trust = Trust(fleet.authority, config.public_key, fleet.own.data, fleet.bulletin)
-        self.problem = state_file.read(fleet.state_file, self.trust)
-        """Why the state on the disk is not used, or not written; empty if all is well."""
+        self._unread, self._unwritten = state_file.read(fleet.state_file, self.trust), ""
         self.exchange = BulletinExchange(self.trust, os.urandom)
-        self.events: dict[str, float] = {}
-        """When something about bulletins was noticed last that a person has to know."""
+        self._events: dict[str, tuple[float, str]] = {}
+        """When something about bulletins was noticed last that a person has to know, and the name of the cause."""
         self._askings: dict[bytes, _Asking] = {}  # by key of a relay
         self._limits: dict[bytes, TokenBucket] = {}  # of certificates, by key of the sender
         self._settled_at = monotonic() + CONTACTS_FIRST_S if fleet.contacts else -c.NEVER
@@ -216,7 +214,10 @@ class FleetMembers:
         Raises:
             Drop: why it is refused.
         """
-        certificate = self._hold(key, data, now)
+        try:
+            certificate = self._hold(key, data, now)
+        except Drop as drop:
+            raise Drop(drop.reason, drop.detail or key) from None
         if certificate.role in self._fleet.policies:
             return self._config_of(key).settings
         return relay_member(self._fleet, key, certificate).peer
@@ -225,7 +226,7 @@ class FleetMembers:
         """Hold a certificate that is valid and wanted, and not too early or one too many. Raises Drop."""
         certificate = self.trust.judge(key, data)
         if not self._is_wanted(certificate):
-            raise Drop(DropReason.ROLE_NOT_ACCEPTED, certificate.name)
+            raise _without_policy(certificate)
         is_enough = self.trust.bulletin.number >= self._fleet.required_bulletin
         if not is_enough or (now < self._settled_at and not self._is_contact(key)):
             raise Drop(DropReason.BULLETIN_AWAITED)
@@ -294,8 +295,9 @@ class FleetMembers:
             elif isinstance(record, Who):
                 return DropReason.UNEXPECTED_RECORD if self._relay is None else self._relay.on_record(received, now)
             elif isinstance(record, FleetRecord):
-                self._react(self.exchange.receive(key, record, received.order, now), now)
+                self._react(self.exchange.receive(key, record, received.order, now), now, peer.name)
         except Drop as drop:
+            self._evidence.add_dropped(o.Dropped(drop.reason, peer, received.path, 1, drop.detail), now)
             return drop.reason
         if self._is_contact(key) and isinstance(record, Have) and record.number <= self.trust.bulletin.number:
             self._settled_at = now
@@ -306,8 +308,8 @@ class FleetMembers:
         limit = self._limits.setdefault(sender, TokenBucket(*CERTIFICATES, now))
         if not limit.take(now):
             raise Drop(DropReason.RECORD_OVER_LIMIT)
-        if self.trust.judge(record.key, record.certificate).role not in self._fleet.policies:
-            raise Drop(DropReason.ROLE_NOT_ACCEPTED)
+        if (certificate := self.trust.judge(record.key, record.certificate)).role not in self._fleet.policies:
+            raise _without_policy(certificate)
         certificate = self._hold(record.key, record.certificate, now)
         if (asking := self._askings.get(sender)) is not None:
             asking.received += 1
@@ -343,11 +345,14 @@ class FleetMembers:
         self._react(reaction, now)
         return verdict
 
-    def _react(self, reaction: Reaction, now: float) -> None:
+    def _react(self, reaction: Reaction, now: float, who: str = "this machine") -> None:
         for key in reaction.ended:
             self._end(key, now)
+        if reaction.persists:
+            self._events.clear()
+            self._unread = ""
         if reaction.event:
-            self.events[reaction.event] = now
+            self._events[reaction.event] = now, who
         if reaction.persists:
             self._show_certificate()
             self._persist()
@@ -378,8 +383,31 @@ class FleetMembers:
             "held": {held.certificate.name: held.certificate.serial for held in trust.held.values()},
             "bulletins": {name: self.exchange.shown(link.key) for name, link in self._links.items()},
             "problem": self.problem,
-            "events": {name: now - at for name, at in self.events.items() if now < at + EVENT_S},
+            "events": {name: now - self._events[name][0] for name in self.noticed(now)},
         }
+
+    @property
+    def problem(self) -> str:
+        """Why the state on the disk was not used at the start, or is not written; empty if all is well."""
+        return self._unwritten or self._unread
+
+    @property
+    def required_bulletin(self) -> int:
+        """Below this number no member is accepted."""
+        return self._fleet.required_bulletin
+
+    def noticed(self, now: float) -> dict[str, str]:
+        """Recent events of bulletins, each with the name of the peer that caused it last."""
+        return {event: who for event, (at, who) in self._events.items() if now < at + EVENT_S}
+
+    def refused_contacts(self) -> Iterator[tuple[str, DropReason]]:
+        """The contacts of the configuration that are not accepted, with their serials, and why."""
+        for contact in self._fleet.contacts:
+            if contact.key not in self.trust.held:
+                try:
+                    self.trust.judge(contact.key, contact.certificate)
+                except Drop as drop:
+                    yield (drop.detail if isinstance(drop.detail, str) else contact.name), drop.reason
 
     # Ends.
 
@@ -418,15 +446,19 @@ class FleetMembers:
             try:
                 await _THREAD.run(state_file.write, self._fleet.state_file, state)
             except OSError as error:
-                self.problem = f"cannot be written: {error.strerror}"
+                self._unwritten = f"{self._fleet.state_file} cannot be written: {error.strerror}"
                 self._written_at = monotonic() + HAVE_INTERVAL_S
                 break
-            self.problem = ""
+            self._unwritten = ""
             self.exchange.note_persisted(number, digest)
             if state == self._state:
                 break
         self._writing = None
         self._perform([])
+
+
+def _without_policy(certificate: Certificate) -> Drop:
+    return Drop(DropReason.ROLE_NOT_ACCEPTED, f"{certificate.name} (role {certificate.role.name.lower()})")
 
 
 def _systems_of(peer: PeerConfig) -> frozenset[int]:

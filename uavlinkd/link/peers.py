@@ -25,8 +25,8 @@ class Peers:
         self._parts = parts
         self._carriage = carriage
         if (fleet := parts.config.fleet) is not None:
-            known = parts.node, parts.links, parts.relays, parts.relay
-            parts.fleet = FleetMembers(parts.config, fleet, FleetShell(*known, self, carriage.perform, parts.log))
+            known = parts.node, parts.links, parts.relays, parts.relay, parts.evidence
+            parts.fleet = FleetMembers(parts.config, fleet, FleetShell(*known, self, carriage.perform))
 
     def start(self) -> None:
         """Add all that the configuration has."""

@@ -1,8 +1,9 @@
 """The daemon's status as metrics for Prometheus, in its text format 0.0.4. ``metrics.toml`` has a line for each.
 
 Names follow https://prometheus.io/docs/practices/naming/: base units, and ``_total`` for counters. Label values are
-names from the configuration and reasons from closed lists, so the network cannot increase their number. A counter
-that shows an attack starts at zero: Prometheus cannot see an increase of a series that did not exist before.
+names from the configuration or from certificates, and reasons from closed lists, so the network cannot increase their
+number. A counter that shows an attack starts at zero: Prometheus cannot see an increase of a series that did not
+exist before.
 
 Points in time are exported as ages: a drone without a set clock knows how old a handshake is, but not its date.
 
@@ -153,6 +154,11 @@ def _recording(status: Status) -> Iterator[Part]:
         yield (), recording
 
 
+def _fleet(status: Status) -> Iterator[Part]:
+    if (fleet := status["fleet"]) is not None:
+        yield (), fleet | {"members": len(fleet["held"]), "is_degraded": bool(fleet["problem"])}
+
+
 def _relay(status: Status) -> Iterator[Part]:
     if (relay := status["relay"]) is not None:
         yield (), relay | {"drops": {reason: relay["dropped"].get(reason, 0) for reason in _RELAY_REASONS}}
@@ -198,6 +204,7 @@ _PARTS: Mapping[str, Callable[[Status], Iterator[Part]]] = {
     "line": _lines,
     "radio": _radios,
     "endpoint": _endpoints,
+    "fleet": _fleet,
     "relay": _relay,
     "member": _members,
     "used relay": _used_relays,

@@ -71,6 +71,8 @@ def render_status(status: Status, width: int = 80) -> RenderableType:
     parts: list[RenderableType] = [_headline(status)]
     if status["findings"]:
         parts.append(_findings(status["findings"]))
+    if (fleet := status["fleet"]) is not None:
+        parts.append(_fleet(fleet))
     relay = status["relay"]
     if relay is None or status["peers"] or status["endpoints"]:
         parts += [*_peers(status, width), _endpoints(status)]
@@ -372,7 +374,15 @@ def _short(number: float) -> str:
     return f"{number:.1f}" if number < 9.95 else f"{number:.0f}"
 
 
-# Relays.
+# Fleet and relays.
+
+
+def _fleet(fleet: Status) -> Text:
+    """A line about this daemon in its fleet, with the peers whose bulletin has another number."""
+    number, who = fleet["number"], f"{fleet['name']}, {fleet['role']}, serial {fleet['serial']}"
+    text = f"fleet {fleet['fleet']}: {who}; bulletin {number}"
+    other = [f"{name} has {its}" for name, its in fleet["bulletins"].items() if its not in (None, number)]
+    return Text(f"{text}, but {_some(other)}", style="yellow") if other else Text(text)
 
 
 def _members(relay: dict[str, Any]) -> Table:

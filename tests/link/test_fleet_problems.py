@@ -1,0 +1,175 @@
+"""The findings about a fleet with an authority: each cause with its subject and remedy."""
+
+from __future__ import annotations
+
+import asyncio
+from base64 import b64decode
+from pathlib import Path
+from time import monotonic
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from tests.config.files import KEY
+from tests.config.fleets import OTHER_SIGNER, bulletin, certificate, contact, fleet, load_member, member_file
+from tests.link.test_diagnosis import NOW, STRANGER, Daemon
+from tests.link.test_evidence import THERE
+from uavlinkd.authority import state_file
+from uavlinkd.authority.constants import HAVE_INTERVAL_S
+from uavlinkd.core.certificates import MemberRole, digest_of
+from uavlinkd.core.drops import Drop, DropReason
+from uavlinkd.core.outputs import Dropped, RecordReceived
+from uavlinkd.core.path import Path as NetPath
+from uavlinkd.core.relay_records import BulletinRecord, CertificateRecord, FleetRecord, Have
+from uavlinkd.link.fleet_members import EVENT_S, FleetMembers, FleetShell
+from uavlinkd.ops.findings import Severity, Subject
+
+C, D = (b64decode(KEY[name]) for name in ("c", "d"))
+
+
+class Member(Daemon):
+    """Vehicle 7, which has the pinned peer drone1 and the contact gs. Its bulletin has the number 2."""
+
+    def __init__(self, folder: Path, *, news: str = "", more: str = "", contacts: str = "") -> None:
+        super().__init__()
+        self.set_up(role="all", system_ids="all")
+        self.config = load_member(folder, member_file(fleet(more=more, news=news or bulletin(2)) + contacts))
+        assert self.config.fleet is not None
+        shell = SimpleNamespace(by_name={})
+        known = self.node, self.links, cast(Any, shell), None, self.evidence
+        self.membership: Any = SimpleNamespace()
+        self.fleet = FleetMembers(
+            self.config, self.config.fleet, FleetShell(*known, self.membership, lambda outputs: None)
+        )
+        self.parts.fleet = self.fleet
+        self.key = self.link.key
+        self.fleet.exchange.on_handshake(self.key, 0.0, NOW)
+        self.orders = 0
+
+    def record(self, record: FleetRecord) -> DropReason | None:
+        """The pinned peer sends it."""
+        self.orders += 1
+        received = RecordReceived(self.link.peer, NetPath(0, THERE), record, self.orders)
+        return self.fleet.on_record(received, self.now)
+
+    def have(self, number: int, data: str, serial: int = 0) -> None:
+        self.record(Have(number, digest_of(b64decode(data)), serial, 0))
+
+    def shows(self, key: bytes, signed: str) -> None:
+        """An initiation shows this certificate, from an unknown address."""
+        with pytest.raises(Drop) as drop:
+            self.fleet.admit(key, b64decode(signed), self.now)
+        refused = Dropped(drop.value.reason, None, NetPath(0, STRANGER), 1, drop.value.detail)
+        self.evidence.add_dropped(refused, self.now)
+
+
+async def test_a_fleet_without_problems_has_none(tmp_path: Path) -> None:
+    """A contact that is accepted, a peer with the same bulletin."""
+    member = Member(tmp_path, contacts=contact())
+    member.have(2, bulletin(2), serial=9)
+    assert member.findings() == {}
+
+
+async def test_members_that_are_refused_are_named(tmp_path: Path) -> None:
+    """With their serials and addresses; both of a conflict. A sender without a name has its key."""
+    member = Member(tmp_path, news=bulletin(2, 9), more='operator = "pinned"')
+    member.shows(C, certificate(name="v9", ids=(9, 9), key=KEY["c"], serial=9))
+    member.shows(D, certificate(name="v8", ids=(8, 8), key=KEY["c"]))
+    member.shows(C, certificate(name="v8", ids=(7, 7), key=KEY["c"], serial=11))
+    member.shows(C, certificate(MemberRole.OPERATOR, "gs", (255, 255), key=KEY["c"], serial=12))
+    texts = {cause: finding.text for cause, finding in member.findings().items()}
+    at = "at 198.51.100.7:5790"
+    assert set(texts) == {"certificate_revoked", "bad_certificate", "member_conflict", "role_not_accepted"}
+    assert texts["certificate_revoked"].endswith(f": v9 (serial 9) {at}")
+    assert texts["bad_certificate"].endswith(f"of {KEY['d']} {at}")
+    assert texts["member_conflict"].endswith(f"v8 (serial 11) and this daemon's own certificate {at}")
+    assert texts["role_not_accepted"].endswith(f": gs (role operator) {at}")
+    assert member.findings(NOW + 31) == {}
+
+
+async def test_own_key_with_a_certificate_elsewhere(tmp_path: Path) -> None:
+    """A second machine has this daemon's key and shows its certificate."""
+    member = Member(tmp_path)
+    member.shows(member.config.public_key, certificate())
+    member.evidence.add_dropped(
+        Dropped(DropReason.BAD_CERTIFICATE, None, NetPath(0, STRANGER), 1, bytes([7]) * 32), NOW
+    )
+    assert "own_key_elsewhere" in member.findings()
+
+
+async def test_introduction_that_is_refused_is_shown(tmp_path: Path) -> None:
+    """A relay names a revoked member, and one whose role has no policy."""
+    member = Member(tmp_path, news=bulletin(2, 9), more='operator = "pinned"')
+    revoked = certificate(name="v9", ids=(9, 9), key=KEY["c"], serial=9)
+    assert member.record(CertificateRecord(C, b64decode(revoked))) is DropReason.CERTIFICATE_REVOKED
+    other = certificate(MemberRole.OPERATOR, "gs", (255, 255), key=KEY["c"], serial=12)
+    assert member.record(CertificateRecord(C, b64decode(other))) is DropReason.ROLE_NOT_ACCEPTED
+    assert set(member.findings()) == {"certificate_revoked", "role_not_accepted"}
+
+
+async def test_bulletins_that_contradict_each_other(tmp_path: Path) -> None:
+    """Each names the peer. They last for ten minutes, or until a bulletin ends them."""
+    member = Member(tmp_path, news=bulletin(2, 9))
+    member.have(2, bulletin(2, 9))
+    member.have(1, bulletin(1))
+    member.have(2, bulletin(2, 8))
+    assert member.record(BulletinRecord(b64decode(bulletin(3, 8)))) is None
+    findings = member.findings()
+    assert {cause: finding.severity for cause, finding in findings.items()} == {
+        "bulletin_conflict": Severity.SECURITY,
+        "bulletin_shrinks": Severity.SECURITY,
+        "bulletin_rolled_back": Severity.WARNING,
+    }
+    assert all(finding.text.startswith("drone1 ") for finding in findings.values())
+    assert member.findings(NOW + EVENT_S) == {}
+
+
+async def test_revoked_here_and_elsewhere(tmp_path: Path) -> None:
+    """This daemon, its contact, and a pinned peer, which stays; a bulletin that is too old for the file."""
+    member = Member(tmp_path, news=bulletin(2, 2, 7, 9), more="require_bulletin = 3", contacts=contact())
+    member.have(2, bulletin(2, 2, 7, 9), serial=9)
+    findings = member.findings()
+    assert set(findings) == {
+        *("own_certificate_revoked", "contact_refused", "bulletin_awaited", "revoked_but_pinned"),
+    }
+    assert "revokes the certificate of this daemon (serial 7)" in findings["own_certificate_revoked"].text
+    assert "the contact gs (serial 2) is refused: the bulletin revokes" in findings["contact_refused"].text
+    assert findings["revoked_but_pinned"].subject is Subject.PEER
+    assert "(serial 9)" in findings["revoked_but_pinned"].text
+
+
+async def test_state_that_cannot_be_written(tmp_path: Path) -> None:
+    """The bulletin counts anyway. The state is written again until that succeeds."""
+    member = Member(tmp_path)
+    assert member.config.fleet is not None
+    file = member.config.fleet.state_file
+    file.with_name(f".{file.name}.new").mkdir()
+    assert member.fleet.publish(bulletin(3), NOW)["verdict"] == "newer"
+    await until_written(member.fleet)
+    finding = member.findings()["fleet_state_degraded"]
+    assert finding.text.startswith(f"{file} cannot be written: Is a directory: ")
+    file.with_name(f".{file.name}.new").rmdir()
+    member.fleet.do_due(monotonic() + HAVE_INTERVAL_S)
+    await until_written(member.fleet)
+    assert member.findings() == {}
+    assert state_file.read(file, member.fleet.trust) == ""
+
+
+async def test_state_that_cannot_be_used(tmp_path: Path) -> None:
+    """That of another fleet counts as absent and is replaced, and a finding says why until a bulletin comes."""
+    foreign = state_file.FleetState(b64decode(bulletin(5, signer=OTHER_SIGNER)), b"")
+    state_file.write(tmp_path / "drone0.fleet-state", foreign)
+    member = Member(tmp_path)
+    await until_written(member.fleet)
+    text = member.findings()["fleet_state_degraded"].text
+    assert "drone0.fleet-state has a bulletin of another fleet" in text
+    member.fleet.publish(bulletin(3), NOW)
+    await until_written(member.fleet)
+    assert member.findings() == {}
+
+
+async def until_written(fleet: FleetMembers) -> None:
+    """The thread has written the state, or could not."""
+    tasks = asyncio.all_tasks() - {asyncio.current_task()}
+    await asyncio.gather(*tasks)
