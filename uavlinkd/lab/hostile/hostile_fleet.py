@@ -83,7 +83,7 @@ class HostileFleet:
                 service.admit(peer, member, self.trust.held[key], now, is_own=True)
             case o.PeerExpired():
                 self.trust.held.pop(key, None)
-            case o.SessionEstablished() if peer.session_with(c.FEATURE_FLEET, now) is not None:
+            case o.SessionEstablished() | o.PeerUp() if peer.session_with(c.FEATURE_FLEET, now) is not None:
                 self._exchange.on_handshake(key, PUSH_AGAIN_S, now)
             case o.PeerLost() | o.PeerClosed():
                 self._exchange.on_down(key)
