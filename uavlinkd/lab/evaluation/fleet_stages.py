@@ -172,7 +172,8 @@ class FleetRelayStage(FleetStage):
     def pinned(self, one: str) -> list[dict[str, object]]:
         del one
         key = encode_key(self._pinned_key)
-        return [{"name": PINNED, "public_key": key, "role": "observer", "system_ids": [_PINNED_ID]}]
+        policy = {"allow_in": [], "allow_out": [], "system_ids": [_PINNED_ID]}
+        return [{"name": PINNED, "public_key": key, **policy}]
 
 
 def member_attacks(stage: FleetStage) -> list[KeyAttack]:
