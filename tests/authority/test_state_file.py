@@ -69,7 +69,7 @@ def variants(data: bytes) -> Iterator[bytes]:
 def test_damaged_file_counts_as_absent(path: Path) -> None:
     """The cause is reported."""
     state_file.write(path, BEFORE)
-    trust = Trust(AUTHORITY, OWN, *reversed(CONFIGURED))
+    trust = Trust(AUTHORITY, OWN, CONFIGURED.certificate, CONFIGURED.bulletin)
     for data in variants(path.read_bytes()):
         path.write_bytes(data)
         assert state_file.read(path, trust) == f"{path} is incomplete, or was not written by uavlinkd"
@@ -209,3 +209,14 @@ def test_power_cut_at_every_step(tmp_path: Path, is_first: bool) -> None:
             break
     before = CONFIGURED if is_first else BEFORE
     assert outcomes == [{before}, {before}, {before}, {before, AFTER}, {AFTER}]
+
+
+def test_newest_certificates_of_contacts(path: Path) -> None:
+    """That in the configuration may be refused by now. Another member's, or that of no contact, is not held."""
+    keys = [bytes((number,)) * 32 for number in (2, 3, 4)]
+    newest = tuple((key, signed(vehicle(system, 9 + system), key)) for system, key in enumerate(keys, 2))
+    state_file.write(path, FleetState(bulletin(4, least=5), AFTER.certificate, newest))
+    trust = Trust(AUTHORITY, OWN, CONFIGURED.certificate, CONFIGURED.bulletin)
+    contacts = {keys[0]: signed(vehicle(2), keys[0]), keys[1]: signed(vehicle(7), keys[1])}
+    assert state_file.read(path, trust, contacts) == ""
+    assert {key: held.data for key, held in trust.held.items()} == {keys[0]: newest[0][1]}

@@ -117,3 +117,6 @@ async def test_members_get_newer_certificates(
             name: peer["handshakes"] for name, peer in later.items()
         }
     assert {peer["state"] for peer in after[1].values()} == {"up"}
+    await daemons[1].stop()
+    await daemons[1].start()  # its file has a certificate of its contact that is refused now
+    await daemons[1].until(lambda status: is_up(status, "ground", "v2"))

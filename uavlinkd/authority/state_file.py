@@ -1,23 +1,28 @@
 """The file with the newest bulletin and the newest own certificate, for the next start. README.md, "Start and state".
 
-A text of four lines: what it is, the bulletin and the certificate in base64, and a checksum of the lines before.
+A text: what it is, the bulletin and the certificate in base64, a line with the key and certificate of each contact,
+and a checksum of the lines before.
 """
 
 from __future__ import annotations
 
 import os
 from base64 import b64decode, b64encode
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from stat import S_ISREG
+from types import MappingProxyType
 from typing import NamedTuple
 
-from uavlinkd.authority.trust import BulletinVerdict, Trust
+from uavlinkd.authority.trust import BulletinVerdict, Trust, is_same_member
+from uavlinkd.core.certificates import parse_certificate
 from uavlinkd.core.crypto import sha256
+from uavlinkd.core.drops import Drop
 
 _TITLE = b"uavlinkd fleet state 1"
-_MOST_BYTES = 1024
-"""Of the file. The longest one has 600."""
+_MOST_BYTES = 2048
+"""Of the file. The longest one has 1,150."""
 
 
 class FleetState(NamedTuple):
@@ -26,10 +31,12 @@ class FleetState(NamedTuple):
     bulletin: bytes
     certificate: bytes
     """Empty for a daemon that has none."""
+    contacts: tuple[tuple[bytes, bytes], ...] = ()
+    """The key and the newest certificate of each. That of the configuration may be below the least serial by now."""
 
 
-def read(path: Path, trust: Trust) -> str:
-    """Let a daemon that starts know what the file has.
+def read(path: Path, trust: Trust, contacts: Mapping[bytes, bytes] = MappingProxyType({})) -> str:
+    """Let a daemon that starts know what the file has. ``contacts``: certificates of the configuration, by key.
 
     Returns the cause in words if it cannot be used, and nothing if it is used or absent.
     """
@@ -48,6 +55,10 @@ def read(path: Path, trust: Trust) -> str:
     if verdict not in (BulletinVerdict.NEWER, BulletinVerdict.KNOWN):
         return f"{path} has a bulletin of another fleet, or one that contradicts the configuration ({verdict.value})"
     trust.replace_own(state.certificate)
+    for key, newest in state.contacts:
+        with suppress(Drop):
+            if key in contacts and is_same_member(parse_certificate(contacts[key]), parse_certificate(newest)):
+                trust.hold(key, newest)
     return ""
 
 
@@ -76,14 +87,16 @@ def write(path: Path, state: FleetState) -> None:
 
 
 def _encode(state: FleetState) -> bytes:
-    lines = b"\n".join((_TITLE, *map(b64encode, state), b""))
+    contacts = (b" ".join(map(b64encode, contact)) for contact in state.contacts)
+    lines = b"\n".join((_TITLE, b64encode(state.bulletin), b64encode(state.certificate), *contacts, b""))
     return lines + sha256(lines).hex().encode() + b"\n"
 
 
 def _parse(data: bytes) -> FleetState | None:
     try:
-        _, bulletin, certificate, _, _ = data.split(b"\n")
-        state = FleetState(b64decode(bulletin), b64decode(certificate))
+        _, bulletin, certificate, *contacts, _, _ = data.split(b"\n")
+        pairs = [[b64decode(part) for part in contact.split(b" ")] for contact in contacts]
+        state = FleetState(b64decode(bulletin), b64decode(certificate), tuple((key, held) for key, held in pairs))
     except ValueError:
         return None
     return state if _encode(state) == data else None

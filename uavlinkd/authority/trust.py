@@ -146,7 +146,7 @@ class Trust:
         if before is not None and certificate.serial <= before.certificate.serial:
             return []
         ended = [other for other, _ in self._rivals(key, certificate)]  # the same member before
-        if before is not None and not _same(before.certificate, certificate):
+        if before is not None and not is_same_member(before.certificate, certificate):
             ended.append(key)
         for other in ended:
             del self.held[other]
@@ -177,7 +177,7 @@ class Trust:
         if self.own is not None and self._overlap(self.own.certificate, certificate):
             return "this daemon's own certificate"
         for _, held in self._rivals(key, certificate):
-            if held.serial >= certificate.serial or not _same(held, certificate):
+            if held.serial >= certificate.serial or not is_same_member(held, certificate):
                 return _label(held)
         return None
 
@@ -245,6 +245,6 @@ def _label(certificate: Certificate) -> str:
     return f"{certificate.name} (serial {certificate.serial})"
 
 
-def _same(one: Certificate, other: Certificate) -> bool:
+def is_same_member(one: Certificate, other: Certificate) -> bool:
     """Whether two certificates are of the same member."""
     return one._replace(serial=0) == other._replace(serial=0)

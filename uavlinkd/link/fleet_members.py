@@ -111,7 +111,7 @@ class FleetMembers:
         self._perform = daemon.perform
         self._evidence = daemon.evidence
         self.trust = Trust(fleet.authority, config.public_key, fleet.own.data, fleet.bulletin)
-        self._unread, self._unwritten = state_file.read(fleet.state_file, self.trust), ""
+        self._unread, self._unwritten = self._read(fleet), ""
         self.exchange = BulletinExchange(self.trust, os.urandom)
         self._events: dict[str, tuple[float, str]] = {}
         """When something about bulletins was noticed last that a person has to know, and the name of the cause."""
@@ -125,6 +125,9 @@ class FleetMembers:
         self._hold_contacts(monotonic())
         self._show_certificate()
         self._persist()  # the configuration may have a newer bulletin
+
+    def _read(self, fleet: FleetConfig) -> str:
+        return state_file.read(fleet.state_file, self.trust, {one.key: one.certificate for one in fleet.contacts})
 
     @property
     def next_at(self) -> float:
@@ -296,6 +299,8 @@ class FleetMembers:
                 return DropReason.UNEXPECTED_RECORD if self._relay is None else self._relay.on_record(received, now)
             elif isinstance(record, FleetRecord):
                 self._react(self.exchange.receive(key, record, received.order, now), now, peer.name)
+                if isinstance(record, CertificateRecord) and self._is_contact(key):
+                    self._persist()
         except Drop as drop:
             self._evidence.add_dropped(o.Dropped(drop.reason, peer, received.path, 1, drop.detail), now)
             return drop.reason
@@ -338,6 +343,7 @@ class FleetMembers:
                 for ended in self.trust.hold(key, certificate) if key in self.trust.held else ():
                     self._end(ended, now)
         self.exchange.note_own_certificate(now)
+        self._persist()
         return {"verdict": self._publish(bulletin, now).value, "number": self.trust.bulletin.number}
 
     def _publish(self, bulletin: bytes, now: float) -> BulletinVerdict:
@@ -436,7 +442,10 @@ class FleetMembers:
 
     @property
     def _state(self) -> FleetState:
-        return FleetState(self.trust.bulletin_bytes, b"" if self.trust.own is None else self.trust.own.data)
+        held = self.trust.held
+        contacts = tuple((one.key, held[one.key].data) for one in self._fleet.contacts if one.key in held)
+        own = b"" if self.trust.own is None else self.trust.own.data
+        return FleetState(self.trust.bulletin_bytes, own, contacts)
 
     async def _write(self) -> None:
         trust = self.trust
