@@ -31,6 +31,10 @@ async def test_members_meet_at_a_relay(stage: Stage) -> None:
     autopilot = await stage.client()
     autopilot.send(frame(1), into)
     await screen.until(lambda: screen.received == frame(1))
+    vehicle.config["fleet"]["deny"] = ["v9"]
+    vehicle.write_config()
+    assert (await vehicle.ask("reload"))["problems"] == []
+    assert (await vehicle.status())["relays"]["relay"]["state"] == "up", "a reload does not end the relay"
     assert await ground.ask(fleet.revoke("v1")) == {"verdict": "newer", "number": 2}
     assert "v1" not in (await ground.status())["peers"]
     await relay.until(lambda status: "v1" not in status["relay"]["members"])

@@ -34,7 +34,8 @@ from uavlinkd.config.model import FleetConfig
 from uavlinkd.config.relay_rules import MOST_MEMBERS
 from uavlinkd.core import constants as c
 from uavlinkd.core import outputs as o
-from uavlinkd.core.certificates import Certificate
+from uavlinkd.core.certificates import Certificate, parse_certificate
+from uavlinkd.core.crypto import is_usable_public_key
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.limits import TokenBucket
 from uavlinkd.core.node import Node
@@ -310,17 +311,22 @@ class FleetMembers:
 
     def _introduce(self, sender: bytes, record: CertificateRecord, now: float) -> None:
         """A relay names a member: make a link with it. Raises Drop."""
+        if not any(relay.config.settings.public_key == sender for relay in self._relays.by_name.values()):
+            raise Drop(DropReason.UNEXPECTED_RECORD)
         limit = self._limits.setdefault(sender, TokenBucket(*CERTIFICATES, now))
         if not limit.take(now):
             raise Drop(DropReason.RECORD_OVER_LIMIT)
-        if (certificate := self.trust.judge(record.key, record.certificate)).role not in self._fleet.policies:
-            raise _without_policy(certificate)
-        certificate = self._hold(record.key, record.certificate, now)
+        # One that is refused counts too: otherwise those with higher serials would never be asked for.
         if (asking := self._askings.get(sender)) is not None:
             asking.received += 1
-            asking.after = max(asking.after, certificate.serial)
+            asking.after = max(asking.after, parse_certificate(record.certificate).serial)
             if asking.received == CERTIFICATES_PER_ANSWER:
                 asking.due_at, asking.tries = now, 0
+        if not is_usable_public_key(record.key):  # a stolen authority's key can sign it; an initiation would raise
+            raise Drop(DropReason.BAD_CERTIFICATE)
+        if (certificate := self.trust.judge(record.key, record.certificate)).role not in self._fleet.policies:
+            raise _without_policy(certificate)
+        self._hold(record.key, record.certificate, now)
         peer = self._node.find(record.key)
         if peer is None or peer.provisional_until != c.NEVER:
             self._join(record.key, peer, now)
