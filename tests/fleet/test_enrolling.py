@@ -116,7 +116,8 @@ def test_new_key_replaces_the_former_one_at_the_end(place: Path, say: Say) -> No
         assert new == say("enroll v7") != request
         assert (place / "v7.toml").read_bytes() == before
         assert 'refused: this fleet has a "v7" already' in say("fleet sign", new)
-        line = say("fleet sign --replace", new)
+        assert say("fleet sign --replace gs", new) == "refused: the line is of v7, not of gs: nothing was signed\n"
+        line = say("fleet sign --replace v7", new)
         assert "The former key, " in say("enroll --finish", line)
         assert len(list(place.glob("v7*.key"))) == 1
         before = (place / "v7.toml").read_bytes()

@@ -79,8 +79,11 @@ def _sign(options: argparse.Namespace) -> None:
         request = parse_request(_line())
     except EnrolmentError as error:
         raise FleetError(f"the line {error}") from None
+    replaces = options.replace is not None
+    if replaces and options.replace != request.name:  # a captured machine could ask for the role of another
+        raise FleetError(f"the line is of {request.name}, not of {options.replace}: nothing was signed")
     ask = passphrase_from(options.passphrase_file)
-    result, line = operations.sign(options.out, request, _identity(options), ask, replaces=options.replace)
+    result, line = operations.sign(options.out, request, _identity(options), ask, replaces=replaces)
     print(line)
     member = result.fleet.member(request.name)
     _note(f"signed {member.name}: {_role(member.role)}, system id {member.ids}, serial {member.certificate.serial}")

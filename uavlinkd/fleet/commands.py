@@ -68,7 +68,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     sign = add("sign", "read the line of `uavlinkd enroll NAME`, and print the one for `uavlinkd enroll --finish`")
     sign.add_argument("name", nargs="?", metavar="NAME", help="print the line of this member once more")
     sign.add_argument(
-        "--replace", action="store_true", help="the name exists: replace its key, and revoke the old one"
+        "--replace", metavar="NAME", help="the line is of this member: replace its key, and revoke the old one"
     )
     new = add("add", "make a folder for a new member, with its key and configuration")
     for action in (sign, new):

@@ -61,7 +61,7 @@ def certify(
     if former is not None:
         if not replaces:
             raise FleetError(
-                f'this fleet has a "{name}" already: choose another name, or replace its key (--replace)'
+                f'this fleet has a "{name}" already: choose another name, or replace its key (--replace {name})'
             )
         role, ids = (
             role or former.role,
