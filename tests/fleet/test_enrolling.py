@@ -89,7 +89,7 @@ def test_existing_configuration_keeps_its_edits(place: Path, say: Say) -> None:
     """It becomes a member's with its own key; its pinned peers stay."""
     text = """\
 name = "v7"
-private_key_file = "mine.key"  # since 2024
+private_key_file = "keys/mine.key"  # since 2024
 [link]
 suites = ["x25519"]
 
@@ -97,11 +97,14 @@ suites = ["x25519"]
 name = "autopilot"
 url = "udpin:127.0.0.1:14550"
 """
+    (place / "keys").mkdir()
     (place / "v7.toml").write_text(text)
     enrolled(say, "v7")
     after = (place / "v7.toml").read_text()
-    assert after.startswith('name = "v7"\nprivate_key_file = "mine.key"\n[link]\nsuites = ["x25519"]\nconfidential')
-    assert (place / "mine.key").exists()
+    assert after.startswith(
+        'name = "v7"\nprivate_key_file = "keys/mine.key"\n[link]\nsuites = ["x25519"]\nconfidential'
+    )
+    assert (place / "keys/mine.key").exists()
     assert load_config(place / "v7.toml", {}).fleet is not None
 
 

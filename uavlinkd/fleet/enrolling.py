@@ -110,9 +110,10 @@ def finish(line: str, config: Path | None, folder: Path | None, url: str | None,
     _check_present(table.get("fleet"), reply, certificate, place.config)
     own = str(table.get("private_key_file", key_file(certificate.name)))
     path, contacts = _verified(reply, [place.key(own), place.key(_other(own))])
+    name = own if path == place.key(own) else _other(own)  # it may be in another folder
     listen = listen or ([] if "listen" in table else listen_on(reply))
     if table:
-        top = {"private_key_file": path.name, **({"listen": listen} if listen else {})}
+        top = {"private_key_file": name, **({"listen": listen} if listen else {})}
         text = with_fleet(place.config.read_text(encoding="utf-8-sig"), reply, top)
     else:
         settings = FleetSettings(
@@ -120,10 +121,10 @@ def finish(line: str, config: Path | None, folder: Path | None, url: str | None,
         )
         if url is not None:
             settings = replace(settings, drone_url=url, ground_station_url=url)
-        text = write_config(reply, settings, path.name, listen)
+        text = write_config(reply, settings, name, listen)
     _replace(place, text)
-    former = place.key(own) if path.name != own else place.key(_other(own))
-    has_former = path.name != own and former.exists()
+    former = place.key(own)
+    has_former = path != former and former.exists()
     if has_former:
         former.unlink()
     fingerprint = fingerprint_of(reply.authority)
