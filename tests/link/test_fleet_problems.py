@@ -36,7 +36,8 @@ class Member(Daemon):
         self.set_up(role="all", system_ids="all")
         self.config = load_member(folder, member_file(fleet(more=more, news=news or bulletin(2)) + contacts))
         assert self.config.fleet is not None
-        shell = SimpleNamespace(by_name={})
+        self.relays: dict[str, Any] = {}
+        shell = SimpleNamespace(by_name=self.relays)
         known = self.node, self.links, cast(Any, shell), None, self.evidence
         self.membership: Any = SimpleNamespace()
         self.fleet = FleetMembers(
@@ -99,9 +100,11 @@ async def test_own_key_with_a_certificate_elsewhere(tmp_path: Path) -> None:
 
 
 async def test_introduction_that_is_refused_is_shown(tmp_path: Path) -> None:
-    """A relay names a revoked member, and one whose role has no policy."""
+    """A relay names a revoked member, and one whose role has no policy. Other peers cannot."""
     member = Member(tmp_path, news=bulletin(2, 9), more='operator = "pinned"')
     revoked = certificate(name="v9", ids=(9, 9), key=KEY["c"], serial=9)
+    assert member.record(CertificateRecord(C, b64decode(revoked))) is DropReason.UNEXPECTED_RECORD
+    member.relays["drone1"] = SimpleNamespace(config=member.link.config)
     assert member.record(CertificateRecord(C, b64decode(revoked))) is DropReason.CERTIFICATE_REVOKED
     other = certificate(MemberRole.OPERATOR, "gs", (255, 255), key=KEY["c"], serial=12)
     assert member.record(CertificateRecord(C, b64decode(other))) is DropReason.ROLE_NOT_ACCEPTED
