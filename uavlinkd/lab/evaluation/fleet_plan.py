@@ -6,7 +6,7 @@ from typing import Final
 
 from uavlinkd.lab.evaluation.tampering_plan import FLEET, plan_rows
 
-_UNANSWERED: Final = "drop-message,message=response,share=0.9"
+_UNANSWERED: Final = "drop-message,message=response"
 """A daemon that starts shows its certificate until it is answered."""
 
 FLEET_PLANS: Final = plan_rows(
@@ -16,7 +16,7 @@ initiations with certificates replayed | replay-initiation,kinds=certificate,cop
     | restarts needs=duplicate
 initiations with certificates replayed later
     | replay-initiation,kinds=certificate,copies=20,when=later,delay_s=12 {_UNANSWERED}
-    | restarts is_variant after_s=12.1 needs=replayed_initiation
+    | restarts is_variant after_s=12.1 needs=duplicate
 initiations with certificates truncated | truncate,kinds=certificate | restarts needs=malformed
 initiations with certificates extended | extend,kinds=certificate | restarts needs=malformed
 certificates cut off and added | certificate-length {_UNANSWERED} | restarts needs=bad_handshake
