@@ -37,6 +37,7 @@ def test_what_comes_long_after_it_was_sent_is_stale(ledger: Ledger) -> None:
         ("b", numbered_frame(1, 0)[:-3] + b"\x00\x00\x00", Fault.FALSE),
         ("b", b"\xfd", Fault.FALSE),
         ("b", b"", None),
+        ("b", b"\x02\x02", Fault.FALSE),
         ("a", numbered_frame(1, 0), Fault.REFLECTED),
     ],
 )
@@ -45,6 +46,17 @@ def test_what_may_not_come_out_is_a_fault(ledger: Ledger, receiver: str, frame: 
     ledger.on_received(receiver, frame, 1.5)
     assert set(ledger.faults) == ({fault} if fault else set())
     assert delivered(ledger) == 0
+
+
+@pytest.mark.parametrize(
+    ("before", "is_fault"),
+    [(b"\x02" * 7, False), (b"\x02" * 280, False), (b"\x02" * 281, True), (b"\x02\xfe", True)],
+)
+def test_separator_bytes_may_precede_a_frame(ledger: Ledger, before: bytes, *, is_fault: bool) -> None:
+    """Neither too many, nor with a start byte."""
+    ledger.on_received("b", before + numbered_frame(1, 0), 1.5)
+    assert dict(ledger.faults) == ({Fault.FALSE: 1} if is_fault else {})
+    assert delivered(ledger) == 1
 
 
 def test_every_altered_byte_is_seen(ledger: Ledger) -> None:
