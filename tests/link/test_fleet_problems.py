@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from base64 import b64decode
+from base64 import b64decode, b64encode
 from pathlib import Path
 from time import monotonic
 from types import SimpleNamespace
@@ -109,6 +109,16 @@ async def test_introduction_that_is_refused_is_shown(tmp_path: Path) -> None:
     other = certificate(MemberRole.OPERATOR, "gs", (255, 255), key=KEY["c"], serial=12)
     assert member.record(CertificateRecord(C, b64decode(other))) is DropReason.ROLE_NOT_ACCEPTED
     assert set(member.findings()) == {"certificate_revoked", "role_not_accepted"}
+
+
+async def test_key_of_small_order_is_not_introduced(tmp_path: Path) -> None:
+    """The holder of a stolen authority's key can sign for it. An initiation to it would raise."""
+    member = Member(tmp_path)
+    member.relays["drone1"] = SimpleNamespace(config=member.link.config)
+    key = bytes([1, *bytes(31)])
+    signed = certificate(name="v9", ids=(9, 9), key=b64encode(key).decode(), serial=9)
+    assert member.record(CertificateRecord(key, b64decode(signed))) is DropReason.BAD_CERTIFICATE
+    assert member.node.find(key) is None
 
 
 async def test_bulletins_that_contradict_each_other(tmp_path: Path) -> None:
