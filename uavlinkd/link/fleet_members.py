@@ -6,7 +6,6 @@ configuration changes, or when the daemon holds too many.
 
 from __future__ import annotations
 
-import asyncio
 import os
 from base64 import b64decode
 from collections.abc import Callable, Iterator, Mapping
@@ -17,11 +16,8 @@ from typing import Final, Protocol
 from uavlinkd.authority import state_file
 from uavlinkd.authority.constants import (
     CERTIFICATES,
-    CERTIFICATES_PER_ANSWER,
     CERTIFIED_PEERS,
     CONTACTS_FIRST_S,
-    HAVE_INTERVAL_S,
-    WHO_INTERVAL_S,
 )
 from uavlinkd.authority.enrolment import fingerprint_of
 from uavlinkd.authority.exchange import BulletinExchange, Reaction
@@ -44,18 +40,16 @@ from uavlinkd.core.peer import Peer
 from uavlinkd.core.relay_records import CertificateRecord, FleetRecord, Have, Who
 from uavlinkd.core.settings import PeerSettings
 from uavlinkd.link.evidence import Evidence
+from uavlinkd.link.fleet_disk import FleetDisk
+from uavlinkd.link.member_questions import MemberQuestions
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.relays import Relays
 from uavlinkd.mavlink.policy.settings import read_settings
 from uavlinkd.relay.service import RelayService
 from uavlinkd.system.clock import monotonic
-from uavlinkd.system.tasks import Threads
 
-WHO_SOON_S: Final = 0.5
-"""A question to a relay is repeated after this, and each time after twice as long: it, or an answer, may be lost."""
 EVENT_S: Final = 600.0
 """An event of bulletins is shown for so long, or until a newer bulletin counts."""
-_THREAD = Threads(1, "fleet state")
 
 
 class Membership(Protocol):
@@ -84,18 +78,6 @@ class FleetShell:
     perform: Callable[[list[Output]], None]
 
 
-@dataclass(slots=True)
-class _Asking:
-    """What one relay is asked about other members."""
-
-    due_at: float
-    tries: int = 0
-    after: int = 0
-    """The highest serial of an answer, if it was full: ask on from there."""
-    received: int = 0
-    """Certificates since the last question."""
-
-
 class FleetMembers:
     """Certificates, bulletins and introductions of one daemon. Times are monotonic seconds.
 
@@ -112,20 +94,18 @@ class FleetMembers:
         self._perform = daemon.perform
         self._evidence = daemon.evidence
         self.trust = Trust(fleet.authority, config.public_key, fleet.own.data, fleet.bulletin)
-        self._unread, self._unwritten = self._read(fleet), ""
+        self._unread = self._read(fleet)
         self.exchange = BulletinExchange(self.trust, os.urandom)
         self._events: dict[str, tuple[float, str]] = {}
         """When something about bulletins was noticed last that a person has to know, and the name of the cause."""
-        self._askings: dict[bytes, _Asking] = {}  # by key of a relay
+        self._questions = MemberQuestions()
         self._limits: dict[bytes, TokenBucket] = {}  # of certificates, by key of the sender
         self._settled_at = monotonic() + CONTACTS_FIRST_S if fleet.contacts else -c.NEVER
-        self._writing: asyncio.Task[None] | None = None
-        self._written_at = c.NEVER
-        """When a state that could not be written is written again."""
+        self._disk = FleetDisk(fleet.state_file, self._state, self._on_written)
         self._reserve(config, fleet)
         self._hold_contacts(monotonic())
         self._show_certificate()
-        self._persist()  # the configuration may have a newer bulletin
+        self._disk.write()  # the configuration may have a newer bulletin
 
     def _read(self, fleet: FleetConfig) -> str:
         return state_file.read(fleet.state_file, self.trust, {one.key: one.certificate for one in fleet.contacts})
@@ -133,21 +113,16 @@ class FleetMembers:
     @property
     def next_at(self) -> float:
         """When :meth:`do_due` has something to do."""
-        return min(self.exchange.next_at, self._written_at, *(one.due_at for one in self._askings.values()), c.NEVER)
+        return min(self.exchange.next_at, self._questions.next_at, self._disk.again_at)
 
     def do_due(self, now: float) -> None:
         """Send what is due. Call it at :attr:`next_at`."""
         for key, record in self.exchange.do_due(now):
             self._send(key, record, now)
-        for key, asking in self._askings.items():
-            if now >= asking.due_at:
-                roles = sum(1 << role for role in self._fleet.call)
-                self._send(key, Who(roles, asking.after), now)
-                asking.due_at = now + min(WHO_INTERVAL_S, WHO_SOON_S * 2.0 ** min(asking.tries, 6))
-                asking.tries += 1
-                asking.received = asking.after = 0
-        if now >= self._written_at:
-            self._persist()
+        for key, who in self._questions.pop_due(sum(1 << role for role in self._fleet.call), now):
+            self._send(key, who, now)
+        if now >= self._disk.again_at:
+            self._disk.write()
 
     # The configuration.
 
@@ -266,10 +241,10 @@ class FleetMembers:
                 self._serve(key, now)  # a contact comes without an admission
                 self.exchange.on_handshake(key, max(2 * peer.answer_s, 0.0 if budget is None else budget.ask_s), now)
                 if self._fleet.call and any(relay.peer is peer for relay in self._relays.by_name.values()):
-                    self._askings[key] = _Asking(now)
+                    self._questions.begin(key, now)
             case o.PeerLost() | o.PeerClosed():
                 self.exchange.on_down(key)
-                self._askings.pop(key, None)
+                self._questions.end(key)
 
     def _join(self, key: bytes, peer: Peer | None, now: float) -> None:
         """A member is here, or is introduced: make a link with it, and let it use the relay of this daemon."""
@@ -301,7 +276,7 @@ class FleetMembers:
             elif isinstance(record, FleetRecord):
                 self._react(self.exchange.receive(key, record, received.order, now), now, peer.name)
                 if isinstance(record, CertificateRecord) and self._is_contact(key):
-                    self._persist()
+                    self._disk.write()
         except Drop as drop:
             self._evidence.add_dropped(o.Dropped(drop.reason, peer, received.path, 1, drop.detail), now)
             return drop.reason
@@ -317,11 +292,7 @@ class FleetMembers:
         if not limit.take(now):
             raise Drop(DropReason.RECORD_OVER_LIMIT)
         # One that is refused counts too: otherwise those with higher serials would never be asked for.
-        if (asking := self._askings.get(sender)) is not None:
-            asking.received += 1
-            asking.after = max(asking.after, parse_certificate(record.certificate).serial)
-            if asking.received == CERTIFICATES_PER_ANSWER:
-                asking.due_at, asking.tries = now, 0
+        self._questions.note(sender, parse_certificate(record.certificate).serial, now)
         if not is_usable_public_key(record.key):  # a stolen authority's key can sign it; an initiation would raise
             raise Drop(DropReason.BAD_CERTIFICATE)
         if (certificate := self.trust.judge(record.key, record.certificate)).role not in self._fleet.policies:
@@ -349,7 +320,7 @@ class FleetMembers:
                 for ended in self.trust.hold(key, certificate) if key in self.trust.held else ():
                     self._end(ended, now)
         self.exchange.note_own_certificate(now)
-        self._persist()
+        self._disk.write()
         return {"verdict": self._publish(bulletin, now).value, "number": self.trust.bulletin.number}
 
     def _publish(self, bulletin: bytes, now: float) -> BulletinVerdict:
@@ -367,7 +338,7 @@ class FleetMembers:
             self._events[reaction.event] = now, who
         if reaction.persists:
             self._show_certificate()
-            self._persist()
+            self._disk.write()
 
     def _show_certificate(self) -> None:
         if self.trust.own is not None:
@@ -401,7 +372,7 @@ class FleetMembers:
     @property
     def problem(self) -> str:
         """Why the state on the disk was not used at the start, or is not written; empty if all is well."""
-        return self._unwritten or self._unread
+        return self._disk.problem or self._unread
 
     @property
     def required_bulletin(self) -> int:
@@ -426,7 +397,7 @@ class FleetMembers:
     def _end(self, key: bytes, now: float) -> None:
         """Nothing of this key is accepted any more. It gets no close: it is not a peer."""
         self.exchange.forget(key)
-        self._askings.pop(key, None)
+        self._questions.end(key)
         self._limits.pop(key, None)
         if self._relay is not None:
             self._relay.end(key, now)
@@ -440,36 +411,16 @@ class FleetMembers:
 
     # The disk.
 
-    def _persist(self) -> None:
-        """Write the state in a thread: what a bulletin revokes has ended already."""
-        self._written_at = c.NEVER
-        if self._writing is None:
-            self._writing = asyncio.get_running_loop().create_task(self._write())
-
-    @property
     def _state(self) -> FleetState:
         held = self.trust.held
         contacts = tuple((one.key, held[one.key].data) for one in self._fleet.contacts if one.key in held)
         own = b"" if self.trust.own is None else self.trust.own.data
         return FleetState(self.trust.bulletin_bytes, own, contacts)
 
-    async def _write(self) -> None:
-        trust = self.trust
-        while True:
-            number, digest = trust.bulletin.number, trust.digest
-            state = self._state
-            try:
-                await _THREAD.run(state_file.write, self._fleet.state_file, state)
-            except OSError as error:
-                self._unwritten = f"{self._fleet.state_file} cannot be written: {error.strerror}"
-                self._written_at = monotonic() + HAVE_INTERVAL_S
-                break
-            self._unwritten = ""
-            self.exchange.note_persisted(number, digest)
-            if state == self._state:
-                break
-        self._writing = None
-        self._perform([])
+    def _on_written(self, state: FleetState) -> None:
+        if state.bulletin == self.trust.bulletin_bytes:
+            self.exchange.note_persisted(self.trust.bulletin.number, self.trust.digest)
+        self._perform([])  # the timer may be due earlier
 
 
 def _without_policy(certificate: Certificate) -> Drop:
