@@ -130,10 +130,14 @@ class FleetMembers:
         """Apply a new configuration. Call it before its peers are added, which may have names and keys of members."""
         before, self._fleet = self._fleet, fleet
         old, new = ({contact.key for contact in one.contacts} for one in (before, fleet))
+        leaving = {link.key for link in self._links.values()}  # with the configuration, as relays do
+        leaving |= {relay.config.settings.public_key for relay in self._relays.by_name.values()}
         for key in old - new:
-            self.trust.held.pop(key, None)  # its peer leaves with the configuration
+            self.trust.held.pop(key, None)
             if self._relay is not None:
                 self._relay.end(key, now)
+            if key not in leaving:  # it was a member of this relay only: it has to show its certificate again
+                self._end(key, now)
         if self.trust.replace_own(fleet.own.data):
             self.exchange.note_own_certificate(now)
         self._show_certificate()
