@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -130,6 +131,36 @@ def test_new_key_replaces_the_former_one_at_the_end(place: Path, say: Say) -> No
     assert read_manifest(place / "fleet").bulletin.revoked == (2, 3)
 
 
+def test_member_with_other_ids_sends_with_them(place: Path, say: Say) -> None:
+    """Its autopilot's endpoint has the ids of the certificate, and others keep theirs."""
+    enrolled(say, "v7", "--id 7")
+    file = place / "v7.toml"
+    other = '\n[[endpoint]]\nname = "camera"\nurl = "udpin:127.0.0.1:14560"\nsystem_ids = [9]\n'
+    file.write_text(file.read_text() + other)
+    line = say("fleet sign --replace v7 --ids 17-18", say("enroll v7"))
+    say("enroll --finish", line)
+    endpoints = tomllib.loads(file.read_text())["endpoint"]
+    assert [endpoint["system_ids"] for endpoint in endpoints] == [[17, 18], [9]]
+
+
+def test_url_of_an_existing_file_is_not_changed(place: Path, say: Say) -> None:
+    """Another one is refused, because it would have no effect."""
+    line = say("fleet sign", say("enroll v7"))
+    url = "udpin:127.0.0.1:14551"
+    say(f"enroll --finish --url {url}", line)
+    assert "write the url into its [[endpoint]]" in say("enroll --finish --url serial:/dev/ttyACM0:57600", line)
+    assert "is a member" in say(f"enroll --finish --url {url}", line)
+
+
+def test_revoked_member_returns_as_it_was(place: Path, say: Say) -> None:
+    """With a new key, and `--replace`."""
+    enrolled(say, "v7", "--role observer --id 70")
+    say("fleet revoke v7")
+    enrolled(say, "v7", "--replace v7")
+    member = read_manifest(place / "fleet").member("v7")
+    assert (member.role, member.ids, member.certificate.serial) == (MemberRole.OBSERVER, "70", 3)
+
+
 def test_lines_that_cannot_be_used_are_refused(
     place: Path, say: Say, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -139,6 +170,8 @@ def test_lines_that_cannot_be_used_are_refused(
     line = say("fleet sign", say("enroll v7"))
     foreign = say(f"fleet sign --out {other / 'fleet'}", say("enroll v7"))
     of_v8 = say("fleet sign", say("enroll v8"))
+    say("enroll --finish --config v8.toml", of_v8)
+    assert "the line is for v7, and v8.toml is of v8" in say("enroll --finish --config v8.toml", line)
     say("enroll --finish", line)
     before = {path: path.read_bytes() for path in place.glob("*.*")}
     assert "was cut or changed" in say("enroll --finish", line[:300])
@@ -151,7 +184,9 @@ def test_lines_that_cannot_be_used_are_refused(
     assert "`uavlinkd enroll NAME`" in say("enroll")
     assert "is not a name" in say("enroll V7")
     monkeypatch.chdir(other)
-    assert "there is no v7.key: run `uavlinkd enroll NAME` here first" in say("enroll --finish", line)
+    assert "the line is for v7, and there is no v7.key: run `uavlinkd enroll NAME` here" in say(
+        "enroll --finish", line
+    )
     monkeypatch.chdir(place)
     assert {path: path.read_bytes() for path in place.glob("*.*")} == before
 
@@ -178,7 +213,8 @@ def test_members_are_listed(place: Path, say: Say) -> None:
     assert rows[0][2:] == ["bulletin", "2"]
     assert [row[:4] for row in rows[2:]] == [["relay", "relay", "-", "1"], ["v7", "vehicle", "70-79", "2"]]
     assert rows[3][-1] == "revoked"
-    assert 'has no "v7"' in say("fleet sign v7")
+    assert "v7 is revoked" in say("fleet sign v7")
+    assert 'has no "v8"' in say("fleet sign v8")
 
 
 def test_folder_for_a_card(place: Path, say: Say) -> None:

@@ -243,7 +243,8 @@ def test_revoked_member_frees_its_name(folder: Path) -> None:
     assert fleet.bulletin.revoked == (4,)
     assert "drone2" not in [member.name for member in fleet.current]
     assert (folder / "drone2" / "drone2.key").exists()
-    with refused(folder, 'has no "drone2"'):
+    assert operations.revoke(folder, "drone2", unasked).fleet == fleet
+    with refused(folder, "drone2 is revoked"):
         operations.rotate(folder, "drone2", unasked)
     (folder / "drone2").rename(folder / "away")
     operations.add(folder, "drone2", Identity(ids=(2, 2)), unasked)

@@ -151,8 +151,8 @@ def _enroll(options: argparse.Namespace) -> None:
             raise FleetError("name the new member: `uavlinkd enroll NAME`")
         place = enrolling.MemberFiles(options.config or Path(config_file(options.name)), options.keys)
         line, key = enrolling.request(options.name, place)
+        _note(f"the private key is {key}. `fleet sign` reads this line, and `enroll --finish` what that prints")
         print(line)
-        _note(f"the private key is {key}. Give this line to `uavlinkd fleet sign`, and its line to `enroll --finish`")
         return
     line = options.finish or _line()
     done = enrolling.finish(line, options.config, options.keys, options.url, options.listen)
@@ -177,7 +177,8 @@ def _line() -> str:
 
 def _print_result(options: argparse.Namespace, result: Result) -> None:
     """Print the fleet as a table, and what to do next."""
-    _print_table(result.fleet, result.fleet.current)
+    if result.fleet.current:
+        _print_table(result.fleet, result.fleet.current)
     if result.changed:
         _say("")
     for text in _to_carry(options, result):

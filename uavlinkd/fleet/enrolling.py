@@ -107,14 +107,16 @@ def finish(line: str, config: Path | None, folder: Path | None, url: str | None,
         raise FleetError("the line has no valid certificate: sign the request again") from None
     place = MemberFiles(config or Path(config_file(certificate.name)), folder)
     table = place.table()
-    _check_present(table.get("fleet"), reply, certificate, place.config)
+    former_ids = _check_present(table.get("fleet"), reply, certificate, place.config)
     own = str(table.get("private_key_file", key_file(certificate.name)))
     path, contacts = _verified(reply, [place.key(own), place.key(_other(own))])
     name = own if path == place.key(own) else _other(own)  # it may be in another folder
     listen = listen or ([] if "listen" in table else listen_on(reply))
     if table:
+        if url is not None and url not in _urls(table):
+            raise FleetError(f"{place.config} exists: write the url into its [[endpoint]], and leave --url out")
         top = {"private_key_file": name, **({"listen": listen} if listen else {})}
-        text = with_fleet(place.config.read_text(encoding="utf-8-sig"), reply, top)
+        text = with_fleet(place.config.read_text(encoding="utf-8-sig"), reply, top, former_ids)
     else:
         settings = FleetSettings(
             control_socket="{name}.sock" if folder is None else "/run/uavlinkd/{name}/control.sock"
@@ -131,10 +133,15 @@ def finish(line: str, config: Path | None, folder: Path | None, url: str | None,
     return Enrolled(certificate, fingerprint, place.config, contacts, former if has_former else None)
 
 
-def _check_present(fleet: Any, reply: Reply, certificate: Certificate, config: Path) -> None:
-    """Check that a line is not older than the file, nor of another fleet."""
+def _urls(table: dict[str, Any]) -> list[Any]:
+    endpoints = table.get("endpoint")
+    return [each.get("url") for each in endpoints if isinstance(each, dict)] if isinstance(endpoints, list) else []
+
+
+def _check_present(fleet: Any, reply: Reply, certificate: Certificate, config: Path) -> tuple[int, int] | None:
+    """Check that a line is not older than the file, nor of another fleet. Returns the present system ids."""
     if fleet is None:
-        return
+        return None
     try:
         authority, signed, published = (
             b64decode(fleet[key], validate=True) for key in ("authority", "certificate", "bulletin")
@@ -148,16 +155,20 @@ def _check_present(fleet: Any, reply: Reply, certificate: Certificate, config: P
             f"the line is of fleet {fingerprint_of(reply.authority)}, and {config} is of {fingerprint_of(authority)}:"
             " to leave that fleet, delete [fleet] and each [[contact]] from the file"
         )
+    if present.name != certificate.name and present.serial > certificate.serial:
+        raise FleetError(f"the line is for {certificate.name}, and {config} is of {present.name}")
     if present.serial > certificate.serial or (new is not None and number > new.number):
         raise FleetError(
             f"the line was used or is old: {config} has serial {present.serial} and bulletin {number} already:"
             f" `uavlinkd fleet sign {certificate.name}` prints a newer one"
         )
+    return present.system_ids
 
 
 def _verified(reply: Reply, paths: list[Path]) -> tuple[Path, tuple[str, ...]]:
     """The key file whose key was certified, and the names of the contacts."""
-    reason = f"there is no {paths[0]}: run `uavlinkd enroll NAME` here first, and sign its line"
+    name = parse_certificate(reply.certificate).name
+    reason = f"the line is for {name}, and there is no {paths[0]}: run `uavlinkd enroll NAME` here, and sign its line"
     for path in reversed(paths):
         if path.exists():
             try:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from uavlinkd.authority.enrolment import Contact, Reply
@@ -96,8 +96,10 @@ def write_config(reply: Reply, settings: FleetSettings, private_key_file: str, l
     return with_fleet("\n".join(lines) + "\n", reply)
 
 
-def with_fleet(text: str, reply: Reply, top: Table | None = None) -> str:
+def with_fleet(text: str, reply: Reply, top: Table | None = None, former_ids: tuple[int, int] | None = None) -> str:
     """A configuration with the fleet's present facts and contacts; ``top``: these keys at its top too.
+
+    Endpoints with the ids of the former certificate, ``former_ids``, get those of the present one.
 
     A file that gets its first ``[fleet]`` also gets ``confidential``: relays could read the frames otherwise.
     """
@@ -127,6 +129,8 @@ def with_fleet(text: str, reply: Reply, top: Table | None = None) -> str:
     if reply.relays and "relay_server" not in table:
         facts["relay_server"] = {}
     after = "".join(piece for piece in _sections(text) if not _is_section(piece, _CONTACT))
+    if former_ids is not None:
+        after = _with_ids(after, table, former_ids, parse_certificate(reply.certificate).system_ids)
     for section, values in facts.items():
         after = _with_keys(after, section, values)
         (table if not section else table.setdefault(section, {})).update(values)
@@ -147,6 +151,17 @@ def _parsed(text: str) -> Table:
     if not table or not all(isinstance(section, dict) for section in sections):
         raise FleetError("it is not a configuration: correct it, or move it away")
     return table
+
+
+def _with_ids(text: str, table: Table, before: tuple[int, int], now: tuple[int, int]) -> str:
+    old, new = (list(range(first, last + 1)) for first, last in (before, now))
+    endpoints: Iterator[Table] = iter(table.get("endpoint", ()))
+    pieces = _sections(text)
+    for number, piece in enumerate(pieces):
+        if _is_section(piece, "[[endpoint") and (endpoint := next(endpoints, {})).get("system_ids") == old:
+            pieces[number] = _with_keys(piece, "[endpoint", {"system_ids": new})
+            endpoint["system_ids"] = new
+    return "".join(pieces)
 
 
 def _with_keys(text: str, section: str, values: Table) -> str:

@@ -154,8 +154,17 @@ class Fleet:
         for member in self.current:
             if member.name == name:
                 return member
+        if self.former(name) is not None:
+            raise FleetError(
+                f"{name} is revoked: a new key makes it a member again, `uavlinkd fleet sign --replace {name}`"
+            )
         names = ", ".join(member.name for member in self.current)
         raise FleetError(f'this fleet has no "{printable(name)}": its members are {names or "none"}')
+
+    def former(self, name: str) -> Member | None:
+        """The last member of this name, if it was revoked and has no other certificate."""
+        named = [member for member in self.members if member.name == name]
+        return named[-1] if named and all(map(self.is_revoked, named)) else None
 
     def contacts_of(self, name: str) -> list[Member]:
         """The members that one has in its configuration, relays first."""

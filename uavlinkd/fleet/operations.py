@@ -134,7 +134,7 @@ def sign(
         signer = _signer(folder, before, ask)
         fleet = signing.certify(before, signer, request.public_key, request.name, identity, replaces=replaces)
         changes = FileChanges(folder, fleet)
-        changed = _refresh(changes, before, "")
+        changed = _refresh(changes, before, request.name)
         apply(changes)
     line = files.reply_for(changes.fleet, changes.fleet.member(request.name)).line()
     return Result(changes.fleet, changed, tuple(changes.notes)), line
@@ -188,8 +188,10 @@ def _with_new_key(folder: Path, name: str, identity: Identity, ask: Passphrase, 
 
 
 def revoke(folder: Path, name: str, ask: Passphrase, *, resign: bool = False) -> Result:
-    """Sign a bulletin that refuses a member. Its own folder is kept."""
+    """Sign a bulletin that refuses a member. Its own folder is kept. Once more changes nothing."""
     with _open_fleet(folder) as before:
+        if before.former(name) is not None:
+            return Result(before)
         member = before.member(name)
         changes = FileChanges(folder, signing.revoke(before, _signer(folder, before, ask), [member], resign=resign))
         changed = _refresh(changes, before, name) if resign else ()

@@ -58,16 +58,17 @@ def certify(
     """Sign a certificate for a new member, or a new key of one: then its former serial is revoked too."""
     role, ids, addresses = identity
     former = next((member for member in fleet.current if member.name == name), None)
-    if former is not None:
-        if not replaces:
-            raise FleetError(
-                f'this fleet has a "{name}" already: choose another name, or replace its key (--replace {name})'
-            )
-        role, ids = (
-            role or former.role,
-            ids or (former.certificate.system_ids if role in (None, former.role) else None),
+    if former is not None and not replaces:
+        raise FleetError(
+            f'this fleet has a "{name}" already: choose another name, or replace its key (--replace {name})'
         )
-        addresses = addresses or former.addresses
+    model = former or (fleet.former(name) if replaces else None)
+    if model is not None:
+        role, ids = (
+            role or model.role,
+            ids or (model.certificate.system_ids if role in (None, model.role) else None),
+        )
+        addresses = addresses or model.addresses
     role = role or MemberRole.VEHICLE
     others = [member for member in fleet.current if member is not former]
     _check(fleet, others, public_key, name, addresses)
@@ -131,7 +132,9 @@ def _system_ids(
         raise FleetError("a system id is a number from 1 to 255, and each member has its own")
     for number in _range(ids):
         if number in taken:
-            raise FleetError(f"{name} would have the system id of {taken[number].name}, {number}")
+            raise FleetError(
+                f"{name} would have the system id of {taken[number].name}, {number}: choose another, or omit --id"
+            )
     return ids
 
 
