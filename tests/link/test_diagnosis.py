@@ -28,7 +28,7 @@ from uavlinkd.core.settings import PeerSettings
 from uavlinkd.endpoints.url import parse_url
 from uavlinkd.link import diagnosis, down_problems
 from uavlinkd.link.evidence import EVIDENCE_S, OWN_FRAMES_S, History
-from uavlinkd.link.facts import ICMP_S
+from uavlinkd.link.facts import ICMP_S, Moment
 from uavlinkd.link.own_problems import PROBLEMS, own_codes
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.traffic_problems import SECURITY_S, has_no_client, is_contested
@@ -315,6 +315,11 @@ def test_senders_without_a_member_here_have_their_own_addresses(daemon: Daemon) 
         daemon.dropped(DropReason.UNKNOWN_PEER, address, key)
     shown = ", ".join(f"{encode_key(key)} at {host}:{port}" for key, (host, port) in keys.items())
     assert daemon.findings()["not_a_member"].text.endswith(shown)
+    daemon.parts.fleet = SimpleNamespace()
+    finding = next(one for one in diagnosis.member_problems(Moment(daemon.parts, NOW)) if one.cause == "not_a_member")
+    assert finding.text.endswith(shown)
+    assert "fleet list" in finding.remedy
+    assert "[[member]]" not in finding.remedy
 
 
 # A peer that is up.

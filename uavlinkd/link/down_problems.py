@@ -159,9 +159,12 @@ def silent_relays(
     for relay in relays:
         name, hosts = relay.config.name, hosts_of(relay)
         text = f"the relay {name} does not answer at {listed(map(str, relay.config.addresses))}: "
+        admitted = "a [[member]] there"
+        if moment.daemon.fleet is not None:
+            admitted += ", or a member of its fleet that is not revoked"
         remedy = (
             f"{_ASK_THERE.format(name)}; else open its firewall. `uavlinkd pubkey` there must print the public_key of"
-            " the [[relay]] here, and this daemon must be a [[member]] there"
+            f" the [[relay]] here, and this daemon must be {admitted}"
         )
         error, path = moment.reported(relay) or ("", None)
         if path is not None and error in UNREACHABLE:
