@@ -155,7 +155,8 @@ def _parsed(text: str) -> Table:
 
 def _with_ids(text: str, table: Table, before: tuple[int, int], now: tuple[int, int]) -> str:
     old, new = (list(range(first, last + 1)) for first, last in (before, now))
-    endpoints: Iterator[Table] = iter(table.get("endpoint", ()))
+    present = table.get("endpoint")
+    endpoints: Iterator[Table] = iter(present if isinstance(present, list) else ())
     pieces = _sections(text)
     for number, piece in enumerate(pieces):
         if _is_section(piece, "[[endpoint") and (endpoint := next(endpoints, {})).get("system_ids") == old:
