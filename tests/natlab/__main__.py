@@ -30,7 +30,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.natlab", description=__doc__)
     parser.add_argument("kind", nargs="*", default=[], choices=[[], *KINDS], metavar="KIND", help=", ".join(KINDS))
     parser.add_argument("--delay-ms", type=float, default=0, help="of each place's line, in each direction")
-    parser.add_argument("--loss-percent", type=float, default=0, help="of each place's line, in each direction")
+    lost = "of each place's line, in each direction; with --members of each path between two, when all are linked"
+    parser.add_argument("--loss-percent", type=float, default=0, help=lost)
     parser.add_argument("--direct-s", type=float, default=0, help="wait so long for a direct path")
     parser.add_argument("--ipv6", action="store_true", help="pairs of which both or one have IPv6")
     parser.add_argument("--faults", type=int, default=0, metavar="TRIES", help="let each fault happen so often")
@@ -92,8 +93,7 @@ async def _fail(tries: int) -> None:
 
 
 async def _meet(options: argparse.Namespace) -> None:
-    line = options.delay_ms / 1000, options.loss_percent / 100
-    scenario = Scenario(options.members, options.swarm, *line)
+    scenario = Scenario(options.members, options.swarm, options.delay_ms / 1000)
     for is_pinned in (False, True) if options.idle_s else (False,):
         with Laboratory() as laboratory, redirect_stdout(StringIO()):
             async with Stage() as stage:
@@ -106,6 +106,8 @@ async def _meet(options: argparse.Namespace) -> None:
                     title = "pinned" if is_pinned else "by certificate"
                     _say(f"{title}, idle: {1000 * cpu_s:.1f} ms of processor time and {sent:.0f} bytes a second")
                 else:
+                    if options.loss_percent:
+                        fleet.lose(options.loss_percent / 100)
                     await _revoke_each(fleet, options.tries)
 
 

@@ -104,6 +104,11 @@ class Place:
         for node in self.nodes:
             self.laboratory.forget(node)
 
+    def lose(self, loss: float) -> None:
+        """Its line, which has to have a delay, loses this share of packets in each direction from now on."""
+        (wire,) = (node for node in self.nodes if isinstance(node.router, Wire))
+        self.laboratory.lose(wire, loss)
+
 
 class Laboratory:
     """Namespaces and one process that forwards; all gone at the end of the block, however it ends."""
@@ -176,6 +181,10 @@ class Laboratory:
             self._ask({"name": node.namespace.name})
         elif not isinstance(node.router, Wire):
             node.namespace.forget_connections()
+
+    def lose(self, node: _Node, loss: float) -> None:
+        """Let one line lose this share of packets in each direction."""
+        self._ask({"name": node.namespace.name, "loss": loss})
 
     # How it is built.
 

@@ -55,8 +55,6 @@ class Scenario:
     """Vehicles call each other too, not only the ground station."""
     delay_s: float = 0.01
     """Of each member's line, in each direction: a quarter of the round trip between two of them."""
-    loss: float = 0.0
-    """Of the same line."""
 
 
 class Joined(NamedTuple):
@@ -97,6 +95,7 @@ class Fleet:
         self._is_pinned = is_pinned
         self._authority = CertifiedFleet()
         self._places: dict[str, Place] = {}
+        self._loss = 0.0
         public = laboratory.public()
         self._numbers = count(1)
         self.vehicles: list[DaemonProcess] = []
@@ -124,6 +123,12 @@ class Fleet:
             others = self.vehicles[:number] if self._has_link(vehicle) else []
             await _until_up(vehicle, {one.name for one in (self.ground, *others)})
             await _until_up(self.ground, {vehicle.name})
+
+    def lose(self, loss: float) -> None:
+        """From now on each path between two members loses this share of packets: each one's line a part of it."""
+        self._loss = 1 - (1 - loss) ** 0.5
+        for member in self.members:
+            self._places[member.name].lose(self._loss)
 
     # A new member.
 
@@ -248,7 +253,7 @@ class Fleet:
         return vehicle
 
     def _member(self, name: str, role: MemberRole, system_id: int) -> DaemonProcess:
-        place = self._laboratory.place(KIND, delay_s=self._scenario.delay_s, loss=self._scenario.loss)
+        place = self._laboratory.place(KIND, delay_s=self._scenario.delay_s, loss=self._loss)
         member = self._daemon(name, place, "0.0.0.0")
         member.add_endpoint("autopilot", f"udpin:{_INTO[0]}:{_INTO[1]}")
         member.add_endpoint("screen", f"udpout:{_EAR[0]}:{_EAR[1]}")

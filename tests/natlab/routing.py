@@ -95,6 +95,8 @@ class Forwarding:
             os.set_blocking(descriptors[0], False)
             router = self._routers[name] = Router(descriptors[0], settings)
             self._selector.register(router.tun, selectors.EVENT_READ, router)
+        elif "loss" in settings:
+            self._routers[name].loss = settings["loss"]
         else:
             translator = self._routers[name].translator
             assert translator is not None

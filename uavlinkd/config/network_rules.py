@@ -166,8 +166,8 @@ def _other_ends(sections: Iterable[Values], serial: set[str], peers: Sequence[Va
                 )
     for section in sections if not any("addresses" in peer.invalid for peer in peers) else ():
         if (name := section.valid["name"]) in serial - set(users):
-            text = f'has no peer at its other end: write addresses = [{{ network = "{name}" }}] in its [[peer]]'
-            yield section.at("serial"), text
+            text = f'has no peer at its other end: write addresses = [{{ network = "{name}" }}]'
+            yield section.at("serial"), f"{text} in its [[peer]] or [[contact]]"
 
 
 def _listen(top: Values) -> Found:
