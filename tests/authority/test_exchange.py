@@ -134,6 +134,17 @@ def test_peer_with_a_newer_bulletin() -> None:
     assert daemon.hour(NOW + 2) == []
 
 
+def test_wait_follows_the_round_trip() -> None:
+    """A slow handshake does not slow the bulletin down. Nothing is kept for a peer that is not there."""
+    daemon = Daemon(NEW)
+    daemon.up()
+    daemon.exchange.set_wait(OTHER, 9.0)
+    daemon.exchange.set_wait(PEER, 4 * WAIT_S)
+    daemon.receive(have(OLD), NOW + 1)
+    sent = [at for at, *_ in daemon.hour(NOW + 1)]
+    assert sent[1] - sent[0] == 4 * WAIT_S
+
+
 def test_disk_that_cannot_be_written() -> None:
     """The bulletin counts and is passed on. No *have* states it, and a bulletin that is repeated causes none."""
     daemon = Daemon()

@@ -43,6 +43,12 @@ def _fleet(folder: Path, text: str) -> FleetConfig:
     return config.fleet
 
 
+@pytest.mark.parametrize(("role", "called"), [(_VEHICLE, _OPERATOR), (_OPERATOR, _VEHICLE), (_OBSERVER, _VEHICLE)])
+def test_either_end_calls_the_other(tmp_path: Path, role: MemberRole, called: MemberRole) -> None:
+    """The one that starts later asks its relay, so neither waits for the other's next question."""
+    assert _fleet(tmp_path, TOP + ENDPOINT + fleet(certificate(role))).call == {called}
+
+
 def test_member_is_configured_by_its_line(tmp_path: Path) -> None:
     """No section names another member, except the contacts. A contact that relays serves all links."""
     config = load_member(tmp_path, member_file(fleet() + _GS + _R1, TOP))

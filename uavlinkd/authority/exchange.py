@@ -94,6 +94,11 @@ class BulletinExchange:
         peer.owes_have, peer.push_at = True, now + peer.wait_s
         self._note(peer)
 
+    def set_wait(self, key: bytes, wait_s: float) -> None:
+        """The round trip of a peer has changed: see :meth:`on_handshake`."""
+        if (peer := self._peers.get(key)) is not None:
+            peer.wait_s = max(wait_s, c.PUSH_AGAIN_S)
+
     def on_down(self, key: bytes) -> None:
         """The link of a peer is lost or closed."""
         if (peer := self._peers.get(key)) is not None:

@@ -91,7 +91,8 @@ def _fleet(file: Sections, states: Path) -> FleetConfig:
     link, limits = LinkSection.model_construct(**file.link.valid), _relay_server_keys(file)
     own = keys.certificate.certificate.role
     policies = fleet_policies(file, own)
-    called = ["operator"] if own == MemberRole.VEHICLE and MemberRole.OPERATOR in policies else []
+    usual = MemberRole.OPERATOR if own == MemberRole.VEHICLE else MemberRole.VEHICLE
+    called = [usual.name.lower()] if usual in policies else []
     return FleetConfig(
         authority=keys.authority,
         own=keys.certificate,

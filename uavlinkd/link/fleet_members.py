@@ -241,14 +241,17 @@ class FleetMembers:
             case o.PeerExpired():
                 self.trust.held.pop(key, None)
             case o.SessionEstablished() | o.PeerUp() if peer.session_with(c.FEATURE_FLEET, now) is not None:
-                budget = self._node.facts.pace(peer.path) if peer.path is not None else None
                 self._serve(key, now)  # a contact comes without an admission
-                self.exchange.on_handshake(key, max(2 * peer.answer_s, 0.0 if budget is None else budget.ask_s), now)
+                self.exchange.on_handshake(key, self._wait_s(peer), now)
                 if self._fleet.call and any(relay.peer is peer for relay in self._relays.by_name.values()):
                     self._questions.begin(key, now)
             case o.PeerLost() | o.PeerClosed():
                 self.exchange.on_down(key)
                 self._questions.end(key)
+
+    def _wait_s(self, peer: Peer) -> float:
+        """How long to wait for what a peer answers to a record, at least."""
+        return max(2 * peer.answer_s, 0.0 if peer.path is None else self._node.facts.pace(peer.path).ask_s)
 
     def _join(self, key: bytes, peer: Peer | None, now: float) -> None:
         """A member is here, or is introduced: make a link with it, and let it use the relay of this daemon."""
@@ -278,6 +281,7 @@ class FleetMembers:
             elif isinstance(record, Who):
                 return DropReason.UNEXPECTED_RECORD if self._relay is None else self._relay.on_record(received, now)
             elif isinstance(record, FleetRecord):
+                self.exchange.set_wait(key, self._wait_s(peer))
                 self._react(self.exchange.receive(key, record, received.order, now), now, peer.name)
                 if isinstance(record, CertificateRecord) and self._is_contact(key):
                     self._disk.write()

@@ -48,7 +48,7 @@ class MemberQuestions:
         for relay, asking in self._askings.items():
             if now >= asking.due_at:
                 yield relay, Who(roles, asking.after)
-                asking.due_at = now + min(WHO_INTERVAL_S, WHO_SOON_S * 2.0 ** min(asking.tries, 6))
+                asking.due_at = now + min(WHO_INTERVAL_S, WHO_SOON_S * 2.0 ** min(asking.tries, 8))
                 asking.tries += 1
                 asking.received = asking.after = 0
 
