@@ -29,7 +29,8 @@ async def test_clocks_have_no_effect(tmp_path: Path) -> None:
         for vehicle, day in years.items():
             (started,) = vehicle.events("daemon_started")
             assert started["timestamp"].startswith(day)
-            state_file.write(tmp_path / "state", FleetState(fleet.bulletin, fleet.certificates[vehicle.name][1]))
+            contact, own = fleet.certificates["ground"][:2], fleet.certificates[vehicle.name][1]
+            state_file.write(tmp_path / "state", FleetState(fleet.bulletin, own, (contact,)))
             name = vehicle.name
             await ground.until(lambda status, name=name: status["fleet"]["bulletins"][name] == fleet.number)  # type: ignore[misc]
             await vehicle.stop()
