@@ -222,6 +222,7 @@ def test_peer_by_certificate() -> None:
     assert fleet.b.peer.provisional_until == c.UNCONFIRMED_LIFETIME_S
     assert not fleet.b.peer.is_up
     assert fleet.b.node.facts.peers == 0
+    assert fleet.b.node.find(KEY_A.public) is fleet.b.peer
     confirmed = exchange(fleet.b, fleet.a, fleet.a.receive(response, 0.1), 0.1)
     events = [type(out) for out in confirmed if isinstance(out, PeerAdmitted | PeerUp)]
     assert events == [PeerAdmitted, PeerUp]
