@@ -11,7 +11,7 @@ from uavlinkd.core.constants import NEVER
 from uavlinkd.core.relay_records import Who
 
 WHO_SOON_S: Final = 0.5
-"""A question to a relay is repeated after this, and each time after twice as long: it, or an answer, may be lost."""
+"""A question without an answer is repeated after this, and each time after twice as long."""
 
 
 @dataclass(slots=True)
@@ -53,9 +53,9 @@ class MemberQuestions:
                 asking.received = asking.after = 0
 
     def note(self, relay: bytes, serial: int, now: float) -> None:
-        """A relay sent the certificate with this serial. After a full answer it is asked for the others."""
+        """A relay sent the certificate with this serial. After a full answer it is asked for the others at once."""
         if (asking := self._askings.get(relay)) is not None:
             asking.received += 1
             asking.after = max(asking.after, serial)
-            if asking.received == CERTIFICATES_PER_ANSWER:
-                asking.due_at, asking.tries = now, 0
+            is_full = asking.received == CERTIFICATES_PER_ANSWER
+            asking.due_at = now if is_full else now + WHO_INTERVAL_S
