@@ -181,6 +181,18 @@ def test_held_bytes_are_not_verified_again(monkeypatch: pytest.MonkeyPatch) -> N
     assert known.judge(KEY, data) == CERTIFICATE
 
 
+def test_relay_does_not_compare_system_ids() -> None:
+    """It carries no frames of its own. A name is of one member there too."""
+    known = Trust(AUTHORITY, OWN, signed(RELAY, OWN), bulletin(1))
+    assert known.hold(KEY, signed(vehicle(7), KEY)) == []
+    other = vehicle(7, 8)._replace(name="other")
+    assert known.hold(OTHER, signed(other, OTHER)) == []
+    another = bytes((4,)) * 32
+    same_name = vehicle(9, 7)._replace(name="v7")
+    assert refused(known, another, signed(same_name, another)) is DropReason.MEMBER_CONFLICT
+    assert set(known.held) == {KEY, OTHER}
+
+
 def test_configuration_that_changes() -> None:
     """Held certificates that it denies, or with which it conflicts, end."""
     known = trust()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from base64 import b64decode, b64encode
+from base64 import b64decode
 from pathlib import Path
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -12,14 +12,11 @@ from tests.config.files import ENDPOINT, HEAD, KEY
 from uavlinkd.config import Config, keys
 from uavlinkd.config.load import load_config
 from uavlinkd.core.certificates import Bulletin, Certificate, MemberRole, fleet_id_of
+from uavlinkd.system.base64_text import to_base64
 
 OTHER_SIGNER = Ed25519PrivateKey.from_private_bytes(bytes(range(32)))
-PRIVATE = b64encode(b"\x08" * 31 + b"\x48").decode()
+PRIVATE = to_base64(b"\x08" * 31 + b"\x48")
 OWN = keys.public_key_text(PRIVATE)
-
-
-def text_of(data: bytes) -> str:
-    return b64encode(data).decode()
 
 
 def authority(signer: Ed25519PrivateKey = SIGNER) -> bytes:
@@ -38,19 +35,19 @@ def certificate(
     """A signed certificate, in base64."""
     ids = (0, 0) if role == MemberRole.RELAY else ids
     made = Certificate(fleet_id_of(authority(signer)), serial, role, ids, name)
-    return text_of(made.encode() + signer.sign(made.to_be_signed(b64decode(key))))
+    return to_base64(made.encode() + signer.sign(made.to_be_signed(b64decode(key))))
 
 
 def bulletin(number: int = 1, *revoked: int, signer: Ed25519PrivateKey = SIGNER) -> str:
     """A signed bulletin, in base64."""
     made = Bulletin(fleet_id_of(authority(signer)), number, 0, revoked)
-    return text_of(made.encode() + signer.sign(made.to_be_signed()))
+    return to_base64(made.encode() + signer.sign(made.to_be_signed()))
 
 
 def fleet(own: str = "", more: str = "", *, news: str = "") -> str:
     """The section of a vehicle, or of the member with another certificate."""
     return (
-        f'[fleet]\nauthority = "{text_of(authority())}"\ncertificate = "{own or certificate()}"\n'
+        f'[fleet]\nauthority = "{to_base64(authority())}"\ncertificate = "{own or certificate()}"\n'
         f'bulletin = "{news or bulletin()}"\n{more}\n'
     )
 

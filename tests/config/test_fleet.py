@@ -19,7 +19,6 @@ from tests.config.fleets import (
     fleet,
     load_member,
     member_file,
-    text_of,
 )
 from uavlinkd.config import ConfigError
 from uavlinkd.config.changes import compare
@@ -30,6 +29,7 @@ from uavlinkd.core.certificates import Certificate, MemberRole
 from uavlinkd.core.settings import Link
 from uavlinkd.relay.forwarding import RelayLimits
 from uavlinkd.system.addresses import parse_address
+from uavlinkd.system.base64_text import to_base64
 
 _BOTH = c.FEATURE_RECORDS | c.FEATURE_FLEET
 _VEHICLE, _OPERATOR = MemberRole.VEHICLE, MemberRole.OPERATOR
@@ -179,12 +179,12 @@ def test_pinned_links_carry_bulletins_in_a_fleet(tmp_path: Path) -> None:
     assert not Link().features & _BOTH
 
 
-_ANY = text_of(bytes(100))
+_ANY = to_base64(bytes(100))
 _FOREIGN = certificate(name="x", ids=(8, 8), signer=OTHER_SIGNER)
 _ROLE = '[[fleet_role]]\nname = "operator"\n'
-_AUTHORITY = text_of(authority())
+_AUTHORITY = to_base64(authority())
 _ROWS = [
-    (fleet().replace(_AUTHORITY, text_of(b"\xec" + b"\xff" * 30 + b"\x7f")), "fleet.authority", "small order"),
+    (fleet().replace(_AUTHORITY, to_base64(b"\xec" + b"\xff" * 30 + b"\x7f")), "fleet.authority", "small order"),
     (fleet().replace(_AUTHORITY, OWN[:-5]), "fleet.authority", "cut"),
     (
         fleet().replace(_AUTHORITY, "AAAA"),

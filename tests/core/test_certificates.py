@@ -31,11 +31,15 @@ from uavlinkd.core import constants as c
 from uavlinkd.core import wire
 from uavlinkd.core.certificates import (
     Bulletin,
+    MemberRole,
     digest_of,
     is_certified,
     is_published,
     parse_bulletin,
     parse_certificate,
+    role_bits,
+    roles_in,
+    verified_bulletin,
 )
 from uavlinkd.core.crypto import AuthorityKey, Secret
 from uavlinkd.core.drops import Drop, DropReason
@@ -125,6 +129,22 @@ def test_bulletin_with_invalid_offsets(revoked: tuple[int, ...]) -> None:
     """Each serial is there once, and is a serial."""
     header = b"\1" + FLEET + struct.pack(f">IIH{len(revoked)}H", 1, 2**32 - 6, len(revoked), *revoked)
     assert parse_bulletin(header + bytes(64)) is None
+
+
+def test_bulletin_of_another_fleet() -> None:
+    """One that the authority signed for its own fleet is valid, and no other bytes."""
+    bulletin = Bulletin(FLEET, 1, 1, ())
+    assert verified_bulletin(published(bulletin), AUTHORITY) == bulletin
+    for data in (b"", published(bulletin)[:-1] + b"\0", published(bulletin._replace(fleet=b"none"))):
+        assert verified_bulletin(data, AUTHORITY) is None
+
+
+def test_system_ids_and_roles() -> None:
+    """A relay has no system id. Bits of roles that this version does not know are ignored."""
+    assert [*CERTIFICATE._replace(system_ids=(7, 9)).systems] == [7, 8, 9]
+    assert not CERTIFICATE._replace(role=MemberRole.RELAY, system_ids=(0, 0)).systems
+    assert role_bits((MemberRole.RELAY, MemberRole.OBSERVER)) == 0b10010
+    assert roles_in(0b1110011) == {MemberRole.RELAY, MemberRole.OBSERVER}
 
 
 def test_bulletin_shrinks() -> None:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from base64 import b64decode, b64encode
+from base64 import b64decode
 from collections.abc import Sequence
 
 from tests.authority.signing import AUTHORITY, FLEET, bulletin, signed
-from tests.daemon.process import DaemonProcess
+from tests.daemon.harness import Stage
+from tests.daemon.process import DaemonProcess, Status
 from uavlinkd.core.certificates import Certificate, MemberRole
+from uavlinkd.system.base64_text import to_base64
 
 
-def text(data: bytes) -> str:
-    return b64encode(data).decode()
+def is_up(status: Status, *names: str) -> bool:
+    """Whether the links with all of these are up."""
+    return all(status["peers"].get(name, {}).get("state") == "up" for name in names)
 
 
 class CertifiedFleet:
@@ -34,9 +37,9 @@ class CertifiedFleet:
         certificate = Certificate(FLEET, self.serial, role, (system_id, system_id), daemon.name)
         self.certificates[daemon.name] = key, signed(certificate, key), certificate
         daemon.config["fleet"] = {
-            "authority": text(AUTHORITY.public),
-            "certificate": text(self.certificates[daemon.name][1]),
-            "bulletin": text(self.bulletin),
+            "authority": to_base64(AUTHORITY.public),
+            "certificate": to_base64(self.certificates[daemon.name][1]),
+            "bulletin": to_base64(self.bulletin),
         }
         for contact in contacts:
             self.add_contact(daemon, contact, [contact.address])
@@ -47,7 +50,7 @@ class CertifiedFleet:
         """Write another member into a daemon's configuration."""
         section = {
             "public_key": contact.public_key,
-            "certificate": text(self.certificates[contact.name][1]),
+            "certificate": to_base64(self.certificates[contact.name][1]),
             "addresses": list(addresses),
         }
         daemon.config.setdefault("contact", []).append(section)
@@ -56,7 +59,7 @@ class CertifiedFleet:
         """The request that publishes a bulletin which revokes these members too."""
         self.number += 1
         self.revoked = sorted({*self.revoked, *(self.certificates[name][2].serial for name in names)})
-        return f"publish {text(self.bulletin)}"
+        return f"publish {to_base64(self.bulletin)}"
 
     def renew(self, *daemons: DaemonProcess) -> str:
         """The request that hands new certificates of these over."""
@@ -66,10 +69,35 @@ class CertifiedFleet:
             self.serial += 1
             certificate = before._replace(serial=self.serial)
             self.certificates[daemon.name] = key, signed(certificate, key), certificate
-            renewed.append(f"{daemon.public_key}:{text(self.certificates[daemon.name][1])}")
-        return f"publish {text(self.bulletin)} {' '.join(renewed)}"
+            renewed.append(f"{daemon.public_key}:{to_base64(self.certificates[daemon.name][1])}")
+        return f"publish {to_base64(self.bulletin)} {' '.join(renewed)}"
 
     def raise_least(self, least: int) -> str:
         """The request that publishes a bulletin which refuses lower serials."""
         self.number, self.least = self.number + 1, least
-        return f"publish {text(self.bulletin)}"
+        return f"publish {to_base64(self.bulletin)}"
+
+
+Swarm = tuple[CertifiedFleet, DaemonProcess, DaemonProcess, DaemonProcess]
+
+
+async def start_swarm(stage: Stage, listen: Sequence[str] | None = None, **station: object) -> Swarm:
+    """A ground station that relays, with these sections too, and two vehicles that call it and each other.
+
+    ``listen``: where the vehicles do, as of :meth:`Stage.daemon`.
+    """
+    fleet = CertifiedFleet()
+    ground, one, two = stage.daemon("ground"), stage.daemon("v1", listen), stage.daemon("v2", listen)
+    fleet.join(ground, MemberRole.OPERATOR, 255)
+    ground.config |= {"relay_server": {}, **station}
+    for system_id, vehicle in enumerate((one, two), 1):
+        fleet.join(vehicle, MemberRole.VEHICLE, system_id, ground)
+        vehicle.config["contact"][0]["relays"] = True
+        vehicle.config["fleet"]["call"] = ["operator", "vehicle"]
+        vehicle.add_endpoint("autopilot")
+    ground.add_endpoint("screen")
+    await stage.start(ground, one, two, linked=False)
+    await one.until(lambda status: is_up(status, "ground", "v2"))
+    await two.until(lambda status: is_up(status, "ground", "v1"))
+    await ground.until(lambda status: is_up(status, "v1", "v2"))
+    return fleet, ground, one, two

@@ -9,32 +9,15 @@ import pytest
 
 from tests.daemon.frames import frame
 from tests.daemon.harness import Stage
-from tests.daemon.members import CertifiedFleet, text
+from tests.daemon.members import Swarm, is_up, start_swarm
 from tests.daemon.process import DaemonProcess, Status
-from tests.daemon.test_members import is_up
-from uavlinkd.core.certificates import MemberRole
-
-Fleet = tuple[CertifiedFleet, DaemonProcess, DaemonProcess, DaemonProcess]
+from uavlinkd.system.base64_text import to_base64
 
 
 @pytest.fixture
-async def fleet(stage: Stage) -> Fleet:
+async def fleet(stage: Stage) -> Swarm:
     """A ground station that records and relays; two vehicles that call it and each other."""
-    fleet = CertifiedFleet()
-    ground, one, two = stage.daemon("ground"), stage.daemon("v1"), stage.daemon("v2")
-    fleet.join(ground, MemberRole.OPERATOR, 255)
-    ground.config |= {"relay_server": {}, "recording": {"folder": "recordings"}}
-    for system_id, vehicle in enumerate((one, two), 1):
-        fleet.join(vehicle, MemberRole.VEHICLE, system_id, ground)
-        vehicle.config["contact"][0]["relays"] = True
-        vehicle.config["fleet"]["call"] = ["operator", "vehicle"]
-        vehicle.add_endpoint("autopilot")
-    ground.add_endpoint("screen")
-    await stage.start(ground, one, two, linked=False)
-    await one.until(lambda status: is_up(status, "ground", "v2"))
-    await two.until(lambda status: is_up(status, "ground", "v1"))
-    await ground.until(lambda status: is_up(status, "v1", "v2"))
-    return fleet, ground, one, two
+    return await start_swarm(stage, recording={"folder": "recordings"})
 
 
 async def reload(daemon: DaemonProcess) -> Status:
@@ -44,7 +27,7 @@ async def reload(daemon: DaemonProcess) -> Status:
     return await daemon.status()
 
 
-async def test_names_and_keys_in_the_file_win(fleet: Fleet) -> None:
+async def test_names_and_keys_in_the_file_win(fleet: Swarm) -> None:
     """A name that is denied, and a member's key in a [[peer]], at a station that relays; and back."""
     _, ground, one, two = fleet
     ground.config["fleet"]["deny"] = ["v1"]
@@ -75,7 +58,7 @@ def edit_contacts(config: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize(("edit", "left"), [(edit_policy, {"v2"}), (edit_link, {"ground"}), (edit_contacts, {"v2"})])
 async def test_rules_of_the_fleet_change(
-    fleet: Fleet, edit: Callable[[dict[str, Any]], None], left: set[str]
+    fleet: Swarm, edit: Callable[[dict[str, Any]], None], left: set[str]
 ) -> None:
     """No certificate makes an operator; other settings of links; no contact. Then everything is as before."""
     _, _, one, _ = fleet
@@ -88,11 +71,11 @@ async def test_rules_of_the_fleet_change(
     await one.until(lambda status: is_up(status, "ground", "v2"))
 
 
-async def test_member_becomes_a_contact(fleet: Fleet) -> None:
+async def test_member_becomes_a_contact(fleet: Swarm) -> None:
     """A member that was introduced gets its address from the file. A bulletin revokes it, then it leaves the file."""
     signed, ground, one, two = fleet
     contact = {"public_key": two.public_key, "addresses": [two.address]}
-    one.config["contact"].append(contact | {"certificate": text(signed.certificates["v2"][1])})
+    one.config["contact"].append(contact | {"certificate": to_base64(signed.certificates["v2"][1])})
     await reload(one)
     await one.until(lambda status: is_up(status, "v2") and status["peers"]["v2"]["path"] == two.address)
     await ground.ask(signed.revoke("v2"))
@@ -102,22 +85,22 @@ async def test_member_becomes_a_contact(fleet: Fleet) -> None:
     assert set((await reload(one))["peers"]) == {"ground"}
 
 
-async def test_contact_is_revoked_and_signed_again(fleet: Fleet) -> None:
+async def test_contact_is_revoked_and_signed_again(fleet: Swarm) -> None:
     """Its link and its relay end at once. A newer certificate in the file brings both back."""
     signed, ground, one, _ = fleet
     await one.ask(signed.revoke("ground"))
     status = await one.until(lambda status: "ground" not in status["peers"] and not status["relays"])
     assert status["fleet"]["number"] == 2
     signed.renew(ground)
-    one.config["contact"][0]["certificate"] = text(signed.certificates["ground"][1])
+    one.config["contact"][0]["certificate"] = to_base64(signed.certificates["ground"][1])
     await reload(one)
     ground.config["fleet"]["certificate"] = one.config["contact"][0]["certificate"]
-    ground.config["fleet"]["bulletin"] = text(signed.bulletin)
+    ground.config["fleet"]["bulletin"] = to_base64(signed.bulletin)
     await reload(ground)
     await one.until(lambda status: is_up(status, "ground") and status["relays"]["ground"]["state"] == "up")
 
 
-async def test_member_is_revoked_while_it_is_recorded(fleet: Fleet, stage: Stage) -> None:
+async def test_member_is_revoked_while_it_is_recorded(fleet: Swarm, stage: Stage) -> None:
     """Its recording stays, the others go on, and a metric counts the members."""
     signed, ground, one, two = fleet
     clients = {vehicle: await stage.client() for vehicle in (one, two)}

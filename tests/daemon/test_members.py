@@ -8,13 +8,8 @@ import pytest
 
 from tests.daemon.frames import frame
 from tests.daemon.harness import Stage
-from tests.daemon.members import CertifiedFleet
-from tests.daemon.process import DaemonProcess, Status
+from tests.daemon.members import CertifiedFleet, Swarm, is_up, start_swarm
 from uavlinkd.core.certificates import MemberRole
-
-
-def is_up(status: Status, *names: str) -> bool:
-    return all(status["peers"].get(name, {}).get("state") == "up" for name in names)
 
 
 async def test_members_meet_at_a_relay(stage: Stage) -> None:
@@ -45,27 +40,13 @@ async def test_members_meet_at_a_relay(stage: Stage) -> None:
 
 
 @pytest.fixture
-async def swarm(stage: Stage) -> tuple[CertifiedFleet, DaemonProcess, DaemonProcess, DaemonProcess]:
-    """A ground station that relays, and two vehicles that call each other too."""
-    fleet = CertifiedFleet()
-    ground, one, two = stage.daemon("ground"), stage.daemon("v1", []), stage.daemon("v2", [])
-    fleet.join(ground, MemberRole.OPERATOR, 255)
-    ground.config["relay_server"] = {}
-    for system_id, vehicle in enumerate((one, two), 1):
-        fleet.join(vehicle, MemberRole.VEHICLE, system_id, ground)
-        vehicle.config["contact"][0]["relays"] = True
-        vehicle.config["fleet"]["call"] = ["operator", "vehicle"]
-        vehicle.add_endpoint("autopilot")
-    ground.add_endpoint("screen")
-    await stage.start(ground, one, two, linked=False)
-    await one.until(lambda status: is_up(status, "ground", "v2"))
-    await two.until(lambda status: is_up(status, "ground", "v1"))
-    await ground.until(lambda status: is_up(status, "v1", "v2"))
-    return fleet, ground, one, two
+async def swarm(stage: Stage) -> Swarm:
+    """No vehicle listens."""
+    return await start_swarm(stage, [])
 
 
 async def test_station_that_relays(
-    swarm: tuple[CertifiedFleet, DaemonProcess, DaemonProcess, DaemonProcess],
+    swarm: Swarm,
 ) -> None:
     """Vehicles meet there, and its bulletin revokes one of them at the other, which tells a member that was off."""
     fleet, ground, one, two = swarm
@@ -80,9 +61,7 @@ async def test_station_that_relays(
     assert len(two.events("peer_up", peer="v1")) == before
 
 
-async def test_member_gets_a_new_key(
-    stage: Stage, swarm: tuple[CertifiedFleet, DaemonProcess, DaemonProcess, DaemonProcess]
-) -> None:
+async def test_member_gets_a_new_key(stage: Stage, swarm: Swarm) -> None:
     """The same name and ids with a higher serial: all accept the new key, and the old one is revoked."""
     fleet, ground, one, two = swarm
     contacts = one.config["contact"]
@@ -101,7 +80,7 @@ async def test_member_gets_a_new_key(
 
 
 async def test_members_get_newer_certificates(
-    swarm: tuple[CertifiedFleet, DaemonProcess, DaemonProcess, DaemonProcess],
+    swarm: Swarm,
 ) -> None:
     """All get new certificates, each along live links. Then the least serial rises: no link ends."""
     fleet, *daemons = swarm

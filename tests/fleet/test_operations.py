@@ -27,7 +27,6 @@ from uavlinkd.fleet.manifest import (
     Fleet,
     FleetError,
     FleetSettings,
-    base64_of,
     check_settings,
     fill,
     read_manifest,
@@ -36,6 +35,7 @@ from uavlinkd.fleet.signing import Identity
 from uavlinkd.fleet.transaction import check_members, lock
 from uavlinkd.lab.child_processes import end_with_parent
 from uavlinkd.system.addresses import Address
+from uavlinkd.system.base64_text import to_base64
 
 COMMAND = end_with_parent(sys.executable, "-m", "uavlinkd", "fleet", "add", "scout", "--out", "fleet")
 RELAY = Identity(MemberRole.RELAY, None, (Address("198.51.100.9", 5790),))
@@ -88,7 +88,7 @@ def test_every_daemon_accepts_a_new_fleet(folder: Path) -> None:
     for member in fleet.members:
         assert loaded(folder, member.name).warnings == ()
         of = {
-            path.split("/")[0] for path, content in files.items() if base64_of(member.public_key).encode() in content
+            path.split("/")[0] for path, content in files.items() if to_base64(member.public_key).encode() in content
         }
         assert of - {"fleet.toml"} == ({*names[1:]} if member.name == "relay" else set())
 
@@ -368,7 +368,7 @@ def test_rotated_key_is_removed_everywhere(folder: Path) -> None:
     assert fleet.bulletin.revoked == (old.certificate.serial,)
     for path, content in snapshot(folder).items():
         assert content != secret
-        assert path == "fleet.toml" or base64_of(old.public_key).encode() not in content
+        assert path == "fleet.toml" or to_base64(old.public_key).encode() not in content
 
 
 @pytest.mark.parametrize(

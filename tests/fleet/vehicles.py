@@ -18,11 +18,12 @@ from uavlinkd.config.load import load_config
 from uavlinkd.core.certificates import MemberRole
 from uavlinkd.core.crypto import Secret
 from uavlinkd.fleet import operations
-from uavlinkd.fleet.manifest import FleetSettings, base64_of, read_manifest
+from uavlinkd.fleet.manifest import FleetSettings, read_manifest
 from uavlinkd.lab.child_processes import end_with_parent
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.ops.control import ControlError, ask
 from uavlinkd.system.addresses import Address
+from uavlinkd.system.base64_text import to_base64
 
 NAMES = ("drone1", "drone2", "drone3")
 RELAY = "relay"
@@ -134,7 +135,7 @@ class Vehicles:
 
     async def until_linked(self) -> None:
         """Wait until both ends of every pair are linked by the keys of the fleet's folder."""
-        public = {member.name: base64_of(member.public_key) for member in read_manifest(self.fleet).current}
+        public = {member.name: to_base64(member.public_key) for member in read_manifest(self.fleet).current}
 
         def is_linked(name: str) -> bool:
             peers = self.peers(name)

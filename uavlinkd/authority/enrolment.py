@@ -7,18 +7,26 @@ secret, but the reply decides whom the new member trusts: compare the fingerprin
 from __future__ import annotations
 
 import base64
-import binascii
 import struct
 from typing import NamedTuple
 
 from uavlinkd.authority.trust import Trust
-from uavlinkd.core.certificates import BULLETIN_BYTES, NAME, MemberRole, parse_certificate
+from uavlinkd.core.certificates import (
+    BULLETIN_BYTES,
+    FLEET_LABEL,
+    NAME,
+    MemberRole,
+    parse_certificate,
+    role_bits,
+    roles_in,
+)
 from uavlinkd.core.constants import KEY_BYTES
 from uavlinkd.core.crypto import AuthorityKey, is_usable_public_key, sha256
 from uavlinkd.core.drops import Drop
 from uavlinkd.core.suites import SUITES, Suite
 from uavlinkd.core.wire import CERTIFICATE_BYTES
 from uavlinkd.system.addresses import AddressError, parse_address
+from uavlinkd.system.base64_text import from_base64, to_base64
 
 WORD = "uavlink-enroll-1"
 VERSION = 1
@@ -37,7 +45,11 @@ class EnrolmentError(ValueError):
 
 def fingerprint_of(authority: bytes) -> str:
     """Eight characters by which persons compare the public key of an authority."""
-    return base64.b32encode(sha256(b"uavlink fleet" + authority)[:5]).decode().lower()
+    return _eight_characters(FLEET_LABEL + authority)
+
+
+def _eight_characters(data: bytes) -> str:
+    return base64.b32encode(sha256(data)[:5]).decode().lower()
 
 
 class Request(NamedTuple):
@@ -48,8 +60,8 @@ class Request(NamedTuple):
 
     def line(self) -> str:
         """The line, without its end."""
-        key = base64.b64encode(self.public_key).decode()
-        check = base64.b32encode(sha256(f"{WORD} {self.name} {key}".encode())[:5]).decode().lower()
+        key = to_base64(self.public_key)
+        check = _eight_characters(f"{WORD} {self.name} {key}".encode())
         return f"{WORD} {self.name} {key} {check}"
 
 
@@ -117,11 +129,10 @@ class Reply(NamedTuple):
 
     def line(self) -> str:
         """The line, without its end."""
-        calls = sum(1 << role for role in self.calls)
-        head = (VERSION, self.suite.number, calls, self.relays, self.authority, self.successor)
+        head = (VERSION, self.suite.number, role_bits(self.calls), self.relays, self.authority, self.successor)
         data = _HEAD.pack(*head, self.certificate, len(self.bulletin)) + self.bulletin + _encoded(self.addresses)
         data += bytes([len(self.contacts)]) + b"".join(contact.encode() for contact in self.contacts)
-        return base64.b64encode(data + sha256(data)[:CHECK_BYTES]).decode().rstrip("=")
+        return to_base64(data + sha256(data)[:CHECK_BYTES]).rstrip("=")
 
 
 def parse_reply(line: str) -> Reply:
@@ -158,10 +169,9 @@ def _parsed(data: bytes) -> Reply:
         key, signed, flag = _CONTACT.unpack_from(data, at)
         texts, at = _addresses(data, at + _CONTACT.size)
         contacts.append(Contact(key, signed, texts, bool(flag)))
-    roles = frozenset(role for role in MemberRole if calls >> role & 1)
     bulletin = data[_HEAD.size : _HEAD.size + size]
     parts = (authority, successor, certificate, bulletin, tuple(contacts))
-    reply = Reply(SUITES[suite], roles, bool(relays), addresses, *parts)
+    reply = Reply(SUITES[suite], roles_in(calls), bool(relays), addresses, *parts)
     is_same = base64.b64decode(reply.line() + "==")[:-CHECK_BYTES] == data  # one spelling of each reply
     if not is_same or count > MOST_CONTACTS or not all(contact.addresses for contact in contacts):
         raise ValueError("not canonical")
@@ -209,9 +219,6 @@ def verify_reply(reply: Reply, own_key: bytes) -> Trust:
 
 def _decoded(text: str, reason: str) -> bytes:
     try:
-        data = base64.b64decode(text, validate=True)
-    except (binascii.Error, ValueError):
+        return from_base64(text)
+    except ValueError:
         raise EnrolmentError(reason) from None
-    if base64.b64encode(data).decode() != text:
-        raise EnrolmentError(reason)
-    return data

@@ -19,6 +19,7 @@ from uavlinkd.authority.trust import BulletinVerdict, Trust, is_same_member
 from uavlinkd.core.certificates import parse_certificate
 from uavlinkd.core.crypto import sha256
 from uavlinkd.core.drops import Drop
+from uavlinkd.system.folders import sync_folder
 
 _TITLE = b"uavlinkd fleet state 1"
 _MOST_BYTES = 2048
@@ -79,11 +80,7 @@ def write(path: Path, state: FleetState) -> None:
         with suppress(OSError):
             new.unlink()  # the disk may be full
         raise
-    folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+    sync_folder(path.parent)
 
 
 def _encode(state: FleetState) -> bytes:

@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 from uavlinkd.core.certificates import (
     GENERATION,
-    Bulletin,
     Certificate,
     MemberRole,
     digest_of,
@@ -20,6 +19,7 @@ from uavlinkd.core.certificates import (
     is_published,
     parse_bulletin,
     parse_certificate,
+    verified_bulletin,
 )
 from uavlinkd.core.crypto import AuthorityKey
 from uavlinkd.core.drops import Drop, DropReason
@@ -75,7 +75,7 @@ class Trust:
         self._authority = authority
         self.fleet = fleet_id_of(authority.public)
         self.own_key = own_key
-        parsed = self._verified(bulletin)
+        parsed = verified_bulletin(bulletin, authority)
         if parsed is None:
             raise ValueError("is not a bulletin of this fleet")
         self.bulletin, self.bulletin_bytes = parsed, bulletin
@@ -85,8 +85,6 @@ class Trust:
         """By static public key, without the own one."""
         self._claims: dict[str | int, bytes] = {}
         """Who was held last with a name or a system id: a relay holds thousands, and must not compare all of them."""
-        self._last_valid = (b"", b"")
-        """The key and certificate whose signature was found valid last: they are judged, then held."""
         self.pinned = Pinned()
         if certificate and not self.replace_own(certificate):
             raise ValueError("is not a certificate of this fleet for the key of this daemon")
@@ -141,7 +139,10 @@ class Trust:
         Raises:
             Drop: as :meth:`judge`; then nothing was changed.
         """
-        certificate = self.judge(key, data)
+        return self.keep(key, self.judge(key, data), data)
+
+    def keep(self, key: bytes, certificate: Certificate, data: bytes) -> list[bytes]:
+        """Hold a certificate that :meth:`judge` returned for these bytes: see :meth:`hold`."""
         before = self.held.get(key)
         if before is not None and certificate.serial <= before.certificate.serial:
             return []
@@ -168,11 +169,11 @@ class Trust:
 
     def _conflict(self, key: bytes, certificate: Certificate) -> str | None:
         """Which other member has the name or a system id of this one; None if it is the same member."""
-        pinned, ids = self.pinned, range(certificate.system_ids[0], certificate.system_ids[1] + 1)
+        pinned, ids = self.pinned, certificate.systems
         if certificate.name in pinned.names:
             return f"the peer {certificate.name} of the configuration"
         for system_id, name in pinned.system_ids.items():
-            if system_id in ids and certificate.system_ids[1]:
+            if system_id in ids:
                 return f"{name}, which has system id {system_id} in the configuration"
         if self.own is not None and self._overlap(self.own.certificate, certificate):
             return "this daemon's own certificate"
@@ -191,8 +192,8 @@ class Trust:
         """What no other member may have: its name, and its system ids. A relay carries no frames of its own."""
         yield certificate.name
         is_relay = self.own is not None and self.own.certificate.role is MemberRole.RELAY
-        if certificate.system_ids[1] and not is_relay:
-            yield from range(certificate.system_ids[0], certificate.system_ids[1] + 1)
+        if not is_relay:
+            yield from certificate.systems
 
     def _overlap(self, one: Certificate, other: Certificate) -> bool:
         """Whether two certificates have a name or a system id in common."""
@@ -200,12 +201,8 @@ class Trust:
 
     def _is_signed(self, certificate: Certificate, key: bytes, data: bytes) -> bool:
         held = self.held.get(key)
-        if (held is not None and held.data == data) or self._last_valid == (key, data):
-            return True
-        if certificate.fleet != self.fleet or not is_certified(data, key, self._authority):
-            return False
-        self._last_valid = key, data
-        return True
+        is_held = held is not None and held.data == data
+        return is_held or (certificate.fleet == self.fleet and is_certified(data, key, self._authority))
 
     # Bulletins.
 
@@ -234,11 +231,6 @@ class Trust:
         for key in ended:
             del self.held[key]
         return BulletinVerdict.NEWER, ended
-
-    def _verified(self, data: bytes) -> Bulletin | None:
-        bulletin = parse_bulletin(data)
-        is_ours = bulletin is not None and bulletin.fleet == self.fleet and is_published(data, self._authority)
-        return bulletin if is_ours else None
 
 
 def _label(certificate: Certificate) -> str:

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import combinations
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
+from uavlinkd.authority.enrolment import MOST_CONTACTS
 from uavlinkd.authority.trust import HeldCertificate
 from uavlinkd.config.build import fleet_policies, member_role, policy_data
 from uavlinkd.config.model import PolicyData
 from uavlinkd.config.problems import Found, Sections, Values, role_of, unique
 from uavlinkd.config.relay_rules import over_ip
 from uavlinkd.config.signed import ENROLL_AGAIN
-from uavlinkd.core.certificates import MemberRole, fleet_id_of, is_certified, is_published, parse_bulletin
+from uavlinkd.core.certificates import MemberRole, fleet_id_of, is_certified, verified_bulletin
 from uavlinkd.core.crypto import AuthorityKey
 from uavlinkd.mavlink.policy.settings import PolicyError, read_settings
-
-MOST_CONTACTS: Final = 3
 
 
 def check(file: Sections) -> Found:
@@ -37,10 +36,8 @@ def _signatures(file: Sections) -> Found:
     if authority is None:
         return
     fleet, bulletin = fleet_id_of(authority.public), file.fleet.get("bulletin")
-    if bulletin is not None:
-        is_ours = (parsed := parse_bulletin(bulletin)) is not None and parsed.fleet == fleet
-        if not is_ours or not is_published(bulletin, authority):
-            yield "fleet.bulletin", f"is not signed by the authority of this file: {ENROLL_AGAIN}"
+    if bulletin is not None and verified_bulletin(bulletin, authority) is None:
+        yield "fleet.bulletin", f"is not signed by the authority of this file: {ENROLL_AGAIN}"
     for section, key, remedy in (
         (file.fleet, file.own_key, "sign the line that `uavlinkd enroll` prints here"),
         *((contact, contact.get("public_key"), ENROLL_AGAIN) for contact in file.contacts),
@@ -106,9 +103,8 @@ def _claims(file: Sections) -> Iterator[_Claim]:
     for section in (file.fleet, *file.contacts):
         held: HeldCertificate | None = section.get("certificate")
         if held is not None:
-            first, last = held.certificate.system_ids
             key = file.own_key if section is file.fleet else section.get("public_key")
-            yield _Claim(section, key, held.certificate.name, frozenset(range(first, last + 1)) - {0})
+            yield _Claim(section, key, held.certificate.name, frozenset(held.certificate.systems))
 
 
 def _roles(file: Sections) -> Found:

@@ -5,8 +5,6 @@ No message repeats the content of a key file, not even in part: a message about 
 
 from __future__ import annotations
 
-import base64
-import binascii
 import os
 import secrets
 import shlex
@@ -16,7 +14,9 @@ from contextlib import suppress
 from pathlib import Path
 
 from uavlinkd.core.constants import KEY_BYTES
-from uavlinkd.core.crypto import Secret, x25519_public_key
+from uavlinkd.core.crypto import FIELD_PRIME, Secret, x25519_public_key
+from uavlinkd.system.base64_text import from_base64, to_base64
+from uavlinkd.system.folders import sync_folder
 from uavlinkd.system.terminal import CommandError
 
 KEY_TEXT_LENGTH = 44
@@ -28,8 +28,6 @@ _READ_LIMIT = 256
 _HAS_OWNERS = hasattr(os, "geteuid")
 """Files have owners and modes, and folders can be synced. Windows has none of this, and no flags for these files."""
 _NONBLOCK, _CLOEXEC = getattr(os, "O_NONBLOCK", 0), getattr(os, "O_CLOEXEC", 0)
-_FIELD_PRIME = 2**255 - 19
-"""The field of X25519 (RFC 7748, section 4.1)."""
 
 
 class KeyFileError(CommandError):
@@ -70,24 +68,22 @@ def public_key_text(private_text: str) -> str:
 
 def encode_key(key: bytes) -> str:
     """32 bytes in base64."""
-    return base64.b64encode(key).decode("ascii")
+    return to_base64(key)
 
 
 def decode_key(text: str) -> bytes:
     """The 32 bytes of a key in base64. A newline or spaces around it do not matter.
 
-    Only the spelling that WireGuard writes is accepted. Python's decoder also accepts unused bits at the end, and
-    then two spellings of a key would count as two keys.
+    Only the spelling that WireGuard writes is accepted: two spellings of a key would count as two keys.
 
     Raises:
         ValueError: with a message that does not repeat the text.
     """
-    stripped = text.strip()
     try:
-        key = base64.b64decode(stripped, validate=True)
-    except (binascii.Error, ValueError):
+        key = from_base64(text.strip())
+    except ValueError:
         key = b""
-    if len(key) != KEY_BYTES or encode_key(key) != stripped:
+    if len(key) != KEY_BYTES:
         raise ValueError(f"is not a key: a key has {KEY_TEXT_LENGTH} characters of base64 and ends in =")
     return key
 
@@ -97,7 +93,7 @@ def is_canonical_public_key(public: bytes) -> bool:
 
     X25519 reduces larger numbers modulo the prime, so the same point would have two encodings.
     """
-    return int.from_bytes(public, "little") < _FIELD_PRIME
+    return int.from_bytes(public, "little") < FIELD_PRIME
 
 
 def write_secret_file(path: Path, text: str) -> None:
@@ -129,17 +125,6 @@ def write_secret_file(path: Path, text: str) -> None:
         if isinstance(error, OSError):
             raise KeyFileError(f"{path}: cannot be written: {error.strerror}") from None
         raise
-
-
-def sync_folder(folder: Path) -> None:
-    """Sync the directory entry of a new file."""
-    if not _HAS_OWNERS:
-        return
-    descriptor = os.open(folder, os.O_RDONLY | _CLOEXEC)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def find_secret_file(name: str, folder: Path, environ: Mapping[str, str]) -> tuple[Path, bool]:

@@ -56,7 +56,7 @@ def member_peer(fleet: FleetConfig, key: bytes, certificate: Certificate) -> Pee
     """The peer of a member whose role has a policy here. It has the addresses that its contact has in the file."""
     first, last = certificate.system_ids
     ids = first if first == last else f"{first}-{last}"
-    contact = next((contact for contact in fleet.contacts if contact.key == key), None)
+    contact = fleet.contact(key)
     return PeerConfig(
         settings=PeerSettings(certificate.name, key, None, fleet.link, is_certified=True),
         addresses=() if contact is None else contact.addresses,

@@ -215,6 +215,10 @@ class FleetConfig:
     member_most_peers: int
     member_limits: RelayLimits
 
+    def contact(self, key: bytes) -> ContactConfig | None:
+        """The contact with this static public key."""
+        return next((contact for contact in self.contacts if contact.key == key), None)
+
     @property
     def certificate(self) -> bytes:
         """The own certificate as it is sent."""

@@ -5,25 +5,21 @@ Each function raises ValueError, whose message does not repeat the text.
 
 from __future__ import annotations
 
-from base64 import b64decode, b64encode
-
 from uavlinkd.authority.trust import HeldCertificate
 from uavlinkd.core.certificates import NAME, parse_bulletin, parse_certificate
 from uavlinkd.core.constants import KEY_BYTES
 from uavlinkd.core.crypto import AuthorityKey
 from uavlinkd.core.drops import Drop
+from uavlinkd.system.base64_text import from_base64
 
 ENROLL_AGAIN = "run `uavlinkd enroll --finish` again with the line of `uavlinkd fleet sign`"
 
 
 def _decoded(text: str) -> bytes:
     try:
-        data = b64decode(text, validate=True)
+        return from_base64(text)
     except ValueError:
-        data = b""
-    if b64encode(data).decode("ascii") != text:
-        raise ValueError(f"is not base64, or was cut: {ENROLL_AGAIN}")
-    return data
+        raise ValueError(f"is not base64, or was cut: {ENROLL_AGAIN}") from None
 
 
 def authority(text: str) -> AuthorityKey:

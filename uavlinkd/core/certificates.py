@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from enum import IntEnum
 from itertools import pairwise
 from typing import NamedTuple
@@ -27,6 +27,7 @@ _SIGNED = struct.Struct(f">B{FLEET_BYTES}sIBBBBH{NAME_BYTES}s")
 _BULLETIN = struct.Struct(f">B{FLEET_BYTES}sIIH")
 BULLETIN_BYTES = _BULLETIN.size + SIGNATURE_BYTES
 """Of a bulletin without revoked serials."""
+FLEET_LABEL = b"uavlink fleet"
 _CERTIFICATE_LABEL = b"uavlink certificate 1"
 _BULLETIN_LABEL = b"uavlink bulletin 1"
 GENERATION = 1 << 24
@@ -35,7 +36,7 @@ GENERATION = 1 << 24
 
 def fleet_id_of(authority: bytes) -> bytes:
     """The id of the fleet with this first authority's public key."""
-    return sha256(b"uavlink fleet" + authority)[:FLEET_BYTES]
+    return sha256(FLEET_LABEL + authority)[:FLEET_BYTES]
 
 
 class MemberRole(IntEnum):
@@ -47,6 +48,16 @@ class MemberRole(IntEnum):
     OBSERVER = 4
 
 
+def role_bits(roles: Iterable[MemberRole]) -> int:
+    """Bit *r* for each role *r*."""
+    return sum(1 << role for role in roles)
+
+
+def roles_in(bits: int) -> frozenset[MemberRole]:
+    """The known roles among these bits."""
+    return frozenset(role for role in MemberRole if bits >> role & 1)
+
+
 class Certificate(NamedTuple):
     """What the authority says about a static key, without the key and without the signature."""
 
@@ -56,6 +67,12 @@ class Certificate(NamedTuple):
     system_ids: tuple[int, int]
     """The first and the last; two zeros for a relay."""
     name: str
+
+    @property
+    def systems(self) -> range:
+        """All of its system ids: none of a relay."""
+        first, last = self.system_ids
+        return range(first, last + 1) if last else range(0)
 
     def encode(self) -> bytes:
         """The 36 signed bytes."""
@@ -144,6 +161,13 @@ def parse_bulletin(data: bytes) -> Bulletin | None:
 def is_published(data: bytes, authority: AuthorityKey) -> bool:
     """Whether the authority signed this bulletin, whose format is valid."""
     return authority.verifies(data[-SIGNATURE_BYTES:], _BULLETIN_LABEL + data[:-SIGNATURE_BYTES])
+
+
+def verified_bulletin(data: bytes, authority: AuthorityKey) -> Bulletin | None:
+    """The bulletin in these bytes; None unless it is one of the fleet of this authority, which signed it."""
+    bulletin = parse_bulletin(data)
+    is_ours = bulletin is not None and bulletin.fleet == fleet_id_of(authority.public)
+    return bulletin if is_ours and is_published(data, authority) else None
 
 
 def digest_of(bulletin: bytes) -> bytes:

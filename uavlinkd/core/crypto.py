@@ -161,7 +161,8 @@ def is_usable_public_key(public: bytes) -> bool:
     return True
 
 
-_FIELD_PRIME = 2**255 - 19
+FIELD_PRIME = 2**255 - 19
+"""The field of X25519 and Ed25519 (RFC 7748, section 4.1)."""
 
 
 class AuthorityKey:
@@ -177,9 +178,9 @@ class AuthorityKey:
         y = int.from_bytes(public, "little") & (2**255 - 1)
         # OpenSSL accepts signatures that no key made under points of small order. The equivalent point of Curve25519
         # (RFC 7748, section 4.1) has the same order; the neutral point, with y = 1, has none.
-        if len(public) != KEY_BYTES or not 1 < y < _FIELD_PRIME:
+        if len(public) != KEY_BYTES or not 1 < y < FIELD_PRIME:
             raise ValueError("is not a public key of Ed25519")
-        u = (1 + y) * pow(1 - y, -1, _FIELD_PRIME) % _FIELD_PRIME
+        u = (1 + y) * pow(1 - y, -1, FIELD_PRIME) % FIELD_PRIME
         if not is_usable_public_key(u.to_bytes(KEY_BYTES, "little")):
             raise ValueError("is a point of small order, under which everyone can sign")
         self._key = Ed25519PublicKey.from_public_bytes(public)

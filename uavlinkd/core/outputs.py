@@ -150,6 +150,6 @@ class FreshnessVerified(NamedTuple):
 
 
 PathEvent = PathChanged | PathStateChanged | PathSuspected
-LinkEvent = PeerUp | PeerLost | PeerClosed | SessionEstablished | FreshnessUnverified | FreshnessVerified
-Event = PeerAdmitted | PeerExpired | LinkEvent | PathEvent
+FreshnessEvent = FreshnessUnverified | FreshnessVerified
+Event = PeerAdmitted | PeerExpired | PeerUp | PeerLost | PeerClosed | SessionEstablished | PathEvent | FreshnessEvent
 Output = Transmit | Deliver | RecordReceived | Dropped | Event

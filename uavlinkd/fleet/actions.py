@@ -29,7 +29,6 @@ from uavlinkd.fleet.manifest import (
     FleetError,
     FleetSettings,
     Member,
-    base64_of,
     parse_addresses,
     read_manifest,
 )
@@ -38,6 +37,7 @@ from uavlinkd.fleet.publishing import publish
 from uavlinkd.fleet.signing import Identity
 from uavlinkd.mavlink.dialect import SYSTEM_ID
 from uavlinkd.ops.commands import control_socket
+from uavlinkd.system.base64_text import to_base64
 from uavlinkd.system.terminal import OK, CommandError, printable
 
 _SET_IDS = f"Set {SYSTEM_ID} of each autopilot, and the id of each ground control station, to the id above"
@@ -211,7 +211,7 @@ def _print_table(fleet: Fleet, members: Iterable[Member]) -> None:
     for member in members:
         addresses = ", ".join(map(str, member.addresses)) or "-"
         state = "revoked" if fleet.is_revoked(member) else ""
-        key = f"{base64_of(member.public_key)[:8]}..."
+        key = f"{to_base64(member.public_key)[:8]}..."
         rows.append(
             (member.name, _role(member.role), member.ids, str(member.certificate.serial), key, addresses, state)
         )

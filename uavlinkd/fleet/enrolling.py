@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import tomllib
-from base64 import b64decode
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,6 +26,7 @@ from uavlinkd.core.drops import Drop
 from uavlinkd.fleet.files import config_file, key_file, listen_on, with_fleet, write_config
 from uavlinkd.fleet.manifest import FleetError, FleetFileError, FleetSettings
 from uavlinkd.fleet.transaction import Rollback
+from uavlinkd.system.base64_text import from_base64
 
 _NEXT = ".next.key"
 """No name of a member has a dot."""
@@ -143,9 +143,7 @@ def _check_present(fleet: Any, reply: Reply, certificate: Certificate, config: P
     if fleet is None:
         return None
     try:
-        authority, signed, published = (
-            b64decode(fleet[key], validate=True) for key in ("authority", "certificate", "bulletin")
-        )
+        authority, signed, published = (from_base64(fleet[key]) for key in ("authority", "certificate", "bulletin"))
         present, bulletin, new = parse_certificate(signed), parse_bulletin(published), parse_bulletin(reply.bulletin)
         number = 0 if bulletin is None else bulletin.number
     except (LookupError, TypeError, ValueError, Drop):

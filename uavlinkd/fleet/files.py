@@ -15,8 +15,9 @@ from typing import Any
 from uavlinkd.authority.enrolment import Contact, Reply
 from uavlinkd.core.certificates import MemberRole, parse_certificate
 from uavlinkd.core.suites import SUITES_BY_NAME
-from uavlinkd.fleet.manifest import Fleet, FleetError, FleetSettings, Member, base64_of, fill, toml_lines
+from uavlinkd.fleet.manifest import Fleet, FleetError, FleetSettings, Member, fill, toml_lines
 from uavlinkd.system.addresses import parse_address
+from uavlinkd.system.base64_text import to_base64
 
 _HEADER = re.compile(r"[ \t]*(\[{1,2})[ \t]*([A-Za-z0-9_-]+)[ \t]*\]|[ \t]*\[")
 _KEY = re.compile(r"[ \t]*(?:\"([^\"]*)\"|'([^']*)'|([A-Za-z0-9_-]+))[ \t]*=")
@@ -106,16 +107,16 @@ def with_fleet(text: str, reply: Reply, top: Table | None = None, former_ids: tu
     facts: dict[str, Table] = {
         "": top or {},
         "fleet": {
-            "authority": base64_of(reply.authority),
-            "successor": base64_of(reply.successor),
-            "certificate": base64_of(reply.certificate),
-            "bulletin": base64_of(reply.bulletin),
+            "authority": to_base64(reply.authority),
+            "successor": to_base64(reply.successor),
+            "certificate": to_base64(reply.certificate),
+            "bulletin": to_base64(reply.bulletin),
         },
     }
     contacts = [
         {
-            "public_key": base64_of(contact.public_key),
-            "certificate": base64_of(contact.certificate),
+            "public_key": to_base64(contact.public_key),
+            "certificate": to_base64(contact.certificate),
             "addresses": list(contact.addresses),
             "relays": contact.relays and parse_certificate(contact.certificate).role is not MemberRole.RELAY,
         }

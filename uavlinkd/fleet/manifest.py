@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import re
 import tomllib
-from base64 import b64decode, b64encode
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -22,14 +21,14 @@ from uavlinkd.core.certificates import (
     MemberRole,
     fleet_id_of,
     is_certified,
-    is_published,
-    parse_bulletin,
     parse_certificate,
+    verified_bulletin,
 )
 from uavlinkd.core.crypto import AuthorityKey
 from uavlinkd.core.drops import Drop
 from uavlinkd.core.suites import SUITES_BY_NAME
 from uavlinkd.system.addresses import Address, AddressError, parse_address
+from uavlinkd.system.base64_text import from_base64, to_base64
 from uavlinkd.system.terminal import FAILED, UsageError, printable
 
 FILE_NAME = "fleet.toml"
@@ -175,9 +174,9 @@ class Fleet:
 def write_manifest(fleet: Fleet) -> str:
     """The text of a manifest."""
     facts = {
-        "authority": base64_of(fleet.authority.public),
-        "successor": base64_of(fleet.successor),
-        "bulletin": base64_of(fleet.published),
+        "authority": to_base64(fleet.authority.public),
+        "successor": to_base64(fleet.successor),
+        "bulletin": to_base64(fleet.published),
         "next_serial": fleet.next_serial,
     }
     lines = [
@@ -197,16 +196,11 @@ def _table_of(member: Member) -> dict[str, Any]:
         "role": member.role.name.lower(),
         "system_ids": list(member.certificate.system_ids),
         "serial": member.certificate.serial,
-        "public_key": base64_of(member.public_key),
-        "certificate": base64_of(member.signed),
+        "public_key": to_base64(member.public_key),
+        "certificate": to_base64(member.signed),
         "addresses": [str(address) for address in member.addresses],
         "relays": member.relays,
     }
-
-
-def base64_of(data: bytes) -> str:
-    """The text of bytes in a file."""
-    return b64encode(data).decode("ascii")
 
 
 def toml_lines(values: Mapping[str, object]) -> list[str]:
@@ -245,11 +239,10 @@ def _fleet(table: dict[str, Any]) -> Fleet:
             "is of an earlier version, without an authority. Its members work as before, and their files are edited"
             " by hand; or create a new fleet in another folder"
         )
-    authority, published = AuthorityKey(_bytes(facts.pop("authority"))), _bytes(facts.pop("bulletin"))
-    bulletin = parse_bulletin(published)
-    if bulletin is None or bulletin.fleet != fleet_id_of(authority.public) or not is_published(published, authority):
+    authority, published = AuthorityKey(from_base64(facts.pop("authority"))), from_base64(facts.pop("bulletin"))
+    if (bulletin := verified_bulletin(published, authority)) is None:
         raise ValueError("not a bulletin of this fleet")
-    successor, next_serial = _bytes(facts.pop("successor")), facts.pop("next_serial")
+    successor, next_serial = from_base64(facts.pop("successor")), facts.pop("next_serial")
     members = tuple(_member(section, authority) for section in table.pop("member", []))
     serials = {member.certificate.serial for member in members}
     is_ascending = type(next_serial) is int and all(serial < next_serial for serial in {0, *serials})
@@ -260,12 +253,8 @@ def _fleet(table: dict[str, Any]) -> Fleet:
     return Fleet(authority, successor, bulletin, published, next_serial, settings, members)
 
 
-def _bytes(text: str) -> bytes:
-    return b64decode(text, validate=True)
-
-
 def _member(section: dict[str, Any], authority: AuthorityKey) -> Member:
-    key, signed = _bytes(section["public_key"]), _bytes(section["certificate"])
+    key, signed = from_base64(section["public_key"]), from_base64(section["certificate"])
     addresses = parse_addresses("addresses", section["addresses"])
     member = Member(key, parse_certificate(signed), signed, addresses, section["relays"])
     is_ours = member.certificate.fleet == fleet_id_of(authority.public) and is_certified(signed, key, authority)

@@ -214,7 +214,7 @@ def restore(folder: Path, private: Secret, ask: Passphrase | None) -> None:
 def merge(folder: Path, bulletin: bytes, ask: Passphrase) -> Fleet:
     """Sign the union of the folder's bulletin and another one of the same authority, which a daemon has."""
     with _open_fleet(folder) as before:
-        other = signing.verified_bulletin(before, bulletin)
+        other = signing.bulletin_of(before, bulletin)
         changes = FileChanges(folder, signing.merge(before, _signer(folder, before, ask), other))
         apply(changes)
     return changes.fleet

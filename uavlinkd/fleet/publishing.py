@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import time
-from base64 import b64decode
 from pathlib import Path
 
 from uavlinkd.authority.trust import BulletinVerdict
 from uavlinkd.fleet import operations, signing
 from uavlinkd.fleet.authority_key import Passphrase
-from uavlinkd.fleet.manifest import Fleet, FleetError, base64_of, read_manifest
+from uavlinkd.fleet.manifest import Fleet, FleetError, read_manifest
 from uavlinkd.ops.control import ask as ask_daemon
+from uavlinkd.system.base64_text import from_base64, to_base64
 
 _AT_ONCE = 30
 """Certificates in a request, which has at most 8,192 bytes."""
@@ -25,8 +25,8 @@ def publish(folder: Path, socket: Path, ask: Passphrase, *, merges: bool = False
     is signed and handed over. ``merges``: a newer one too.
     """
     fleet = read_manifest(folder)
-    theirs = b64decode(str(ask_daemon(socket, "bulletin").get("bulletin")))
-    bulletin, own = signing.verified_bulletin(fleet, theirs), fleet.bulletin.number
+    theirs = from_base64(str(ask_daemon(socket, "bulletin").get("bulletin")))
+    bulletin, own = signing.bulletin_of(fleet, theirs), fleet.bulletin.number
     if bulletin.number > own and not merges:
         raise FleetError(
             f"the fleet has bulletin {bulletin.number}, this folder {own}: use the newest copy of the folder. If that"
@@ -36,14 +36,14 @@ def publish(folder: Path, socket: Path, ask: Passphrase, *, merges: bool = False
         fleet = operations.merge(folder, theirs, ask)
     # The certificates come first: a member that meets the bulletin with its old one would be refused.
     certificates = [
-        f"{base64_of(member.public_key)}:{base64_of(member.signed)}"
+        f"{to_base64(member.public_key)}:{to_base64(member.signed)}"
         for member in (fleet.current if fleet.bulletin.least > bulletin.least else ())
     ]
     for at in range(0, len(certificates), _AT_ONCE):
-        ask_daemon(socket, " ".join(["publish", base64_of(theirs), *certificates[at : at + _AT_ONCE]]))
+        ask_daemon(socket, " ".join(["publish", to_base64(theirs), *certificates[at : at + _AT_ONCE]]))
     if certificates:
         time.sleep(SETTLE_S)
-    verdict = ask_daemon(socket, f"publish {base64_of(fleet.published)}").get("verdict")
+    verdict = ask_daemon(socket, f"publish {to_base64(fleet.published)}").get("verdict")
     if verdict not in (BulletinVerdict.NEWER.value, BulletinVerdict.KNOWN.value):
         raise FleetError(f"the daemon refused bulletin {fleet.bulletin.number}: {verdict}")
     return fleet

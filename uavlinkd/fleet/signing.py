@@ -17,8 +17,7 @@ from uavlinkd.core.certificates import (
     Certificate,
     MemberRole,
     fleet_id_of,
-    is_published,
-    parse_bulletin,
+    verified_bulletin,
 )
 from uavlinkd.core.crypto import AuthorityKey, SigningKey, is_usable_public_key
 from uavlinkd.fleet.manifest import Fleet, FleetError, FleetSettings, Member
@@ -123,23 +122,19 @@ def _system_ids(
         if not addresses or (ids is not None and ids != (0, 0)):
             raise FleetError(f"{name}: a relay needs --address HOST:PORT, and has no system id")
         return 0, 0
-    taken = {number: member for member in others for number in _range(member.certificate.system_ids)}
+    taken = {number: member for member in others for number in member.certificate.systems}
     if ids is None:
         order: Iterable[int] = range(1, 256) if role is MemberRole.VEHICLE else range(255, 0, -1)
         free = next((number for number in order if number not in taken), 0)
         ids = (free, free)
     if not 1 <= ids[0] <= ids[1] <= 255:
         raise FleetError("a system id is a number from 1 to 255, and each member has its own")
-    for number in _range(ids):
+    for number in range(ids[0], ids[1] + 1):
         if number in taken:
             raise FleetError(
                 f"{name} would have the system id of {taken[number].name}, {number}: choose another, or omit --id"
             )
     return ids
-
-
-def _range(ids: tuple[int, int]) -> range:
-    return range(ids[0], ids[1] + 1) if ids[1] else range(0)
 
 
 def revoke(fleet: Fleet, signer: SigningKey, members: Iterable[Member], *, resign: bool = False) -> Fleet:
@@ -160,10 +155,9 @@ def revoke(fleet: Fleet, signer: SigningKey, members: Iterable[Member], *, resig
     return _publish(replace(fleet, members=members, next_serial=least + len(renewed)), signer, least, set())
 
 
-def verified_bulletin(fleet: Fleet, data: bytes) -> Bulletin:
+def bulletin_of(fleet: Fleet, data: bytes) -> Bulletin:
     """The bulletin of this fleet in these bytes."""
-    bulletin = parse_bulletin(data)
-    if bulletin is None or bulletin.fleet != fleet.bulletin.fleet or not is_published(data, fleet.authority):
+    if (bulletin := verified_bulletin(data, fleet.authority)) is None:
         raise FleetError("the daemon has no bulletin of this fleet: is it a member of another one?")
     return bulletin
 

@@ -13,6 +13,7 @@ from uavlinkd.config import ConfigError, keys
 from uavlinkd.config.load import load_config
 from uavlinkd.fleet.files import config_file
 from uavlinkd.fleet.manifest import FILE_NAME, Fleet, FleetError, FleetFileError, Member, no_fleet, write_manifest
+from uavlinkd.system.folders import sync_folder
 from uavlinkd.system.terminal import printable
 
 
@@ -110,7 +111,7 @@ class Rollback:
         """Replace a file by a prepared one, atomically: a reader finds the old or the new content."""
         self.keep(path)
         new.rename(path)
-        keys.sync_folder(path.parent)
+        sync_folder(path.parent)
 
     def finish(self) -> list[str]:
         """Delete the old contents. Return a sentence about each that cannot be deleted."""

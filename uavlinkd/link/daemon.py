@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-from base64 import b64encode
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
@@ -31,6 +30,7 @@ from uavlinkd.ops.log import shown
 from uavlinkd.ops.recorder import Recorder
 from uavlinkd.ops.sdnotify import Supervisor
 from uavlinkd.system.addresses import Address
+from uavlinkd.system.base64_text import to_base64
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.tasks import on_signal
 from uavlinkd.system.terminal import printable
@@ -181,7 +181,7 @@ class Daemon:
                 await tests.ended.wait()
                 return netcheck(parts, monotonic())
             case ("bulletin", "", "") if parts.fleet is not None:
-                return {"bulletin": b64encode(parts.fleet.trust.bulletin_bytes).decode()}
+                return {"bulletin": to_base64(parts.fleet.trust.bulletin_bytes)}
             case ("publish", " ", signed) if parts.fleet is not None:
                 return parts.fleet.publish(signed, monotonic())
             case ("ping", " ", name):

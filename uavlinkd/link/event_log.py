@@ -94,7 +94,7 @@ class EventLog:
 
     def write(self, event: o.Event, now: float) -> None:
         """Write an event, within the limit of its peer. ``now`` is monotonic seconds."""
-        if isinstance(event, o.FreshnessUnverified | o.FreshnessVerified):  # a finding reports it
+        if isinstance(event, o.FreshnessEvent):  # a finding reports it
             return
         if isinstance(event, o.SessionEstablished) and event.rekey:
             omitted = self._limits.take("debug", event.peer.name, now)

@@ -7,7 +7,6 @@ configuration changes, or when the daemon holds too many.
 from __future__ import annotations
 
 import os
-from base64 import b64decode
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -30,7 +29,7 @@ from uavlinkd.config.model import FleetConfig
 from uavlinkd.config.relay_rules import MOST_MEMBERS
 from uavlinkd.core import constants as c
 from uavlinkd.core import outputs as o
-from uavlinkd.core.certificates import Certificate, parse_certificate
+from uavlinkd.core.certificates import Certificate, parse_certificate, role_bits
 from uavlinkd.core.crypto import is_usable_public_key
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.limits import TokenBucket
@@ -46,6 +45,7 @@ from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.relays import Relays
 from uavlinkd.mavlink.policy.settings import read_settings
 from uavlinkd.relay.service import RelayService
+from uavlinkd.system.base64_text import from_base64
 from uavlinkd.system.clock import monotonic
 
 EVENT_S: Final = 600.0
@@ -119,7 +119,7 @@ class FleetMembers:
         """Send what is due. Call it at :attr:`next_at`."""
         for key, record in self.exchange.do_due(now):
             self._send(key, record, now)
-        for key, who in self._questions.pop_due(sum(1 << role for role in self._fleet.call), now):
+        for key, who in self._questions.pop_due(role_bits(self._fleet.call), now):
             self._send(key, who, now)
         if now >= self._disk.again_at:
             self._disk.write()
@@ -180,7 +180,7 @@ class FleetMembers:
                     self._end(ended, now)
 
     def _is_contact(self, key: bytes) -> bool:
-        return any(contact.key == key for contact in self._fleet.contacts)
+        return self._fleet.contact(key) is not None
 
     def _is_wanted(self, certificate: Certificate) -> bool:
         """Whether members with this role have a policy here, or this daemon is their relay."""
@@ -198,24 +198,25 @@ class FleetMembers:
             Drop: why it is refused.
         """
         try:
-            certificate = self._hold(key, data, now)
+            certificate = self._hold(key, data, now, needs_policy=self._relay is None)
         except Drop as drop:
             raise Drop(drop.reason, drop.detail or key) from None
         if certificate.role in self._fleet.policies:
             return self._config_of(key).settings
         return relay_member(self._fleet, key, certificate).peer
 
-    def _hold(self, key: bytes, data: bytes, now: float) -> Certificate:
+    def _hold(self, key: bytes, data: bytes, now: float, *, needs_policy: bool) -> Certificate:
         """Hold a certificate that is valid and wanted, and not too early or one too many. Raises Drop."""
         certificate = self.trust.judge(key, data)
-        if not self._is_wanted(certificate):
-            raise _without_policy(certificate)
+        if needs_policy and certificate.role not in self._fleet.policies:
+            role = certificate.role.name.lower()
+            raise Drop(DropReason.ROLE_NOT_ACCEPTED, f"{certificate.name} (role {role})")
         is_enough = self.trust.bulletin.number >= self._fleet.required_bulletin
         if not is_enough or (now < self._settled_at and not self._is_contact(key)):
             raise Drop(DropReason.BULLETIN_AWAITED)
         if key not in self.trust.held:
             self._make_room(now)
-        for ended in self.trust.hold(key, data):
+        for ended in self.trust.keep(key, certificate, data):
             self._end(ended, now)
         return certificate
 
@@ -303,9 +304,7 @@ class FleetMembers:
         self._questions.note(sender, parse_certificate(record.certificate).serial, now)
         if not is_usable_public_key(record.key):  # a stolen authority's key can sign it; an initiation would raise
             raise Drop(DropReason.BAD_CERTIFICATE)
-        if (certificate := self.trust.judge(record.key, record.certificate)).role not in self._fleet.policies:
-            raise _without_policy(certificate)
-        self._hold(record.key, record.certificate, now)
+        self._hold(record.key, record.certificate, now, needs_policy=True)
         peer = self._node.find(record.key)
         if peer is None or peer.provisional_until != c.NEVER:
             self._join(record.key, peer, now)
@@ -316,7 +315,7 @@ class FleetMembers:
         All of it in base64, with spaces between. Returns what became of it.
         """
         try:
-            first, *others = [[b64decode(part, validate=True) for part in one.split(":")] for one in signed.split()]
+            first, *others = [list(map(from_base64, one.split(":"))) for one in signed.split()]
             certificates = [(key, certificate) for key, certificate in others]
             (bulletin,) = first
         except ValueError:
@@ -429,10 +428,6 @@ class FleetMembers:
         if state.bulletin == self.trust.bulletin_bytes:
             self.exchange.note_persisted(self.trust.bulletin.number, self.trust.digest)
         self._perform([])  # the timer may be due earlier
-
-
-def _without_policy(certificate: Certificate) -> Drop:
-    return Drop(DropReason.ROLE_NOT_ACCEPTED, f"{certificate.name} (role {certificate.role.name.lower()})")
 
 
 def _systems_of(peer: PeerConfig) -> frozenset[int]:

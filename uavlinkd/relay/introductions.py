@@ -12,7 +12,7 @@ from operator import itemgetter
 from uavlinkd.authority import constants as a
 from uavlinkd.authority.trust import HeldCertificate
 from uavlinkd.core import constants as c
-from uavlinkd.core.certificates import MemberRole
+from uavlinkd.core.certificates import MemberRole, roles_in
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.limits import TokenBucket
 from uavlinkd.core.relay_records import CertificateRecord, Who
@@ -113,10 +113,9 @@ class Introductions:
     def answer(self, key: bytes, who: Who, now: float) -> list[CertificateRecord] | None:
         """The certificates that a member asks for; None if it got too many."""
         found = list[tuple[int, bytes]]()
-        for role, entries in self._up.items():
-            if who.roles >> role & 1:
-                at = bisect_right(entries, who.after, key=_serial)
-                found += entries[at : at + a.CERTIFICATES_PER_ANSWER + 1]
+        for entries in map(self._up.__getitem__, roles_in(who.roles)):
+            at = bisect_right(entries, who.after, key=_serial)
+            found += entries[at : at + a.CERTIFICATES_PER_ANSWER + 1]
         keys = [other for _, other in sorted(found) if other != key][: a.CERTIFICATES_PER_ANSWER]
         return list(map(self._record, keys)) if self._members[key].certificates.take(now, len(keys)) else None
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from base64 import b64encode
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
@@ -29,6 +28,7 @@ from uavlinkd.lab.evaluation.stage import DaemonStage
 from uavlinkd.lab.evaluation.tampering_plan import FLEET
 from uavlinkd.lab.evaluation.tampering_stages import AMPLE, RELAY_LINK, RELAY_PEERS, MiddleRelay
 from uavlinkd.lab.hostile.hostile_fleet import HostileMembership
+from uavlinkd.system.base64_text import to_base64
 
 PINNED: Final = "pinned"
 """The name of a peer in the files, for which there is a certificate too."""
@@ -54,10 +54,6 @@ class Authority:
         """A bulletin."""
         bulletin = Bulletin(fleet_id_of(self.key.public), number, 1, revoked)
         return bulletin.encode() + self._key.sign(bulletin.to_be_signed())
-
-
-def _text(data: bytes) -> str:
-    return b64encode(data).decode()
 
 
 class FleetStage(DaemonStage):
@@ -91,9 +87,9 @@ class FleetStage(DaemonStage):
 
     def configure(self, one: str) -> None:
         fleet = {
-            "authority": _text(self.authority.key.public),
-            "certificate": _text(self.certificates[one]),
-            "bulletin": _text(self.bulletin),
+            "authority": to_base64(self.authority.key.public),
+            "certificate": to_base64(self.certificates[one]),
+            "bulletin": to_base64(self.bulletin),
             "call": ["vehicle"],
         }
         others: list[tuple[str, Mapping[str, object]]] = [
@@ -110,7 +106,7 @@ class FleetStage(DaemonStage):
         return [] if one == first else [self.contact(self.public_keys[first], self.certificates[first], addresses)]
 
     def contact(self, key: bytes, certificate: bytes, addresses: list[object]) -> dict[str, object]:
-        return {"public_key": encode_key(key), "certificate": _text(certificate), "addresses": addresses}
+        return {"public_key": to_base64(key), "certificate": to_base64(certificate), "addresses": addresses}
 
     def pinned(self, one: str) -> list[dict[str, object]]:
         """The peers in the file of a drone."""
