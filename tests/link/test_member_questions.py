@@ -2,31 +2,47 @@
 
 from __future__ import annotations
 
-from uavlinkd.authority.constants import CERTIFICATES_PER_ANSWER, WHO_INTERVAL_S
+import random
+
+import pytest
+
+from uavlinkd.authority.constants import CERTIFICATES_PER_ANSWER, CERTIFIED_PEERS, WHO, WHO_INTERVAL_S
 from uavlinkd.link.member_questions import MemberQuestions
 
 RELAY = bytes(32)
 
 
-def asked(questions: MemberQuestions, until: float, members: int) -> list[tuple[float, int]]:
-    """When a relay with so many members was asked, and from which serial on."""
-    seen: list[tuple[float, int]] = []
+def asked(questions: MemberQuestions, until: float, members: int, loss: float = 0.0) -> tuple[list[float], set[int]]:
+    """When a relay with so many members was asked, and the serials of which the answers arrived."""
+    at: list[float] = []
+    known: set[int] = set()
+    rng = random.Random(1)
     while (now := questions.next_at) <= until:
         for relay, who in list(questions.pop_due(4, now)):
-            seen.append((now, who.after))
+            at.append(now)
+            if rng.random() < loss:
+                continue
             for serial in range(who.after + 1, min(who.after + CERTIFICATES_PER_ANSWER, members) + 1):
-                questions.note(relay, serial, now)
-    return seen
+                if rng.random() >= loss:
+                    questions.note(relay, serial, now)
+                    known.add(serial)
+    return at, known
 
 
-def test_questions_are_rare_after_an_answer() -> None:
-    """All pages at once, and then in two minutes; without an answer at growing intervals; exactly one page too."""
-    for members, first in ((3, [0]), (20, [0, 8, 16]), (0, [0] * 8)):
-        questions = MemberQuestions()
-        questions.begin(RELAY, 0.0)
-        assert [after for _, after in asked(questions, WHO_INTERVAL_S - 1, members)] == first
+@pytest.mark.parametrize(
+    ("members", "loss", "within_s"), [(1, 0.0, 0.0), (CERTIFIED_PEERS - 1, 0.0, 0.0), (9, 0.3, 20.0), (50, 0.1, 20.0)]
+)
+def test_all_members_are_soon_known(members: int, loss: float, within_s: float) -> None:
+    """One round is enough without loss, also for a full relay within its limit of questions; later ones are rare."""
     questions = MemberQuestions()
     questions.begin(RELAY, 0.0)
-    assert len(asked(questions, WHO_INTERVAL_S, 8)) <= 16
+    at, known = asked(questions, within_s, members, loss)
+    assert len(known) == members
+    assert loss or len(at) <= WHO.burst
+    later, _ = asked(questions, 10 * WHO_INTERVAL_S, members)
+    pages = members // CERTIFICATES_PER_ANSWER + 2
+    assert len([moment for moment in later if moment > 2 * WHO_INTERVAL_S]) <= 12 * pages
+    questions.begin(RELAY, 10 * WHO_INTERVAL_S)  # a new session with it
+    assert questions.next_at > 10 * WHO_INTERVAL_S
     questions.end(RELAY)
-    assert asked(questions, 9e9, 8) == []
+    assert asked(questions, 9e9, members) == ([], set())

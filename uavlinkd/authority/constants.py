@@ -17,7 +17,7 @@ BULLETIN_LEAST_S = 1.0
 """A captured member causes one signature check a second, 60 µs, for each of the two kinds of record."""
 WHO_INTERVAL_S = 120.0
 """Members that come later ask too, and are introduced by their binds: this is for losses."""
-WHO = Rate(4.0, 16)
+WHO = Rate(4.0, 40)
 CERTIFICATES_PER_ANSWER = 8
 CERTIFICATES = Rate(32.0, 256)
 INTRODUCTIONS = Rate(8.0, 200)

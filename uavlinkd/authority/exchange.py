@@ -146,9 +146,9 @@ class BulletinExchange:
     def _receive_have(self, key: bytes, peer: _Peer, have: Have, order: int, now: float) -> Reaction:
         if order <= peer.order:
             raise Drop(DropReason.OLD_RECORD)
-        is_repeated, before = have == peer.have, peer.stated
-        peer.order, peer.have, peer.has = order, have, max(peer.has, have.number)
-        peer.stated = have.number
+        is_repeated, is_rolled_back = have == peer.have, peer.stated is not None and have.number < peer.stated
+        peer.order, peer.have, peer.stated = order, have, have.number
+        peer.has = have.number if is_rolled_back else max(peer.has, have.number)
         if not is_repeated:
             peer.tries = 0
         if self._lacks(key, peer):
@@ -160,7 +160,7 @@ class BulletinExchange:
             # The peer may not know what this end has. The peer's answer to the answer comes too soon for a loop.
             peer.owes_have |= is_repeated and now >= peer.have_sent_at + peer.wait_s
         self._note(peer)
-        if before is not None and have.number < before:
+        if is_rolled_back:
             return Reaction(event=ROLLED_BACK)
         return Reaction(event="" if is_repeated else self._conflict([peer]))
 

@@ -36,7 +36,7 @@ from uavlinkd.core.limits import TokenBucket
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Output
 from uavlinkd.core.peer import Peer
-from uavlinkd.core.relay_records import CertificateRecord, FleetRecord, Have, Who
+from uavlinkd.core.relay_records import CertificateRecord, FleetRecord, Who
 from uavlinkd.core.settings import PeerSettings
 from uavlinkd.link.evidence import Evidence
 from uavlinkd.link.fleet_disk import FleetDisk
@@ -113,14 +113,16 @@ class FleetMembers:
     @property
     def next_at(self) -> float:
         """When :meth:`do_due` has something to do."""
-        return min(self.exchange.next_at, self._questions.next_at, self._disk.again_at)
+        ask_at = max(self._questions.next_at, self._settled_at)  # earlier, the answer would be refused
+        return min(self.exchange.next_at, ask_at if self._has_required else c.NEVER, self._disk.again_at)
 
     def do_due(self, now: float) -> None:
         """Send what is due. Call it at :attr:`next_at`."""
         for key, record in self.exchange.do_due(now):
             self._send(key, record, now)
-        for key, who in self._questions.pop_due(role_bits(self._fleet.call), now):
-            self._send(key, who, now)
+        if self._has_required and now >= self._settled_at:
+            for key, who in self._questions.pop_due(role_bits(self._fleet.call), now):
+                self._send(key, who, now)
         if now >= self._disk.again_at:
             self._disk.write()
 
@@ -211,14 +213,17 @@ class FleetMembers:
         if needs_policy and certificate.role not in self._fleet.policies:
             role = certificate.role.name.lower()
             raise Drop(DropReason.ROLE_NOT_ACCEPTED, f"{certificate.name} (role {role})")
-        is_enough = self.trust.bulletin.number >= self._fleet.required_bulletin
-        if not is_enough or (now < self._settled_at and not self._is_contact(key)):
+        if not self._has_required or (now < self._settled_at and not self._is_contact(key)):
             raise Drop(DropReason.BULLETIN_AWAITED)
         if key not in self.trust.held:
             self._make_room(now)
         for ended in self.trust.keep(key, certificate, data):
             self._end(ended, now)
         return certificate
+
+    @property
+    def _has_required(self) -> bool:
+        return self.trust.bulletin.number >= self._fleet.required_bulletin
 
     def _make_room(self, now: float) -> None:
         """Give up the member that is down for longest, if there are as many as may be."""
@@ -289,8 +294,8 @@ class FleetMembers:
         except Drop as drop:
             self._evidence.add_dropped(o.Dropped(drop.reason, peer, received.path, 1, drop.detail), now)
             return drop.reason
-        if self._is_contact(key) and isinstance(record, Have) and record.number <= self.trust.bulletin.number:
-            self._settled_at = now
+        if self._is_contact(key) and (self.exchange.shown(key) or c.NEVER) <= self.trust.bulletin.number:
+            self._settled_at = min(self._settled_at, now)
         return None
 
     def _introduce(self, sender: bytes, record: CertificateRecord, now: float) -> None:

@@ -11,21 +11,29 @@ from uavlinkd.core.constants import NEVER
 from uavlinkd.core.relay_records import Who
 
 WHO_SOON_S: Final = 0.5
-"""A question without an answer is repeated after this, and each time after twice as long."""
+"""Between questions, and between the first two rounds; then between rounds each time twice as long."""
+
+WHO_TRIES: Final = 2
+"""A round ends after so many questions without an answer: one may be lost."""
 
 
 @dataclass(slots=True)
 class _Asking:
     due_at: float
+    rounds: int = 0
     tries: int = 0
+    """Of the last question."""
     after: int = 0
-    """The highest serial of an answer, if it was full: ask on from there."""
+    """The highest serial of this round: ask on from there."""
     received: int = 0
     """Certificates since the last question."""
 
 
 class MemberQuestions:
-    """The questions to each relay that is up, by its static public key. Times are monotonic seconds."""
+    """The questions to each relay that is up, by its static public key. Times are monotonic seconds.
+
+    A round asks from serial 0 on until questions have no answer. Parts of an answer may be lost: hence more rounds.
+    """
 
     def __init__(self) -> None:
         self._askings: dict[bytes, _Asking] = {}
@@ -37,7 +45,7 @@ class MemberQuestions:
 
     def begin(self, relay: bytes, now: float) -> None:
         """A relay is up: ask it at once, and then regularly."""
-        self._askings[relay] = _Asking(now)
+        self._askings.setdefault(relay, _Asking(now))
 
     def end(self, relay: bytes) -> None:
         """It is not up any more, or is no relay."""
@@ -47,15 +55,20 @@ class MemberQuestions:
         """The questions to send now, each with its receiver. ``roles``: their bits."""
         for relay, asking in self._askings.items():
             if now >= asking.due_at:
+                if asking.received:
+                    asking.tries = 0
+                elif asking.tries == WHO_TRIES:
+                    asking.tries = asking.after = 0
+                    asking.rounds += 1
                 yield relay, Who(roles, asking.after)
-                asking.due_at = now + min(WHO_INTERVAL_S, WHO_SOON_S * 2.0 ** min(asking.tries, 8))
-                asking.tries += 1
-                asking.received = asking.after = 0
+                asking.tries, asking.received = asking.tries + 1, 0
+                doubled = 0 if asking.tries < WHO_TRIES else min(asking.rounds, 8)
+                asking.due_at = now + min(WHO_INTERVAL_S, WHO_SOON_S * 2.0**doubled)
 
     def note(self, relay: bytes, serial: int, now: float) -> None:
-        """A relay sent the certificate with this serial. After a full answer it is asked for the others at once."""
+        """A relay sent the certificate with this serial. Ask for the others: at once if the answer was full."""
         if (asking := self._askings.get(relay)) is not None:
             asking.received += 1
             asking.after = max(asking.after, serial)
-            is_full = asking.received == CERTIFICATES_PER_ANSWER
-            asking.due_at = now if is_full else now + WHO_INTERVAL_S
+            soon = 0.0 if asking.received == CERTIFICATES_PER_ANSWER else WHO_SOON_S
+            asking.due_at = min(asking.due_at, now + soon)
