@@ -32,7 +32,7 @@ class _Asking:
 class MemberQuestions:
     """The questions to each relay that is up, by its static public key. Times are monotonic seconds.
 
-    A round asks from serial 0 on until questions have no answer. Parts of an answer may be lost, so there are more rounds.
+    A round asks from serial 0 on until questions have no answer. There are more rounds, as parts of it may be lost.
     """
 
     def __init__(self) -> None:
