@@ -131,6 +131,26 @@ def test_new_key_replaces_the_former_one_at_the_end(place: Path, say: Say) -> No
     assert read_manifest(place / "fleet").bulletin.revoked == (2, 3)
 
 
+def test_former_key_that_cannot_be_deleted_is_an_error(
+    place: Path, say: Say, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It names the file, and no file changes."""
+    enrolled(say, "v7")
+    line = say("fleet sign --replace v7", say("enroll v7"))
+    before = {path: path.read_bytes() for path in place.glob("v7*")}
+    unlink = Path.unlink
+
+    def refuse(path: Path, missing_ok: bool = False) -> None:
+        if path.name == "v7.key":
+            raise PermissionError(1, "Operation not permitted", str(path))
+        unlink(path, missing_ok)
+
+    monkeypatch.setattr(Path, "unlink", refuse)
+    assert say("enroll --finish", line) == "refused: v7.key: Operation not permitted\n"
+    assert {path: path.read_bytes() for path in place.glob("v7*")} == before
+    assert not list(place.glob(".*"))
+
+
 def test_member_with_other_ids_sends_with_them(place: Path, say: Say) -> None:
     """Its autopilot's endpoint has the ids of the certificate, and others keep theirs."""
     enrolled(say, "v7", "--id 7")

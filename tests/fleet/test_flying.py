@@ -11,7 +11,7 @@ import pytest
 from tests.fleet.vehicles import NAMES, RELAY, Vehicles, flying, unasked
 from tests.waiting import until
 from uavlinkd.fleet import operations
-from uavlinkd.fleet.publishing import publish
+from uavlinkd.fleet.signing import Identity
 from uavlinkd.lab.sim.loopback_ports import free_port
 
 pytestmark = pytest.mark.long
@@ -27,7 +27,7 @@ async def vehicles() -> AsyncIterator[Vehicles]:
 async def published(vehicles: Vehicles, name: str = RELAY) -> None:
     """Hand the bulletin to one daemon only."""
     socket = vehicles.place(name) / f"{name}.sock"
-    await asyncio.to_thread(publish, vehicles.fleet, socket, unasked)
+    await asyncio.to_thread(operations.publish, vehicles.fleet, socket, unasked)
 
 
 async def test_revoked_member_is_cut_off(vehicles: Vehicles) -> None:
@@ -46,7 +46,7 @@ async def test_revoked_member_is_cut_off(vehicles: Vehicles) -> None:
 
 async def test_key_is_replaced(vehicles: Vehicles) -> None:
     """The member that has the new key is linked; the files of others stay as they are."""
-    operations.rotate(vehicles.fleet, "drone1", unasked)
+    operations.add(vehicles.fleet, "drone1", Identity(), unasked, replaces=True)
     await published(vehicles)
     vehicles.carry("drone1")
     await vehicles.stop("drone1")

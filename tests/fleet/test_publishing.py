@@ -17,7 +17,6 @@ from uavlinkd.cli import main
 from uavlinkd.core.certificates import parse_bulletin
 from uavlinkd.fleet import operations
 from uavlinkd.fleet.manifest import FleetError, read_manifest
-from uavlinkd.fleet.publishing import SETTLE_S, publish
 from uavlinkd.ops.control import MAX_REQUEST_BYTES, Answer, ControlServer
 from uavlinkd.system.addresses import Address
 
@@ -64,7 +63,7 @@ async def daemon(tmp_path: Path) -> AsyncIterator[Daemon]:
 async def published(daemon: Daemon, folder: str = "fleet", **options: bool) -> int:
     """The number that the folder has afterwards."""
     place = daemon.socket.parent / folder
-    fleet = await asyncio.to_thread(publish, place, daemon.socket, unasked, **options)
+    fleet = await asyncio.to_thread(operations.publish, place, daemon.socket, unasked, **options)
     assert fleet == read_manifest(place)
     assert daemon.trust.bulletin == fleet.bulletin
     return fleet.bulletin.number
@@ -114,7 +113,7 @@ async def test_new_certificates_come_before_the_bulletin_that_ends_the_old_ones(
     monkeypatch.setattr(time, "sleep", wait)
     operations.revoke(daemon.socket.parent / "fleet", "drone7", unasked, resign=True)
     assert await published(daemon) == 2
-    assert waited == [(SETTLE_S, 40, 1)]
+    assert waited == [(operations.SETTLE_S, 40, 1)]
     assert daemon.trust.bulletin.refuses(41)
 
 
@@ -152,13 +151,23 @@ async def test_daemon_of_another_fleet_is_refused(daemon: Daemon) -> None:
         await published(daemon, "other")
 
 
-@pytest.mark.parametrize("verdict", [{}, {"verdict": "bulletin_shrinks"}])
-async def test_daemon_that_refuses_a_bulletin(daemon: Daemon, tmp_path: Path, verdict: dict[str, object]) -> None:
-    """Its verdict is in the error."""
-    answer = {"bulletin": b64encode(relay_bulletin(tmp_path)).decode(), **verdict}
+@pytest.mark.parametrize(
+    ("answer", "reason"),
+    [
+        ({}, "refused bulletin 1: None"),
+        ({"verdict": "bulletin_shrinks"}, "refused bulletin 1: bulletin_shrinks"),
+        ({"bulletin": "é"}, "has no bulletin of this fleet"),
+        ({"bulletin": None}, "has no bulletin of this fleet"),
+    ],
+)
+async def test_daemon_that_refuses_a_bulletin(
+    daemon: Daemon, tmp_path: Path, answer: dict[str, object], reason: str
+) -> None:
+    """Its verdict is in the error, and an answer of another form is one too."""
+    answer = {"bulletin": b64encode(relay_bulletin(tmp_path)).decode(), **answer}
     daemon.socket = tmp_path / "other.sock"
     server = ControlServer(daemon.socket, lambda _: answer)
     await server.start()
-    with pytest.raises(FleetError, match=f"refused bulletin 1: {verdict.get('verdict')}"):
+    with pytest.raises(FleetError, match=reason):
         await published(daemon)
     await server.stop()

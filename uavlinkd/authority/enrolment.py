@@ -15,6 +15,7 @@ from uavlinkd.core.certificates import (
     BULLETIN_BYTES,
     FLEET_LABEL,
     NAME,
+    Certificate,
     MemberRole,
     parse_certificate,
     role_bits,
@@ -50,6 +51,12 @@ def fingerprint_of(authority: bytes) -> str:
 
 def _eight_characters(data: bytes) -> str:
     return base64.b32encode(sha256(data)[:5]).decode().lower()
+
+
+def ids_of(certificate: Certificate) -> str:
+    """The system ids of a certificate for a person; empty for a relay's."""
+    first, last = certificate.system_ids
+    return "" if not first else f"{first}" if first == last else f"{first}-{last}"
 
 
 class Request(NamedTuple):

@@ -33,20 +33,13 @@ from uavlinkd.fleet.manifest import (
     read_manifest,
 )
 from uavlinkd.fleet.operations import Result
-from uavlinkd.fleet.publishing import publish
 from uavlinkd.fleet.signing import Identity
 from uavlinkd.mavlink.dialect import SYSTEM_ID
 from uavlinkd.ops.commands import control_socket
 from uavlinkd.system.base64_text import to_base64
-from uavlinkd.system.terminal import OK, CommandError, printable
+from uavlinkd.system.terminal import CommandError, printable
 
 _SET_IDS = f"Set {SYSTEM_ID} of each autopilot, and the id of each ground control station, to the id above"
-
-
-def act(options: argparse.Namespace) -> int:
-    """Run ``options.action``."""
-    _ACTIONS[options.action](options)
-    return OK
 
 
 def _init(options: argparse.Namespace) -> None:
@@ -90,7 +83,7 @@ def _sign(options: argparse.Namespace) -> None:
     _note(
         f"fleet {fingerprint_of(result.fleet.authority.public)}: `enroll --finish` prints the same on {member.name}"
     )
-    for note in (*_to_carry(options, result), *result.notes):
+    for note in _to_carry(options, result):
         _note(note)
 
 
@@ -110,14 +103,14 @@ def _change(options: argparse.Namespace) -> None:
     if options.action == "add":
         result = operations.add(options.out, options.name, _identity(options), ask)
     elif options.action == "rotate":
-        result = operations.rotate(options.out, options.name, ask)
+        result = operations.add(options.out, options.name, Identity(), ask, replaces=True)
     else:
         socket = control_socket(options) if options.action == "remove" else None
         resign = options.action == "revoke" and options.resign
         result = operations.revoke(options.out, options.name, ask, resign=resign)
         try:
             if socket is not None:
-                _published(publish(options.out, socket, ask))
+                _say_published(operations.publish(options.out, socket, ask))
         except CommandError as error:
             reason = f"{options.name} is revoked in {options.out}, but no daemon has the bulletin: {error}"
             raise FleetError(f"{reason}\nThen run `uavlinkd fleet publish`") from None
@@ -128,10 +121,10 @@ def _change(options: argparse.Namespace) -> None:
 
 def _publish(options: argparse.Namespace) -> None:
     ask = passphrase_from(options.passphrase_file)
-    _published(publish(options.out, control_socket(options), ask, merges=options.merge))
+    _say_published(operations.publish(options.out, control_socket(options), ask, merges=options.merge))
 
 
-def _published(fleet: Fleet) -> None:
+def _say_published(fleet: Fleet) -> None:
     _say(f"The daemon has bulletin {fleet.bulletin.number}, and passes it on.")
 
 
@@ -154,18 +147,9 @@ def _enroll(options: argparse.Namespace) -> None:
         _note(f"the private key is {key}. `fleet sign` reads this line, and `enroll --finish` what that prints")
         print(line)
         return
-    line = options.finish or _line()
-    done = enrolling.finish(line, options.config, options.keys, options.url, options.listen)
-    certificate = done.certificate
-    first, last = certificate.system_ids
-    ids = f"system id {first}" + (f" to {last}" if last > first else "")
-    _say(f"{certificate.name} is a member of fleet {done.fingerprint}: compare this with the line of `fleet sign`.")
-    _say(f"{done.config}: {_role(certificate.role)}, contacts {', '.join(done.contacts) or 'none'}")
-    if first:
-        _say(f"Set {SYSTEM_ID} of the autopilot, or the id of the ground control station, to {ids}.")
-    _say(f"Then: uavlinkd run --config {done.config}; if the daemon runs already, restart it.")
-    if done.former_key is not None:
-        _say(f"The former key, {done.former_key}, was deleted.")
+    finish = options.finish or _line()
+    for text in enrolling.finish(finish, options.config, options.keys, options.url, options.listen):
+        _say(text)
 
 
 def _line() -> str:
@@ -189,15 +173,20 @@ def _print_result(options: argparse.Namespace, result: Result) -> None:
         is_service = result.fleet.settings.control_socket.startswith("/run/uavlinkd/{name}/")
         start = "systemctl enable --now uavlinkd@NAME" if is_service else "uavlinkd run --config NAME.toml"
         _say(f"On each machine: {start}. If the daemon runs already, restart it.")
-    for note in result.notes:
-        _say(note)
 
 
 def _to_carry(options: argparse.Namespace, result: Result) -> list[str]:
-    is_all = {member.name for member in result.fleet.current} <= set(result.changed)
-    changed = "all folders" if is_all else ", ".join(result.changed)
-    carry = f"Changed in {options.out}: {changed}. Carry each to its owner so that no other person can read it."
-    return [carry] if result.changed else []
+    texts = []
+    if result.changed:
+        is_all = {member.name for member in result.fleet.current} <= set(result.changed)
+        changed = "all folders" if is_all else ", ".join(result.changed)
+        texts.append(
+            f"Changed in {options.out}: {changed}. Carry each to its owner so that no other person can read it."
+        )
+    if result.elsewhere:
+        names = f"For {', '.join(result.elsewhere)}, `uavlinkd fleet sign NAME`"
+        texts.append(f"The contacts changed. {names} prints a line for `uavlinkd enroll --finish`.")
+    return texts
 
 
 def _list(options: argparse.Namespace) -> None:
@@ -232,7 +221,7 @@ def _note(text: str) -> None:
     print(printable(text), file=sys.stderr)
 
 
-_ACTIONS: dict[str, Callable[[argparse.Namespace], None]] = {
+ACTIONS: dict[str, Callable[[argparse.Namespace], None]] = {
     "init": _init,
     "sign": _sign,
     "add": _change,

@@ -33,7 +33,10 @@ def passphrase_from(file: Path | None, *, is_new: bool = False) -> Passphrase:
     """Where a passphrase comes from: the first line of a file, or the terminal, on which a new one is typed twice."""
 
     def ask(what: str) -> Secret:
-        typed = _first_line(file) if file is not None else _typed(f"passphrase of {what}: ")
+        if file is not None:
+            typed = read_private_file(file, _LIMIT).partition(b"\n")[0].rstrip(b"\r")
+        else:
+            typed = _typed(f"passphrase of {what}: ")
         if not typed:
             place = f"{file} is empty" if file is not None else "the passphrase is empty"
             raise FleetError(
@@ -44,10 +47,6 @@ def passphrase_from(file: Path | None, *, is_new: bool = False) -> Passphrase:
         return Secret(typed)
 
     return ask
-
-
-def _first_line(file: Path) -> bytes:
-    return read_private_file(file, _LIMIT).partition(b"\n")[0].rstrip(b"\r")
 
 
 def _typed(prompt: str) -> bytes:
@@ -63,10 +62,17 @@ def _typed(prompt: str) -> bytes:
 def load_key(file: Path, ask: Passphrase) -> Secret:
     """The key in a file. ``ask`` is called if it is encrypted."""
     pem = read_private_file(file, _LIMIT)
+    is_encrypted = b"ENCRYPTED" in pem
     try:
-        return read_signing_key(pem, ask(str(file)) if b"ENCRYPTED" in pem else None)
-    except ValueError as error:
-        raise FleetFileError(f"{file}: {error}") from None
+        return read_signing_key(pem, ask(str(file)) if is_encrypted else None)
+    except ValueError:
+        if is_encrypted:
+            reason = "the passphrase is wrong, or the file is damaged: run the command again with its passphrase"
+        else:
+            reason = "it is not a private key of Ed25519"
+    raise FleetFileError(
+        f"{file} cannot be used: {reason}, or write the file from its paper copy with `uavlinkd fleet restore`"
+    )
 
 
 def paper_copy(private: Secret) -> str:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from uavlinkd.system.terminal import OK
+
 _ROLES = ("vehicle", "operator", "observer", "relay")
 
 
@@ -120,6 +122,7 @@ def _add_enroll(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
 
 
 def _act(options: argparse.Namespace) -> int:
-    from uavlinkd.fleet.actions import act  # noqa: PLC0415  # other commands start without it
+    from uavlinkd.fleet.actions import ACTIONS  # noqa: PLC0415  # other commands start without it
 
-    return act(options)
+    ACTIONS[options.action](options)
+    return OK

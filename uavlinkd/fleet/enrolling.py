@@ -15,17 +15,18 @@ from uavlinkd.authority.enrolment import (
     Request,
     check_name,
     fingerprint_of,
+    ids_of,
     parse_reply,
     verify_reply,
 )
-from uavlinkd.config import ConfigError, keys
-from uavlinkd.config.load import load_config
+from uavlinkd.config import keys
 from uavlinkd.core.certificates import Certificate, parse_bulletin, parse_certificate
 from uavlinkd.core.crypto import x25519_public_key
 from uavlinkd.core.drops import Drop
 from uavlinkd.fleet.files import config_file, key_file, listen_on, with_fleet, write_config
 from uavlinkd.fleet.manifest import FleetError, FleetFileError, FleetSettings
-from uavlinkd.fleet.transaction import Rollback
+from uavlinkd.fleet.transaction import changing
+from uavlinkd.mavlink.dialect import SYSTEM_ID
 from uavlinkd.system.base64_text import from_base64
 
 _NEXT = ".next.key"
@@ -82,21 +83,11 @@ def _other(own: str) -> str:
     return f"{own.removesuffix(_NEXT)}.key" if own.endswith(_NEXT) else own.removesuffix(".key") + _NEXT
 
 
-@dataclass(frozen=True, slots=True)
-class Enrolled:
-    """A finished enrolment."""
-
-    certificate: Certificate
-    fingerprint: str
-    config: Path
-    contacts: tuple[str, ...]
-    former_key: Path | None
-
-
-def finish(line: str, config: Path | None, folder: Path | None, url: str | None, listen: Sequence[str]) -> Enrolled:
+def finish(line: str, config: Path | None, folder: Path | None, url: str | None, listen: Sequence[str]) -> list[str]:
     """Write what the line of `uavlinkd fleet sign` says into the configuration, which is created if it is missing.
 
     Nothing is written unless every signature verifies and a daemon would accept the file. The former key is deleted.
+    Returns sentences for the person who ran the command.
     """
     try:
         reply = parse_reply(line)
@@ -109,28 +100,36 @@ def finish(line: str, config: Path | None, folder: Path | None, url: str | None,
     table = place.table()
     former_ids = _check_present(table.get("fleet"), reply, certificate, place.config)
     own = str(table.get("private_key_file", key_file(certificate.name)))
-    path, contacts = _verified(reply, [place.key(own), place.key(_other(own))])
-    name = own if path == place.key(own) else _other(own)  # it may be in another folder
-    listen = listen or ([] if "listen" in table else listen_on(reply))
-    if table:
-        if url is not None and url not in _urls(table):
-            raise FleetError(f"{place.config} exists: write the url into its [[endpoint]], and leave --url out")
-        top = {"private_key_file": name, **({"listen": listen} if listen else {})}
-        text = with_fleet(place.config.read_text(encoding="utf-8-sig"), reply, top, former_ids)
-    else:
-        settings = FleetSettings(
-            control_socket="{name}.sock" if folder is None else "/run/uavlinkd/{name}/control.sock"
-        )
-        if url is not None:
-            settings = replace(settings, drone_url=url, ground_station_url=url)
-        text = write_config(reply, settings, name, listen)
-    _replace(place, text)
     former = place.key(own)
-    has_former = path != former and former.exists()
-    if has_former:
-        former.unlink()
+    path, contacts = _verified(reply, certificate.name, [place.key(_other(own)), former])
+    name = own if path == former else _other(own)  # it may be in another folder
+    listen = listen or ([] if "listen" in table else listen_on(reply))
+    with changing() as changes:
+        if table:
+            if url is not None and url not in _urls(table):
+                raise FleetError(f"{place.config} exists: write the url into its [[endpoint]], and leave --url out")
+            top = {"private_key_file": name, **({"listen": listen} if listen else {})}
+            text = with_fleet(place.config.read_text(encoding="utf-8-sig"), reply, top, former_ids)
+        else:
+            settings = FleetSettings(
+                control_socket="{name}.sock" if folder is None else "/run/uavlinkd/{name}/control.sock"
+            )
+            if url is not None:
+                settings = replace(settings, drone_url=url, ground_station_url=url)
+            text = write_config(reply, settings, name, listen)
+        changes.write(place.config, text, place.environ())
+        has_former = path != former and former.exists()
+        if has_former:
+            changes.delete(former)
     fingerprint = fingerprint_of(reply.authority)
-    return Enrolled(certificate, fingerprint, place.config, contacts, former if has_former else None)
+    ids = f"the id of the ground control station, to system id {ids_of(certificate)}"
+    return [
+        f"{certificate.name} is a member of fleet {fingerprint}: compare this with the line of `fleet sign`.",
+        f"{place.config}: {certificate.role.name.lower()}, contacts {', '.join(contacts) or 'none'}",
+        *([f"Set {SYSTEM_ID} of the autopilot, or {ids}."] if ids_of(certificate) else []),
+        f"Then: uavlinkd run --config {place.config}; if the daemon runs already, restart it.",
+        *([f"The former key, {former}, was deleted."] if has_former else []),
+    ]
 
 
 def _urls(table: dict[str, Any]) -> list[Any]:
@@ -163,33 +162,17 @@ def _check_present(fleet: Any, reply: Reply, certificate: Certificate, config: P
     return present.system_ids
 
 
-def _verified(reply: Reply, paths: list[Path]) -> tuple[Path, tuple[str, ...]]:
-    """The key file whose key was certified, and the names of the contacts."""
-    name = parse_certificate(reply.certificate).name
-    reason = f"the line is for {name}, and there is no {paths[0]}: run `uavlinkd enroll NAME` here, and sign its line"
-    for path in reversed(paths):
+def _verified(reply: Reply, name: str, paths: list[Path]) -> tuple[Path, list[str]]:
+    """The key file whose key was certified for the member of this name, and the names of the contacts."""
+    reason = (
+        f"the line is for {name}, and there is no {paths[-1]}: run `uavlinkd enroll NAME` here, and sign its line"
+    )
+    for path in paths:
         if path.exists():
             try:
                 trust = verify_reply(reply, x25519_public_key(keys.read_secret_file(path).reveal()))
             except EnrolmentError as error:
                 reason = f"the line {error}"
             else:
-                return path, tuple(held.certificate.name for held in trust.held.values())
+                return path, [held.certificate.name for held in trust.held.values()]
     raise FleetError(reason)
-
-
-def _replace(place: MemberFiles, text: str) -> None:
-    rollback = Rollback()
-    try:
-        new = rollback.prepare(place.config, text)
-        load_config(new, place.environ())
-        rollback.replace(place.config, new)
-        rollback.finish()
-    except BaseException as error:
-        rollback.undo()
-        if isinstance(error, OSError):
-            raise FleetFileError(f"{place.config} cannot be written: {error.strerror}") from None
-        if isinstance(error, ConfigError):
-            problems = "\n".join(f"{problem.key}: {problem.message}" for problem in error.problems)
-            raise FleetError(f"{place.config} would not be valid, and was not changed:\n{problems}") from None
-        raise

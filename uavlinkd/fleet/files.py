@@ -12,7 +12,7 @@ import tomllib
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from uavlinkd.authority.enrolment import Contact, Reply
+from uavlinkd.authority.enrolment import Contact, Reply, ids_of
 from uavlinkd.core.certificates import MemberRole, parse_certificate
 from uavlinkd.core.suites import SUITES_BY_NAME
 from uavlinkd.fleet.manifest import Fleet, FleetError, FleetSettings, Member, fill, toml_lines
@@ -69,7 +69,7 @@ def listen_on(reply: Reply) -> list[str]:
 def write_config(reply: Reply, settings: FleetSettings, private_key_file: str, listen: Sequence[str]) -> str:
     """The text of a new configuration. In ``settings``, only the templates count."""
     certificate = parse_certificate(reply.certificate)
-    name, role, (first, last) = certificate.name, certificate.role, certificate.system_ids
+    name, role, ids, first = certificate.name, certificate.role, ids_of(certificate), certificate.system_ids[0]
     is_vehicle = role is MemberRole.VEHICLE
     top = {
         "name": name,
@@ -80,12 +80,11 @@ def write_config(reply: Reply, settings: FleetSettings, private_key_file: str, l
     endpoint = {
         "name": "autopilot" if is_vehicle else "ground-control",
         "url": fill(settings.drone_url if is_vehicle else settings.ground_station_url, first, name),
-        "system_ids": list(range(first, last + 1)),
+        "system_ids": list(certificate.systems),
         "role": "observer" if role is MemberRole.OBSERVER else None,
     }
-    ids = "" if role is MemberRole.RELAY else f", MAVLink system id {first}" + (f" to {last}" if last > first else "")
     lines = [
-        f"# {name}: {role.name.lower()}{ids}.",
+        f"# {name}: {role.name.lower()}{f', MAVLink system id {ids}' if ids else ''}.",
         "# Later commands change [fleet] and [[contact]], and keep your other edits.",
         "",
         *toml_lines(top),

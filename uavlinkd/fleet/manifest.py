@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from uavlinkd.authority.enrolment import MOST_CONTACTS
+from uavlinkd.authority.enrolment import MOST_CONTACTS, ids_of
 from uavlinkd.core.certificates import (
     Bulletin,
     Certificate,
@@ -103,8 +103,7 @@ class Member:
     @property
     def ids(self) -> str:
         """Its system ids for a person."""
-        first, last = self.certificate.system_ids
-        return f"{first}-{last}" if first != last else str(first or "-")
+        return ids_of(self.certificate) or "-"
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,10 +164,15 @@ class Fleet:
         named = [member for member in self.members if member.name == name]
         return named[-1] if named and all(map(self.is_revoked, named)) else None
 
+    @property
+    def reachable(self) -> list[Member]:
+        """The members with an address, relays first."""
+        reachable = [member for member in self.current if member.addresses]
+        return sorted(reachable, key=lambda member: (not member.relays, member.role))
+
     def contacts_of(self, name: str) -> list[Member]:
-        """The members that one has in its configuration, relays first."""
-        reachable = [member for member in self.current if member.addresses and member.name != name]
-        return sorted(reachable, key=lambda member: (not member.relays, member.role))[:MOST_CONTACTS]
+        """The members that one has in its configuration."""
+        return [member for member in self.reachable if member.name != name][:MOST_CONTACTS]
 
 
 def write_manifest(fleet: Fleet) -> str:

@@ -1,4 +1,4 @@
-"""The operations on a fleet's folder: init, sign, add, rotate, revoke and restore.
+"""The operations on a fleet's folder: init, sign, add, rotate, revoke, publish and restore.
 
 A fleet's folder contains the manifest, the authority's key, and a folder for each member whose key was made here. The
 commands do not need that again: it may have been moved to its vehicle. An operation that raises FleetError changed
@@ -12,18 +12,21 @@ import os
 import secrets
 import shutil
 import tempfile
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from uavlinkd.authority.enrolment import Request
+from uavlinkd.authority.enrolment import Reply, Request
+from uavlinkd.authority.trust import BulletinVerdict
 from uavlinkd.config import keys
 from uavlinkd.core.certificates import MemberRole
 from uavlinkd.core.crypto import Secret, SigningKey, sha256, signing_key_pem
 from uavlinkd.fleet import authority_key, files, signing
 from uavlinkd.fleet.authority_key import AUTHORITY_FILE, SUCCESSOR_FILE, Passphrase
 from uavlinkd.fleet.manifest import (
+    FILE_NAME,
     Fleet,
     FleetError,
     FleetFileError,
@@ -31,22 +34,30 @@ from uavlinkd.fleet.manifest import (
     Member,
     check_settings,
     read_manifest,
+    write_manifest,
 )
 from uavlinkd.fleet.signing import Identity
-from uavlinkd.fleet.transaction import FileChanges, apply, lock
+from uavlinkd.fleet.transaction import FileChanges, changing, lock
+from uavlinkd.ops.control import ask as ask_daemon
 from uavlinkd.system.addresses import Address
+from uavlinkd.system.base64_text import to_base64
+
+_AT_ONCE = 30
+"""Certificates in a request, which has at most 8,192 bytes."""
+SETTLE_S = 5.0
+"""Members that are linked hand new certificates to each other within this time."""
 
 
 @dataclass(frozen=True, slots=True)
 class Result:
     """The fleet after a command, and the members whose folders must be carried to their owners.
 
-    ``notes`` are sentences for the person who carries them.
+    ``elsewhere``: members without a folder here, whose contacts changed.
     """
 
     fleet: Fleet
     changed: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
+    elsewhere: tuple[str, ...] = ()
 
 
 def init(
@@ -92,12 +103,12 @@ def init(
     except OSError as error:
         raise _cannot_create(folder, error) from None
     try:
-        changes = FileChanges(building, fleet)
-        for file, key in ((AUTHORITY_FILE, private), (SUCCESSOR_FILE, successor)):
-            changes.secrets[building / file] = signing_key_pem(key, passphrase, os.urandom)
-        for member in fleet.members:
-            _write(changes, member, private_keys[member.name])
-        apply(changes, fleet.members)
+        with changing() as changes:
+            for file, key in ((AUTHORITY_FILE, private), (SUCCESSOR_FILE, successor)):
+                changes.write_secret(building / file, signing_key_pem(key, passphrase, os.urandom))
+            for member in fleet.members:
+                _write_member(changes, building, fleet, member, private_keys[member.name])
+            changes.write(building / FILE_NAME, write_manifest(fleet))
         building.chmod(0o755)
         building.rename(folder)
     except OSError as error:
@@ -127,25 +138,14 @@ def sign(
     folder: Path, request: Request, identity: Identity, ask: Passphrase, *, replaces: bool = False
 ) -> tuple[Result, str]:
     """Sign a request; also returns the reply line. The same request again, for the same identity, changes nothing."""
-    with _open_fleet(folder) as before:
+    with _changing(folder) as (before, changes):
         known = next((member for member in before.current if member.public_key == request.public_key), None)
-        if known is not None and known.name == request.name and _is_of(known, identity):
+        if known is not None and known.name == request.name and identity.is_of(known):
             return Result(before), files.reply_for(before, known).line()
         signer = _signer(folder, before, ask)
         fleet = signing.certify(before, signer, request.public_key, request.name, identity, replaces=replaces)
-        changes = FileChanges(folder, fleet)
-        changed = _refresh(changes, before, request.name)
-        apply(changes)
-    line = files.reply_for(changes.fleet, changes.fleet.member(request.name)).line()
-    return Result(changes.fleet, changed, tuple(changes.notes)), line
-
-
-def _is_of(member: Member, identity: Identity) -> bool:
-    return (
-        identity.role in (None, member.role)
-        and identity.ids in (None, member.certificate.system_ids)
-        and identity.addresses in ((), member.addresses)
-    )
+        result = _save(changes, folder, fleet, before, but=request.name)
+    return result, files.reply_for(fleet, fleet.member(request.name)).line()
 
 
 def line_of(folder: Path, name: str) -> str:
@@ -154,77 +154,78 @@ def line_of(folder: Path, name: str) -> str:
     return files.reply_for(fleet, fleet.member(name)).line()
 
 
-def add(folder: Path, name: str, identity: Identity, ask: Passphrase) -> Result:
-    """Make a key and a folder for a new member."""
-    return _with_new_key(folder, name, identity, ask, replaces=False)
-
-
-def rotate(folder: Path, name: str, ask: Passphrase) -> Result:
-    """Make a new key for a member, in its folder, and revoke the old certificate."""
-    return _with_new_key(folder, name, Identity(), ask, replaces=True)
-
-
-def _with_new_key(folder: Path, name: str, identity: Identity, ask: Passphrase, *, replaces: bool) -> Result:
-    with _open_fleet(folder) as before:
+def add(folder: Path, name: str, identity: Identity, ask: Passphrase, *, replaces: bool = False) -> Result:
+    """Make a key and a folder for a new member. ``replaces``: a new key for a member, whose old one is revoked."""
+    with _changing(folder) as (before, changes):
         if replaces:
             before.member(name)
         private = keys.generate_private_key()
         signer = _signer(folder, before, ask)
-        changes = FileChanges(
-            folder, signing.certify(before, signer, _public(private), name, identity, replaces=replaces)
-        )
-        member = changes.fleet.member(name)
-        path = folder / name / files.config_file(name)
-        if path.exists():
-            key = path.with_name(files.key_file(name))
-            _edit(changes, member, {"private_key_file": key.name})
-            changes.deleted.append(key)
-            changes.secrets[key] = private
-        else:
-            _write(changes, member, private)
-        changed = _refresh(changes, before, name)
-        apply(changes, [member])
-    return Result(changes.fleet, (name, *changed), tuple(changes.notes))
+        fleet = signing.certify(before, signer, _public(private), name, identity, replaces=replaces)
+        _write_member(changes, folder, fleet, fleet.member(name), private)
+        return _save(changes, folder, fleet, before, but=name, changed=(name,))
 
 
 def revoke(folder: Path, name: str, ask: Passphrase, *, resign: bool = False) -> Result:
     """Sign a bulletin that refuses a member. Its own folder is kept. Once more changes nothing."""
-    with _open_fleet(folder) as before:
+    with _changing(folder) as (before, changes):
         if before.former(name) is not None:
             return Result(before)
         member = before.member(name)
-        changes = FileChanges(folder, signing.revoke(before, _signer(folder, before, ask), [member], resign=resign))
-        changed = _refresh(changes, before, name) if resign else ()
-        apply(changes)
-    return Result(changes.fleet, changed, tuple(changes.notes))
+        fleet = signing.revoke(before, _signer(folder, before, ask), [member], resign=resign)
+        return _save(changes, folder, fleet, before if resign else None)
 
 
 def restore(folder: Path, private: Secret, ask: Passphrase | None) -> None:
     """Write the authority's key from its paper copy, with a new passphrase. The old file is replaced."""
-    with _open_fleet(folder) as fleet:
+    with _changing(folder) as (fleet, changes):
         if SigningKey(private).public != fleet.authority.public:
             raise FleetError("this paper copy is of another authority than this fleet's")
-        changes = FileChanges(folder, fleet)
         passphrase = None if ask is None else ask(AUTHORITY_FILE)
-        changes.deleted.append(folder / AUTHORITY_FILE)
-        changes.secrets[folder / AUTHORITY_FILE] = signing_key_pem(private, passphrase, os.urandom)
-        apply(changes)
+        changes.delete(folder / AUTHORITY_FILE)
+        changes.write_secret(folder / AUTHORITY_FILE, signing_key_pem(private, passphrase, os.urandom))
 
 
-def merge(folder: Path, bulletin: bytes, ask: Passphrase) -> Fleet:
-    """Sign the union of the folder's bulletin and another one of the same authority, which a daemon has."""
-    with _open_fleet(folder) as before:
-        other = signing.bulletin_of(before, bulletin)
-        changes = FileChanges(folder, signing.merge(before, _signer(folder, before, ask), other))
-        apply(changes)
-    return changes.fleet
+def publish(folder: Path, socket: Path, ask: Passphrase, *, merges: bool = False) -> Fleet:
+    """Hand the bulletin to the daemon at a control socket, and newer certificates if all were signed again.
+
+    The daemon may have another bulletin of the same number, which another copy of the folder signed: then their union
+    is signed and handed over. ``merges``: a newer one too.
+    """
+    fleet = read_manifest(folder)
+    theirs = str(ask_daemon(socket, "bulletin").get("bulletin"))
+    bulletin, own = signing.bulletin_of(fleet, theirs), fleet.bulletin.number
+    if bulletin.number > own and not merges:
+        raise FleetError(
+            f"the fleet has bulletin {bulletin.number}, this folder {own}: use the newest copy of the folder. If that"
+            " is lost, --merge signs the union of both; members that were signed there are not in this folder"
+        )
+    if bulletin.number > own or (bulletin.number == own and theirs != to_base64(fleet.published)):
+        with _changing(folder) as (before, changes):
+            fleet = signing.merge(before, _signer(folder, before, ask), bulletin)
+            _save(changes, folder, fleet)
+    # The certificates come first: a member that meets the bulletin with its old one would be refused.
+    certificates = [
+        f"{to_base64(member.public_key)}:{to_base64(member.signed)}"
+        for member in (fleet.current if fleet.bulletin.least > bulletin.least else ())
+    ]
+    for at in range(0, len(certificates), _AT_ONCE):
+        ask_daemon(socket, " ".join(["publish", theirs, *certificates[at : at + _AT_ONCE]]))
+    if certificates:
+        time.sleep(SETTLE_S)
+    verdict = ask_daemon(socket, f"publish {to_base64(fleet.published)}").get("verdict")
+    if verdict not in (BulletinVerdict.NEWER.value, BulletinVerdict.KNOWN.value):
+        raise FleetError(f"the daemon refused bulletin {fleet.bulletin.number}: {verdict}")
+    return fleet
 
 
 @contextmanager
-def _open_fleet(folder: Path) -> Iterator[Fleet]:
-    """Lock a fleet's folder, and read its manifest."""
+def _changing(folder: Path) -> Iterator[tuple[Fleet, FileChanges]]:
+    """Lock a fleet's folder, read its manifest, and change its files."""
     with lock(folder):
-        yield read_manifest(folder)
+        fleet = read_manifest(folder)
+        with changing() as changes:
+            yield fleet, changes
 
 
 def _signer(folder: Path, fleet: Fleet, ask: Passphrase) -> SigningKey:
@@ -238,43 +239,49 @@ def _public(private: str) -> bytes:
     return keys.decode_key(keys.public_key_text(private))
 
 
-def _write(changes: FileChanges, member: Member, private: str) -> None:
-    """Write the key and the configuration of a member."""
-    own, fleet, name = changes.folder / member.name, changes.fleet, member.name
-    changes.secrets[own / files.key_file(name)] = private
+def _write_member(changes: FileChanges, folder: Path, fleet: Fleet, member: Member, private: str) -> None:
+    """Write the key and the configuration of a member. A configuration that is there keeps its edits."""
+    path = folder / member.name / files.config_file(member.name)
+    key = path.with_name(files.key_file(member.name))
     reply = files.reply_for(fleet, member)
-    text = files.write_config(reply, fleet.settings, files.key_file(name), files.listen_on(reply))
-    changes.texts[own / files.config_file(name)] = text
+    if path.exists():
+        changes.delete(key)
+        text = _edited(path, reply, {"private_key_file": key.name})
+    else:
+        text = files.write_config(reply, fleet.settings, key.name, files.listen_on(reply))
+    changes.write_secret(key, private)
+    changes.write(path, text, {})
 
 
-def _refresh(changes: FileChanges, before: Fleet, but: str) -> tuple[str, ...]:
-    """If the contacts changed, write them into the configurations that are here. Returns the names of all others."""
-    fleet = changes.fleet
-    contacts = [[member for member in each.current if member.addresses] for each in (before, fleet)]
-    if contacts[0] == contacts[1]:
-        return ()
-    others = [member for member in fleet.current if member.name != but]
-    for member in others:
-        _edit(changes, member)
-    elsewhere = [member.name for member in others if not (changes.folder / member.name).exists()]
-    if elsewhere:
-        changes.notes.append(
-            f"The contacts changed. For {', '.join(elsewhere)}, `uavlinkd fleet sign NAME` prints a line for"
-            " `uavlinkd enroll --finish`."
-        )
-    return tuple(member.name for member in others if member.name not in elsewhere)
+def _save(
+    changes: FileChanges,
+    folder: Path,
+    fleet: Fleet,
+    before: Fleet | None = None,
+    *,
+    but: str = "",
+    changed: tuple[str, ...] = (),
+) -> Result:
+    """Write the manifest, and if contacts differ from those ``before``, the configurations that are here."""
+    is_new = before is not None and before.reachable != fleet.reachable
+    elsewhere: tuple[str, ...] = ()
+    for member in (member for member in fleet.current if is_new and member.name != but):
+        path = folder / member.name / files.config_file(member.name)
+        if path.exists():
+            changes.write(path, _edited(path, files.reply_for(fleet, member)))
+        if path.parent.exists():
+            changed += (member.name,)
+        else:
+            elsewhere += (member.name,)
+    changes.write(folder / FILE_NAME, write_manifest(fleet))
+    return Result(fleet, changed, elsewhere)
 
 
-def _edit(changes: FileChanges, member: Member, top: dict[str, object] | None = None) -> None:
-    """Change a member's configuration, if it is here."""
-    path = changes.folder / member.name / files.config_file(member.name)
-    if not path.exists():
-        return
+def _edited(path: Path, reply: Reply, top: dict[str, object] | None = None) -> str:
+    """A member's configuration with its present facts."""
     try:
-        text = path.read_text(encoding="utf-8")
-        changes.texts[path] = files.with_fleet(text, files.reply_for(changes.fleet, member), top)
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or "it is not text"
-        raise FleetFileError(f"{path} cannot be read: {reason}") from None
+        return files.with_fleet(path.read_text(encoding="utf-8"), reply, top)
+    except ValueError:
+        raise FleetFileError(f"{path} cannot be read: it is not text") from None
     except FleetError as error:
         raise FleetError(f"{path}: {error}") from None

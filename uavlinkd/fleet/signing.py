@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -22,6 +23,7 @@ from uavlinkd.core.certificates import (
 from uavlinkd.core.crypto import AuthorityKey, SigningKey, is_usable_public_key
 from uavlinkd.fleet.manifest import Fleet, FleetError, FleetSettings, Member
 from uavlinkd.system.addresses import Address
+from uavlinkd.system.base64_text import from_base64
 
 _ALIKE = str.maketrans({"0": "o", "1": "l", "i": "l", "-": None})
 """Characters that persons confuse."""
@@ -36,6 +38,14 @@ class Identity(NamedTuple):
     role: MemberRole | None = None
     ids: tuple[int, int] | None = None
     addresses: tuple[Address, ...] = ()
+
+    def is_of(self, member: Member) -> bool:
+        """Whether a member is as this says."""
+        return (
+            self.role in (None, member.role)
+            and self.ids in (None, member.certificate.system_ids)
+            and self.addresses in ((), member.addresses)
+        )
 
 
 def new_fleet(signer: SigningKey, successor: bytes, settings: FleetSettings) -> Fleet:
@@ -155,11 +165,12 @@ def revoke(fleet: Fleet, signer: SigningKey, members: Iterable[Member], *, resig
     return _publish(replace(fleet, members=members, next_serial=least + len(renewed)), signer, least, set())
 
 
-def bulletin_of(fleet: Fleet, data: bytes) -> Bulletin:
-    """The bulletin of this fleet in these bytes."""
-    if (bulletin := verified_bulletin(data, fleet.authority)) is None:
-        raise FleetError("the daemon has no bulletin of this fleet: is it a member of another one?")
-    return bulletin
+def bulletin_of(fleet: Fleet, text: str) -> Bulletin:
+    """The bulletin of this fleet that a daemon answered, in base64."""
+    with suppress(ValueError):
+        if (bulletin := verified_bulletin(from_base64(text), fleet.authority)) is not None:
+            return bulletin
+    raise FleetError("the daemon has no bulletin of this fleet: is it a member of another one?")
 
 
 def merge(fleet: Fleet, signer: SigningKey, other: Bulletin) -> Fleet:
