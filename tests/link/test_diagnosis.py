@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from dataclasses import replace
 from itertools import chain
 from types import SimpleNamespace
 from typing import Any
@@ -334,6 +335,10 @@ def test_system_of_another(daemon: Daemon) -> None:
     assert set(findings) == {"other_system"}
     assert "of system 7; its system_ids here are 1" in findings["other_system"].text
     assert "only if you know that drone1 has this id" in findings["other_system"].remedy
+    settings = daemon.link.config.settings
+    daemon.link.config = replace(daemon.link.config, settings=replace(settings, is_certified=True))
+    assert "`uavlinkd fleet sign --replace drone1 --id 7`" in daemon.findings()["other_system"].remedy
+    daemon.link.config = replace(daemon.link.config, settings=settings)
     client = object()
     daemon.local.append(SimpleNamespace(name="autopilot", ports=[client], policy=daemon.link.policy, failures={}))
     daemon.router.add_port(client)

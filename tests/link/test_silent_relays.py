@@ -19,6 +19,8 @@ from uavlinkd.core.path_state import PathCondition
 from uavlinkd.core.settings import PeerSettings
 from uavlinkd.link import diagnosis
 from uavlinkd.link.daemon import netcheck
+from uavlinkd.link.down_problems import silent_relays
+from uavlinkd.link.facts import Moment
 from uavlinkd.link.peer_link import NOT_ANSWERING_S, PeerLink
 from uavlinkd.link.relay_link import RelayHandles, RelayLink
 from uavlinkd.link.traffic_problems import LOSSES
@@ -85,7 +87,10 @@ def test_relays_on_two_hosts_show_that_udp_is_probably_blocked(member: Member, i
     if is_far:
         text = findings["udp_blocked"].text
         assert text == "UDP is probably blocked here: none of 2 relays on different hosts answers (one, two)"
-        assert "[[member]]" in findings["udp_blocked"].remedy
+        assert "it must be a [[member]] there: `uavlinkd status`" in findings["udp_blocked"].remedy
+        member.parts.fleet = object()
+        (found,) = silent_relays(Moment(member.parts, LATER), list(member.relays.values()))
+        assert "there, or a member of its fleet" in found.remedy
 
 
 def test_two_addresses_of_one_relay_may_be_one_machine(member: Member) -> None:

@@ -118,6 +118,23 @@ async def test_file_in_place_of_the_socket_is_kept(path: Path) -> None:
     assert path.read_text() == "precious"
 
 
+async def test_fault_in_the_daemon_is_logged_and_answered(path: Path) -> None:
+    """The client learns that the daemon has the reason, also of an error of the system."""
+    logged: list[object] = []
+    asyncio.get_running_loop().set_exception_handler(lambda _, context: logged.append(context["exception"]))
+
+    async def answer(request: str) -> control.Answer:
+        raise {"reload": KeyError("drone1"), "status": OSError(5, "Input/output error")}[request]
+
+    server = ControlServer(path, answer)
+    await server.start()
+    for request, name in (("reload", "KeyError"), ("status", "OSError")):
+        with pytest.raises(ControlError, match=rf"fault in the daemon \({name}\), which its log has"):
+            await asyncio.to_thread(ask, path, request)
+    assert [type(error) for error in logged] == [KeyError, OSError]
+    await server.stop()
+
+
 async def test_answer_may_take_long(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With `on_waiting`, neither side times out, and the client is called after each wait."""
     monkeypatch.setattr(control, "REQUEST_TIMEOUT_S", 0.05)

@@ -131,12 +131,15 @@ def _here(peer: PeerFacts, relays: Sequence[_RelayProblem]) -> Iterator[Found]:
 
 
 def _at_relays(peer: PeerFacts, relays: Sequence[_RelayProblem]) -> Iterator[Found]:
+    is_certified = peer.link.config.settings.is_certified
     for name in (relay.config.name for problem, relay in relays if problem == "not_bound"):
         yield fault(
             "not_bound",
             f"{peer.name} is not bound at the relay {name}: it is off, cannot reach the relay (UDP blocked there), is"
             " not a member, does not use it, or keys differ",
-            f"start {peer.name}; compare both public_key with `uavlinkd pubkey`; write a [[relay]] for {name}"
+            f"start {peer.name}; `uavlinkd status` there and at the relay names the cause"
+            if is_certified
+            else f"start {peer.name}; compare both public_key with `uavlinkd pubkey`; write a [[relay]] for {name}"
             " into its file, and a [[member]] for it into the file of the relay",
         )
     yield from silent_relays(peer.moment, [relay for problem, relay in relays if problem == "relay_not_answering"])
@@ -146,22 +149,22 @@ def silent_relays(
     moment: Moment, relays: Sequence[RelayLink], fault_or_warning: Callable[..., Found] = fault
 ) -> Iterator[Found]:
     """What the silence of these relays means, by what else answers."""
+    admitted = "a [[member]] there"
+    if moment.daemon.fleet is not None:
+        admitted += ", or a member of its fleet that is not revoked"
     if relays and moment.is_udp_blocked:
         names = [relay.config.name for relay in moment.silent_relays]
         yield fault_or_warning(
             "udp_blocked",
             f"UDP is probably blocked here: none of {len(names)} relays on different hosts answers ({listed(names)})",
             "try another network, or let UDP to the ports of the relays, and back, through the firewalls here."
-            f" {IS_REACHABLE.format(min(hosts_of(relays[0])))}. If this daemon is new to the relays, it must be a"
-            " [[member]] there: `uavlinkd status` there shows what arrives",
+            f" {IS_REACHABLE.format(min(hosts_of(relays[0])))}. If this daemon is new to a relay, it must be"
+            f" {admitted}: `uavlinkd status` there shows what arrives",
         )
         return
     for relay in relays:
         name, hosts = relay.config.name, hosts_of(relay)
         text = f"the relay {name} does not answer at {listed(map(str, relay.config.addresses))}: "
-        admitted = "a [[member]] there"
-        if moment.daemon.fleet is not None:
-            admitted += ", or a member of its fleet that is not revoked"
         remedy = (
             f"{_ASK_THERE.format(name)}; else open its firewall. `uavlinkd pubkey` there must print the public_key of"
             f" the [[relay]] here, and this daemon must be {admitted}"

@@ -147,12 +147,18 @@ def _about_systems(part: PartFacts, systems: Mapping[int, int], which: str) -> t
     """The text and the remedy."""
     allowed = part.rules.get("system_ids")
     ids = listed(map(str, allowed)) if isinstance(allowed, list | tuple) else str(allowed)
-    text = f"{which} of system {listed(map(str, sorted(systems)), 8)}; its system_ids here are {ids}"
+    is_certified = isinstance(part, PeerFacts) and part.link.config.settings.is_certified
+    where = "in its certificate" if is_certified else "here"
+    text = f"{which} of system {listed(map(str, sorted(systems)), 8)}; its system_ids {where} are {ids}"
     own = f"set {SYSTEM_ID} of its autopilot to {ids}"
     if owned := _owned(part, systems):  # never advise to trust one peer as another
         whose = listed(f"{system} is {owner}'s" for system, owner in owned.items())
         return text, f"{own}: {whose}"
-    return text, f"{own}; or, only if you know that {part.owner} has this id, write it into its system_ids"
+    remedy = "write it into its system_ids"
+    if is_certified:
+        command = f"uavlinkd fleet sign --replace {part.name} --id {min(systems)}"
+        remedy = f"pass the line of `uavlinkd enroll {part.name}` there to `{command}`, then finish and publish"
+    return text, f"{own}; or, only if you know that {part.owner} has this id, {remedy}"
 
 
 def _owned(part: PartFacts, systems: Iterable[int]) -> dict[int, str]:

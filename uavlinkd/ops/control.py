@@ -20,6 +20,10 @@ from uavlinkd.system.terminal import CommandError
 MAX_REQUEST_BYTES = 8192
 """Enough for the attacks of a man in the middle with all their parameters."""
 UNKNOWN = "unknown request"
+FAILED_INSIDE = (
+    "it failed because of a fault in the daemon ({}), which its log has: restart the daemon, and send what"
+    " `uavlinkd report` writes to the developers"
+)
 REQUEST_TIMEOUT_S = 5.0
 """Limit for sending the request, and for reading the answer. Making the answer has no limit."""
 MAX_CONNECTIONS = 8
@@ -98,9 +102,14 @@ class ControlServer:
             writer.close()
 
     async def _respond(self, line: bytes) -> dict[str, object]:
-        answer = self._answer(line.decode("utf-8", "replace").strip())
-        if isinstance(answer, Awaitable):
-            answer = await answer
+        try:
+            answer = self._answer(line.decode("utf-8", "replace").strip())
+            if isinstance(answer, Awaitable):
+                answer = await answer
+        except Exception as error:  # a fault of the daemon, whose links go on
+            context = {"message": f"a request on the control socket failed: {error!r}", "exception": error}
+            asyncio.get_running_loop().call_exception_handler(context)
+            return {"error": FAILED_INSIDE.format(type(error).__name__)}
         return {"error": UNKNOWN} if answer is None else answer
 
 

@@ -101,15 +101,17 @@ ONE_HOST = (
 BLOCKED = (
     "No UDP comes back from any of these hosts, so something near this machine probably drops it. Try another"
     " network, or let UDP to the ports of the relays, and back, through the firewalls here. If this daemon is new to"
-    " the relays, it must be a [[member]] there: `uavlinkd status` there shows what arrives"
+    " the relays, it must be a [[member]] there, or of their fleet and not revoked: `uavlinkd status` there shows"
+    " what arrives"
 )
 NO_RELAY = (
-    "No relay answers: it is off, a firewall drops UDP here or there, or this daemon is not its [[member]]. Compare"
-    " addresses and public_key. `uavlinkd status` here and there names the cause"
+    "No relay answers: it is off, a firewall drops UDP here or there, or this daemon is neither its [[member]] nor of"
+    " its fleet. Compare addresses and public_key. `uavlinkd status` here and there names the cause"
 )
 ONE_RELAY = (
     "UDP gets out, so the cause is at the silent relay or close to it: it is off, its address or public_key is wrong,"
-    " it has no [[member]] for this daemon, or a firewall there drops UDP. `uavlinkd status` there names the cause"
+    " it has no [[member]] for this daemon, which is not of its fleet or revoked, or a firewall there drops UDP."
+    " `uavlinkd status` there names the cause"
 )
 ONE_PORT = (
     "The same host answers at another port: let UDP to the silent port through the firewalls here and there, or"
