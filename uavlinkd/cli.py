@@ -33,8 +33,6 @@ _NOT_A_RELAY = (
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command and return its exit status."""
-
     def command() -> int:
         options = make_parser().parse_args(arguments)
         return int(options.command(options))

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from uavlinkd.config import Config, ConfigError, keys
+from uavlinkd.config import keys
 from uavlinkd.config.load import load_config
+from uavlinkd.config.model import Config, ConfigError
 
 KEY = {
     name: keys.public_key_text(b64encode(bytes((number,)) * 32).decode())

@@ -23,8 +23,9 @@ from tests.config.files import (
     relay,
     relays,
 )
-from uavlinkd.config import ConfigError, keys
+from uavlinkd.config import keys
 from uavlinkd.config.changes import compare
+from uavlinkd.config.model import ConfigError
 
 _AT = 'addresses = ["10.13.0.9:5790"]'
 _AS_PEER = relay(key=KEY["drone1"], addresses="[]")

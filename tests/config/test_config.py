@@ -31,8 +31,9 @@ from tests.config.files import (
     relays,
 )
 from tests.samples import heartbeat
-from uavlinkd.config import ConfigError, NetworkConfig, PeerAddress, Recording, keys
+from uavlinkd.config import keys
 from uavlinkd.config.load import load_config
+from uavlinkd.config.model import ConfigError, NetworkConfig, PeerAddress, Recording
 from uavlinkd.config.network_rules import used_networks
 from uavlinkd.core import constants as c
 from uavlinkd.core.settings import Link, Redundancy, Timers

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from uavlinkd.config import Config, keys
+from uavlinkd.config import keys
 from uavlinkd.config.load import load_config
+from uavlinkd.config.model import Config
 from uavlinkd.config.schema import (
     EndpointSection,
     LinkSection,

@@ -20,10 +20,9 @@ from tests.config.fleets import (
     load_member,
     member_file,
 )
-from uavlinkd.config import ConfigError
 from uavlinkd.config.changes import compare
 from uavlinkd.config.members import member_peer, relay_member
-from uavlinkd.config.model import FleetConfig, PeerAddress
+from uavlinkd.config.model import ConfigError, FleetConfig, PeerAddress
 from uavlinkd.core import constants as c
 from uavlinkd.core.certificates import Certificate, MemberRole
 from uavlinkd.core.settings import Link
@@ -184,12 +183,16 @@ _FOREIGN = certificate(name="x", ids=(8, 8), signer=OTHER_SIGNER)
 _ROLE = '[[fleet_role]]\nname = "operator"\n'
 _AUTHORITY = to_base64(authority())
 _ROWS = [
-    (fleet().replace(_AUTHORITY, to_base64(b"\xec" + b"\xff" * 30 + b"\x7f")), "fleet.authority", "small order"),
+    (
+        fleet().replace(_AUTHORITY, to_base64(b"\xec" + b"\xff" * 30 + b"\x7f")),
+        "fleet.authority",
+        "is not the public key",
+    ),
     (fleet().replace(_AUTHORITY, OWN[:-5]), "fleet.authority", "cut"),
     (
         fleet().replace(_AUTHORITY, "AAAA"),
         "fleet.authority",
-        "not a public key of Ed25519: run `uavlinkd enroll --finish` again",
+        "not the public key of an authority, or was cut: run `uavlinkd enroll --finish` again",
     ),
     (fleet(_ANY), "fleet.certificate", "not a certificate"),
     (fleet(more='successor = "AAAA"'), "fleet.successor", "32 bytes"),

@@ -31,8 +31,9 @@ from tests.config.files import (
     relay,
     relays,
 )
-from uavlinkd.config import ConfigError, keys
+from uavlinkd.config import keys
 from uavlinkd.config.load import load_config
+from uavlinkd.config.model import ConfigError
 
 # Lines of a peer, the key of the problem, and a part of its message.
 _PEER_ROWS = [

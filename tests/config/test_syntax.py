@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from uavlinkd.config import ConfigError, keys
+from uavlinkd.config import keys
 from uavlinkd.config.load import load_config
+from uavlinkd.config.model import ConfigError
 
 # The text of the file -> line, key and a part of the message.
 _ERRORS = [

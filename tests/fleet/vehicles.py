@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from tests.waiting import until
-from uavlinkd.config import Config
 from uavlinkd.config.load import load_config
+from uavlinkd.config.model import Config
 from uavlinkd.core.certificates import MemberRole
 from uavlinkd.core.crypto import Secret
 from uavlinkd.fleet import operations

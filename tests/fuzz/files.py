@@ -12,9 +12,9 @@ from typing import Final
 
 from tests.fuzz.engine import Run, Script
 from uavlinkd.authority import enrolment
-from uavlinkd.config import Config, ConfigError
 from uavlinkd.config.keys import KeyFileError, decode_key, encode_key, read_secret_file
 from uavlinkd.config.load import load_config
+from uavlinkd.config.model import Config, ConfigError
 from uavlinkd.core import wire
 from uavlinkd.core.crypto import sha256
 from uavlinkd.core.suites import SUITES

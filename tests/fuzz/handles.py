@@ -14,7 +14,7 @@ from tests.core.harness import AT_A, ELSEWHERE, KEY_A, KEY_C, quiet
 from tests.fuzz.engine import Run, Script, play
 from tests.fuzz.insiders import Insider
 from tests.fuzz.stages import NOW, SeededEntropy, copier, pair_of
-from uavlinkd.config import PeerAddress, RelayConfig
+from uavlinkd.config.model import PeerAddress, RelayConfig
 from uavlinkd.core import constants as c
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.outputs import Event, Output, RecordReceived

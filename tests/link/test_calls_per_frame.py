@@ -22,8 +22,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from tests.daemon.udp import Client, open_client
 from tests.endpoints.clients import address_of
 from tests.waiting import until
-from uavlinkd.config import Config, EndpointConfig, PeerAddress, PeerConfig
-from uavlinkd.config.model import Log, Routing
+from uavlinkd.config.model import Config, EndpointConfig, Log, PeerAddress, PeerConfig, Routing
 from uavlinkd.core.crypto import KeyPair, Secret
 from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.endpoints.udp import UdpEndpoint

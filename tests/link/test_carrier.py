@@ -14,7 +14,7 @@ from tests.core.harness import AT_A, KEY_A, Pair
 from tests.link.test_peer_link import link_of
 from tests.policies import TRUSTED
 from tests.samples import attitude, command, raws
-from uavlinkd.config import PeerConfig
+from uavlinkd.config.model import PeerConfig
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.outputs import Deliver, Dropped, Output, SessionEstablished

@@ -11,7 +11,7 @@ from structlog import get_logger
 from structlog.testing import capture_logs
 
 from tests.core.harness import Named
-from uavlinkd.config import ConfigError, Problem
+from uavlinkd.config.model import ConfigError, Problem
 from uavlinkd.core.outputs import PeerLost, PeerUp
 from uavlinkd.link import conditions, daemon
 from uavlinkd.link.conditions import (

@@ -16,8 +16,8 @@ from tests.core.harness import PLAIN
 from tests.daemon.frames import command_long, heartbeat
 from tests.link.test_evidence import HOST, OWN_KEY, THERE, Scene
 from tests.test_readmes import ROOT
-from uavlinkd.config import EndpointConfig, PeerConfig
 from uavlinkd.config.keys import encode_key
+from uavlinkd.config.model import EndpointConfig, PeerConfig
 from uavlinkd.core import constants as c
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.outputs import Dropped

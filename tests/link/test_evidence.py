@@ -11,7 +11,7 @@ import pytest
 from tests.core.harness import PLAIN
 from tests.daemon.frames import heartbeat
 from tests.policies import TRUSTED
-from uavlinkd.config import PeerAddress, PeerConfig
+from uavlinkd.config.model import PeerAddress, PeerConfig
 from uavlinkd.core.crypto import Secret
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.node import Node

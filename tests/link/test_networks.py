@@ -13,7 +13,7 @@ from structlog.testing import capture_logs
 
 from tests.link.socket_states import SocketStateLog
 from tests.needs import need
-from uavlinkd.config import NetworkConfig
+from uavlinkd.config.model import NetworkConfig
 from uavlinkd.endpoints.sockets import BindError, Presence, network_socket
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.link import networks as module

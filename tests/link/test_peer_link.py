@@ -28,9 +28,9 @@ from tests.daemon import frames
 from tests.endpoints.clients import PASSES
 from tests.policies import TRUSTED
 from tests.samples import attitude
-from uavlinkd.config import PeerAddress
-from uavlinkd.config import PeerConfig as Peer
 from uavlinkd.config.build import verify_interval_s
+from uavlinkd.config.model import PeerAddress
+from uavlinkd.config.model import PeerConfig as Peer
 from uavlinkd.core import handshake
 from uavlinkd.core.constants import KNOWN_FEATURES, NEVER
 from uavlinkd.core.cookie import MacKeys

@@ -21,7 +21,7 @@ from tests.link.socket_states import SocketStateLog
 from tests.link.test_drop_summary import Recorder
 from tests.needs import need
 from tests.waiting import until
-from uavlinkd.config import NetworkConfig, PeerAddress
+from uavlinkd.config.model import NetworkConfig, PeerAddress
 from uavlinkd.core.path import Path, relayed
 from uavlinkd.core.relay_records import wrap
 from uavlinkd.endpoints.reader import PAUSE_S

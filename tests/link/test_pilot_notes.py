@@ -6,7 +6,7 @@ import pytest
 
 from tests.core.harness import KEY_B, Pair, quiet
 from tests.daemon.frames import command_long
-from uavlinkd.config import PeerConfig
+from uavlinkd.config.model import PeerConfig
 from uavlinkd.core.refusals import RefusalReport, Refused
 from uavlinkd.core.settings import PeerSettings
 from uavlinkd.link.local_endpoints import PilotNotes

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.core.harness import AT_B, ELSEWHERE, KEY_B, KEY_C, Pair, quiet
-from uavlinkd.config import RelayConfig
+from uavlinkd.config.model import RelayConfig
 from uavlinkd.core import constants as c
 from uavlinkd.core import outputs as o
 from uavlinkd.core.drops import DropReason

@@ -11,7 +11,7 @@ import structlog
 
 from tests.endpoints.test_line_framing import report
 from tests.link.socket_states import SocketStateLog
-from uavlinkd.config import NetworkConfig
+from uavlinkd.config.model import NetworkConfig
 from uavlinkd.endpoints.serial_line import SerialLine
 from uavlinkd.endpoints.url import SerialUrl
 from uavlinkd.link.diagnosis import line_problems

@@ -11,7 +11,7 @@ import pytest
 from tests.core.harness import PLAIN
 from tests.link.test_diagnosis import NOW, Daemon
 from tests.link.test_evidence import THERE
-from uavlinkd.config import PeerAddress, RelayConfig
+from uavlinkd.config.model import PeerAddress, RelayConfig
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.outputs import Dropped, PeerClosed
 from uavlinkd.core.path import Path, relayed

@@ -10,7 +10,7 @@ from typing import NamedTuple
 from tests.core.harness import KEY_A, KEY_B, seeded
 from tests.endpoints.clients import PASSES
 from tests.policies import TRUSTED
-from uavlinkd.config import PeerConfig
+from uavlinkd.config.model import PeerConfig
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.crypto import KeyPair, Secret
 from uavlinkd.core.node import Node

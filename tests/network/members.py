@@ -20,8 +20,8 @@ from tests.network.air import Address, Endpoint
 from tests.network.drone import Drone
 from tests.network.network import Network
 from uavlinkd.authority.trust import Trust
-from uavlinkd.config import PeerAddress, PeerConfig, RelayConfig
 from uavlinkd.config.build import TIMERS
+from uavlinkd.config.model import PeerAddress, PeerConfig, RelayConfig
 from uavlinkd.core import constants as c
 from uavlinkd.core import outputs as o
 from uavlinkd.core.crypto import Entropy

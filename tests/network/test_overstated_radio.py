@@ -19,7 +19,7 @@ import structlog
 
 from tests.link.two_radios import End, Network, Radio
 from tests.network.test_slow_radio import Offered, attitudes, heartbeats, up_within
-from uavlinkd.config import NetworkConfig
+from uavlinkd.config.model import NetworkConfig
 from uavlinkd.config.network_rules import SENDING_SHARE
 from uavlinkd.core.path import Path
 from uavlinkd.endpoints import serial_line

@@ -20,7 +20,7 @@ from structlog.testing import LogCapture
 
 from tests.network.network import Drone, Network
 from tests.policies import TRUSTED
-from uavlinkd.config import PeerConfig
+from uavlinkd.config.model import PeerConfig
 from uavlinkd.core.outputs import Deliver, Dropped, Output, RecordReceived, Transmit
 from uavlinkd.lab.mitm.radio import RadioSettings
 from uavlinkd.link.conditions import HOUR_S, LineLimits

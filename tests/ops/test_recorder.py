@@ -16,7 +16,7 @@ from structlog.typing import FilteringBoundLogger
 
 from tests.daemon.frames import frame
 from tests.waiting import until
-from uavlinkd.config import Recording
+from uavlinkd.config.model import Recording
 from uavlinkd.lab.sim.tlog import read_tlog
 from uavlinkd.ops.recorder import CLOCK_STEP_S, FROM_PEER, MAX_BUFFERED_BYTES, RETRY_S, TO_PEER, Recorder
 from uavlinkd.ops.tlog_files import TlogFolder

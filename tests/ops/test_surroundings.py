@@ -15,7 +15,7 @@ import pytest
 from tests.config.files import ADDRESSES, ENDPOINT, PEER, TOP, URL, load
 from tests.needs import need
 from uavlinkd.cli import main
-from uavlinkd.config import Config
+from uavlinkd.config.model import Config
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.ops import surroundings
 

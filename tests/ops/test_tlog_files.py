@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.daemon.frames import frame
-from uavlinkd.config import Recording
+from uavlinkd.config.model import Recording
 from uavlinkd.lab.sim.tlog import read_tlog
 from uavlinkd.ops import tlog_files
 from uavlinkd.ops.tlog_files import SYNC_INTERVAL_S, TlogFolder

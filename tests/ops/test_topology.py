@@ -12,7 +12,8 @@ from rich.console import Console
 
 from tests.config.files import load
 from tests.config.fleets import bulletin, certificate, contact, fleet, load_member, member_file
-from uavlinkd.config import Config, keys
+from uavlinkd.config import keys
+from uavlinkd.config.model import Config
 from uavlinkd.core.certificates import MemberRole
 from uavlinkd.mavlink import dialect
 from uavlinkd.mavlink.policy.compilation import Policy

@@ -66,7 +66,6 @@ class Request(NamedTuple):
     public_key: bytes
 
     def line(self) -> str:
-        """The line, without its end."""
         key = to_base64(self.public_key)
         check = _eight_characters(f"{WORD} {self.name} {key}".encode())
         return f"{WORD} {self.name} {key} {check}"
@@ -109,7 +108,6 @@ class Contact(NamedTuple):
     relays: bool
 
     def encode(self) -> bytes:
-        """Its bytes in a reply."""
         return _CONTACT.pack(self.public_key, self.certificate, self.relays) + _encoded(self.addresses)
 
 
@@ -135,7 +133,6 @@ class Reply(NamedTuple):
     contacts: tuple[Contact, ...]
 
     def line(self) -> str:
-        """The line, without its end."""
         head = (VERSION, self.suite.number, role_bits(self.calls), self.relays, self.authority, self.successor)
         data = _HEAD.pack(*head, self.certificate, len(self.bulletin)) + self.bulletin + _encoded(self.addresses)
         data += bytes([len(self.contacts)]) + b"".join(contact.encode() for contact in self.contacts)

@@ -80,7 +80,6 @@ class Trust:
             raise ValueError("is not a bulletin of this fleet")
         self.bulletin, self.bulletin_bytes = parsed, bulletin
         self.own: HeldCertificate | None = None
-        """The own certificate."""
         self.held: dict[bytes, HeldCertificate] = {}
         """By static public key, without the own one."""
         self._claims: dict[str | int, bytes] = {}
@@ -91,7 +90,6 @@ class Trust:
 
     @property
     def digest(self) -> bytes:
-        """Of the bulletin."""
         return digest_of(self.bulletin_bytes)
 
     def replace_own(self, data: bytes) -> bool:
@@ -238,5 +236,4 @@ def _label(certificate: Certificate) -> str:
 
 
 def is_same_member(one: Certificate, other: Certificate) -> bool:
-    """Whether two certificates are of the same member."""
     return one._replace(serial=0) == other._replace(serial=0)

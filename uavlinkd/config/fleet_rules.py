@@ -12,7 +12,7 @@ from uavlinkd.config.build import fleet_policies, member_role, policy_data
 from uavlinkd.config.model import PolicyData
 from uavlinkd.config.problems import Found, Sections, Values, role_of, unique
 from uavlinkd.config.relay_rules import over_ip
-from uavlinkd.config.signed import ENROLL_AGAIN
+from uavlinkd.config.schema import ENROLL_AGAIN
 from uavlinkd.core.certificates import MemberRole, fleet_id_of, is_certified, verified_bulletin
 from uavlinkd.core.crypto import AuthorityKey
 from uavlinkd.mavlink.policy.settings import PolicyError, read_settings

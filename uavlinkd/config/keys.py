@@ -67,7 +67,6 @@ def public_key_text(private_text: str) -> str:
 
 
 def encode_key(key: bytes) -> str:
-    """32 bytes in base64."""
     return to_base64(key)
 
 

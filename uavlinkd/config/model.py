@@ -145,7 +145,6 @@ class PeerConfig:
         return bool(self.addresses or self.relays)
 
     def make_policy(self) -> Policy:
-        """A new policy: its counters at zero, its rates unused."""
         return Policy(self.policy)
 
 
@@ -158,7 +157,6 @@ class RelayServer:
 
     @property
     def by_key(self) -> dict[bytes, MemberSettings]:
-        """The members by public key."""
         return {member.peer.public_key: member for member in self.members}
 
 
@@ -216,7 +214,6 @@ class FleetConfig:
     member_limits: RelayLimits
 
     def contact(self, key: bytes) -> ContactConfig | None:
-        """The contact with this static public key."""
         return next((contact for contact in self.contacts if contact.key == key), None)
 
     @property
@@ -284,7 +281,6 @@ class Config:
 
     @property
     def keys_of_others(self) -> set[bytes]:
-        """The keys of the peers and relays."""
         others: tuple[PeerConfig | RelayConfig, ...] = (*self.peers, *self.relays)
         return {one.settings.public_key for one in others}
 

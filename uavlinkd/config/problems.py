@@ -38,7 +38,6 @@ class Values(NamedTuple):
         return self.section.partition("[")[0]
 
     def get(self, key: str, default: Any = None) -> Any:
-        """The valid value of a key, else the default."""
         return self.valid.get(key, default)
 
     def at(self, key: str = "") -> str:
@@ -81,12 +80,10 @@ class Sections:
 
     @property
     def others(self) -> list[Values]:
-        """The sections with public keys."""
         return [*self.peers, *self.members, *self.relays, *self.contacts]
 
     @property
     def has_fleet(self) -> bool:
-        """Whether the file has ``[fleet]``."""
         return "fleet" in self.written
 
     @property
@@ -117,7 +114,6 @@ class Sections:
 
     @property
     def own_key(self) -> bytes | None:
-        """This daemon's public key."""
         secret = self.secret(self.top, "private_key_file")
         return None if secret is None else x25519_public_key(secret.reveal())
 
@@ -148,11 +144,9 @@ class Problems:
         self._found: list[Problem] = []
 
     def add(self, key: str, message: str) -> None:
-        """Add one problem."""
         self._found.append(Problem(self._file, key, message))
 
     def raise_any(self) -> None:
-        """Raise ConfigError if there is a problem."""
         if self._found:
             raise ConfigError(tuple(self._found))
 
@@ -259,18 +253,16 @@ _OTHERS_CALL_IT: dict[type[schema.Section], dict[str, str]] = {
 """Names that WireGuard and common usage have for keys of any section or of one, where the most similar is another."""
 
 
-REMOVED = dict.fromkeys(
-    ("previous_public_key", "previous_private_key_file"),
+_REMOVED = (
     "was removed: to change a key, write the new public key into the other ends' files, restart the daemon whose key"
-    " it is, and reload the others at the same time; in a fleet, `uavlinkd fleet rotate NAME` writes the files",
+    " it is, and reload the others at the same time; in a fleet, `uavlinkd fleet rotate NAME` writes the files"
 )
-"""Keys that files of earlier versions may have, and what to do instead."""
 
 
 def unknown_key(key: str, model: type[schema.Section]) -> str:
     """What to write for a key that the section does not have."""
-    if key in REMOVED:
-        return REMOVED[key]
+    if key in ("previous_public_key", "previous_private_key_file"):  # files of earlier versions may have them
+        return _REMOVED
     plain = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|[ -]", "_", key).lower()
     for section in (model, schema.Section):
         if remedy := _OTHERS_CALL_IT.get(section, {}).get(plain):

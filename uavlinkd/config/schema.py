@@ -7,6 +7,8 @@ values are in :mod:`uavlinkd.config.checks`.
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
+from contextlib import suppress
 from ipaddress import IPv4Address, IPv6Address, ip_address
 from typing import Annotated, Any, Literal
 
@@ -21,22 +23,25 @@ from pydantic import (
 )
 
 from uavlinkd.authority.trust import HeldCertificate
-from uavlinkd.config import signed
 from uavlinkd.config.keys import decode_key, is_canonical_public_key
 from uavlinkd.config.model import SERIAL, PeerAddress
 from uavlinkd.core import constants as c
-from uavlinkd.core.certificates import LAST_SERIAL
+from uavlinkd.core.certificates import LAST_SERIAL, parse_bulletin, parse_certificate
+from uavlinkd.core.certificates import NAME as MEMBER_NAME
 from uavlinkd.core.crypto import AuthorityKey, is_usable_public_key
+from uavlinkd.core.drops import Drop
 from uavlinkd.core.suites import SUITES_BY_NAME, X25519, Suite
 from uavlinkd.endpoints.url import EndpointUrl, SerialUrl, parse_line, parse_url
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.system.addresses import Address, AddressError, parse_address
+from uavlinkd.system.base64_text import from_base64
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
 _INTERFACE = re.compile(r"[^\s/:]{1,15}")  # as dev_valid_name() of Linux
 # A complete or nearly complete key in base64 or hex: no message repeats it.
 _LIKE_A_KEY = re.compile(r"[A-Za-z0-9+/_-]{40,}={0,2}")
 _SMALL_GROUP = re.compile(r"(?:modp|ffdhe?|dhe?)?[-_ ]?(?:512|768|1024)")
+ENROLL_AGAIN = "run `uavlinkd enroll --finish` again with the line of `uavlinkd fleet sign`"
 LEAST_BUDGET = 1000
 _LEAST_AIR = 1000
 _EGRESS = EgressSettings()
@@ -170,6 +175,25 @@ def _own_address(value: Any) -> str:
     return str(ip)
 
 
+def _member_name(value: Any) -> str:
+    if not MEMBER_NAME.fullmatch(_text(value)):
+        raise ValueError("is not the name of a member: names have 1 to 21 of a-z, 0-9 and -")
+    return str(value)
+
+
+def _signed(parse: Callable[[bytes], object], what: str) -> PlainValidator:
+    """A value of the line that an authority prints, in base64. Its signature: :mod:`uavlinkd.config.fleet_rules`."""
+
+    def check(value: Any) -> object:
+        text = _text(value)
+        with suppress(ValueError, Drop):
+            if (parsed := parse(from_base64(text))) is not None:
+                return parsed
+        raise ValueError(f"is not {what}, or was cut: {ENROLL_AGAIN}")
+
+    return PlainValidator(check)
+
+
 Name = Annotated[str, PlainValidator(_name)]
 FileName = Annotated[str, PlainValidator(_file_name)]
 PublicKey = Annotated[bytes, PlainValidator(_public_key)]
@@ -181,11 +205,13 @@ OwnAddress = Annotated[str, PlainValidator(_own_address)]
 SerialLine = Annotated[SerialUrl, PlainValidator(lambda value: parse_line(_text(value)))]
 Url = Annotated[EndpointUrl, PlainValidator(lambda value: parse_url(_text(value)))]
 Budget = Annotated[int, AfterValidator(_budget)]
-Authority = Annotated[AuthorityKey, PlainValidator(lambda value: signed.authority(_text(value)))]
-KeyHash = Annotated[bytes, PlainValidator(lambda value: signed.key_hash(_text(value)))]
-SignedCertificate = Annotated[HeldCertificate, PlainValidator(lambda value: signed.certificate(_text(value)))]
-SignedBulletin = Annotated[bytes, PlainValidator(lambda value: signed.bulletin(_text(value)))]
-MemberName = Annotated[str, PlainValidator(lambda value: signed.member_name(_text(value)))]
+Authority = Annotated[AuthorityKey, _signed(AuthorityKey, "the public key of an authority")]
+KeyHash = Annotated[bytes, _signed(lambda data: data if len(data) == c.KEY_BYTES else None, "a hash of 32 bytes")]
+SignedCertificate = Annotated[
+    HeldCertificate, _signed(lambda data: HeldCertificate(parse_certificate(data), data), "a certificate")
+]
+SignedBulletin = Annotated[bytes, _signed(lambda data: data if parse_bulletin(data) else None, "a bulletin")]
+MemberName = Annotated[str, PlainValidator(_member_name)]
 FrameRole = Literal["vehicle", "operator", "observer"]
 
 
@@ -347,28 +373,20 @@ class EndpointSection(PolicySection):
 
 
 class RoutingSection(Section):
-    """``[routing]``."""
-
     relay: bool = False
 
 
 class MetricsSection(Section):
-    """``[metrics]``."""
-
     listen: ListenAddress | None = Field(default=None, examples=['"127.0.0.1:9790"'])
 
 
 class RecordingSection(Section):
-    """``[recording]``."""
-
     folder: FileName | None = Field(default=None, examples=['"recordings"'])
     max_files: int = Field(default=100, ge=2, le=100_000)
     min_free_bytes: int = Field(default=1_000_000_000, ge=100_000, le=10**15, examples=["1_000_000_000"])
 
 
 class LogSection(Section):
-    """``[log]``."""
-
     level: Literal["debug", "info", "warning", "error"] = "info"
     format: Literal["auto", "console", "json"] = "auto"
 

@@ -297,7 +297,6 @@ def _look_for_address(host: str) -> Presence:
 
 
 def family_of(host: str) -> socket.AddressFamily:
-    """The address family of a numeric host."""
     return socket.AF_INET6 if ":" in host else socket.AF_INET
 
 

@@ -59,8 +59,6 @@ def tcp_listener(address: Address) -> socket.socket:
 
 
 class SocketChannel:
-    """A connected TCP socket."""
-
     def __init__(self, sock: socket.socket) -> None:
         self._sock = sock
         self.fileno = sock.fileno

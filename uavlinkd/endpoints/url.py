@@ -62,8 +62,6 @@ class NetworkUrl:
 
 @dataclass(frozen=True, slots=True)
 class SerialUrl:
-    """An endpoint on a serial port."""
-
     device: str
     baud: int
 

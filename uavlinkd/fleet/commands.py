@@ -11,7 +11,6 @@ _ROLES = ("vehicle", "operator", "observer", "relay")
 
 
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the commands ``enroll`` and ``fleet``."""
     _add_enroll(commands)
     fleet = commands.add_parser(
         "fleet",

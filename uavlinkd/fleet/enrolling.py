@@ -41,7 +41,6 @@ class MemberFiles:
     keys: Path | None = None
 
     def key(self, name: str) -> Path:
-        """The path of a key file."""
         return (self.keys or self.config.parent) / name
 
     def environ(self) -> dict[str, str]:

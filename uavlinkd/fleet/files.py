@@ -27,12 +27,10 @@ Table = dict[str, Any]
 
 
 def config_file(name: str) -> str:
-    """The name of a member's configuration file."""
     return f"{name}.toml"
 
 
 def key_file(name: str) -> str:
-    """The name of its private key file."""
     return f"{name}.key"
 
 

@@ -50,7 +50,6 @@ class FleetFileError(FleetError):
 
 
 def no_fleet(folder: Path) -> FleetError:
-    """The error for a folder without a manifest."""
     return FleetError(
         f"{folder} contains no fleet: name its folder with --out DIR,"
         f" or create one with `uavlinkd fleet init --out {folder}`"
@@ -92,12 +91,10 @@ class Member:
 
     @property
     def name(self) -> str:
-        """As in its certificate."""
         return self.certificate.name
 
     @property
     def role(self) -> MemberRole:
-        """As in its certificate."""
         return self.certificate.role
 
     @property
@@ -139,7 +136,6 @@ class Fleet:
     members: tuple[Member, ...] = ()
 
     def is_revoked(self, member: Member) -> bool:
-        """Whether the bulletin refuses its certificate."""
         return self.bulletin.refuses(member.certificate.serial)
 
     @property
@@ -176,7 +172,6 @@ class Fleet:
 
 
 def write_manifest(fleet: Fleet) -> str:
-    """The text of a manifest."""
     facts = {
         "authority": to_base64(fleet.authority.public),
         "successor": to_base64(fleet.successor),
@@ -217,7 +212,6 @@ def toml_lines(values: Mapping[str, object]) -> list[str]:
 
 
 def read_manifest(folder: Path) -> Fleet:
-    """Read the manifest in a folder."""
     path = folder / FILE_NAME
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -268,7 +262,6 @@ def _member(section: dict[str, Any], authority: AuthorityKey) -> Member:
 
 
 def check_settings(settings: FleetSettings) -> None:
-    """Check the values of all settings."""
     for setting in fields(FleetSettings):
         if not isinstance(getattr(settings, setting.name), bool if setting.name == "swarm" else str):
             raise FleetError(f"{setting.name} has a value of the wrong type")

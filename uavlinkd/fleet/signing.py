@@ -49,7 +49,6 @@ class Identity(NamedTuple):
 
 
 def new_fleet(signer: SigningKey, successor: bytes, settings: FleetSettings) -> Fleet:
-    """A fleet without members."""
     bulletin = Bulletin(fleet_id_of(signer.public), 1, 1, ())
     signed = _published(signer, bulletin)
     return Fleet(AuthorityKey(signer.public), successor, bulletin, signed, settings=settings)

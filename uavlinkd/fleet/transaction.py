@@ -8,8 +8,9 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from uavlinkd.config import ConfigError, keys
+from uavlinkd.config import keys
 from uavlinkd.config.load import load_config
+from uavlinkd.config.model import ConfigError
 from uavlinkd.fleet.manifest import FleetError, FleetFileError, no_fleet
 from uavlinkd.system.folders import sync_folder
 from uavlinkd.system.terminal import printable
@@ -44,13 +45,11 @@ class FileChanges:
         sync_folder(path.parent)
 
     def write_secret(self, path: Path, text: str) -> None:
-        """Write a key to a new file."""
         self._make_folder(path.parent)
         keys.write_secret_file(path, text)
         self._steps.append((path, None))
 
     def delete(self, path: Path) -> None:
-        """Delete a file, if there is one."""
         self._keep(path)
         path.unlink(missing_ok=True)
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 import structlog
 
-from uavlinkd.config import Config, ConfigError, Problem
 from uavlinkd.config.changes import compare
 from uavlinkd.config.load import load_in_thread
+from uavlinkd.config.model import Config, ConfigError, Problem
 from uavlinkd.core.path import Path
 from uavlinkd.endpoints.sockets import BindError
 from uavlinkd.link.carrier import FrameCarrier

@@ -8,8 +8,8 @@ from ipaddress import ip_address
 from itertools import combinations
 from typing import Final, NamedTuple
 
-from uavlinkd.config import EndpointConfig
 from uavlinkd.config.keys import encode_key
+from uavlinkd.config.model import EndpointConfig
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.path import Path, SocketAddress, relay_name
 from uavlinkd.endpoints.ports import Endpoint

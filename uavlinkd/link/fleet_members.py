@@ -23,9 +23,8 @@ from uavlinkd.authority.exchange import BulletinExchange, Reaction
 from uavlinkd.authority.places import longest_down
 from uavlinkd.authority.state_file import FleetState
 from uavlinkd.authority.trust import BulletinVerdict, Pinned, Trust
-from uavlinkd.config import Config, PeerConfig
 from uavlinkd.config.members import member_peer, relay_member
-from uavlinkd.config.model import FleetConfig
+from uavlinkd.config.model import Config, FleetConfig, PeerConfig
 from uavlinkd.config.relay_rules import MOST_MEMBERS
 from uavlinkd.core import constants as c
 from uavlinkd.core import outputs as o

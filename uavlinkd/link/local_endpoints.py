@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Sequence
 from typing import Final, NamedTuple
 
-from uavlinkd.config import EndpointConfig
+from uavlinkd.config.model import EndpointConfig
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.refusals import Refused
 from uavlinkd.core.settings import Class

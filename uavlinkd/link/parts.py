@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 
 from structlog.typing import FilteringBoundLogger
 
-from uavlinkd.config import Config
+from uavlinkd.config.model import Config
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import LinkedPeer, Output
 from uavlinkd.core.settings import PeerSettings

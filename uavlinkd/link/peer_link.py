@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import itemgetter, sub
 
-from uavlinkd.config import PeerConfig
+from uavlinkd.config.model import PeerConfig
 from uavlinkd.core.constants import CONFIGURED_PATHS, LOSS_WINDOW_S, NEVER
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Output, Transmit

@@ -9,7 +9,7 @@ from typing import Final
 
 from structlog.typing import FilteringBoundLogger
 
-from uavlinkd.config import PeerAddress
+from uavlinkd.config.model import PeerAddress
 from uavlinkd.core.path import Path
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.relay_link import RelayLink

@@ -13,7 +13,7 @@ from typing import Final
 
 from structlog.typing import FilteringBoundLogger
 
-from uavlinkd.config import NetworkConfig, PeerAddress
+from uavlinkd.config.model import NetworkConfig, PeerAddress
 from uavlinkd.core.node import Node
 from uavlinkd.core.path import Path, SocketAddress, relay_name
 from uavlinkd.endpoints.ports import failure_name

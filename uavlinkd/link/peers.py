@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from uavlinkd.config import Config, PeerConfig, RelayConfig
 from uavlinkd.config.changes import ConfigChanges
+from uavlinkd.config.model import Config, PeerConfig, RelayConfig
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.settings import PeerSettings
 from uavlinkd.link.fleet_members import FleetMembers, FleetShell

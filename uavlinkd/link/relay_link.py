@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
-from uavlinkd.config import RelayConfig
+from uavlinkd.config.model import RelayConfig
 from uavlinkd.core import constants as c
 from uavlinkd.core import outputs as o
 from uavlinkd.core.constants import NEVER

@@ -11,7 +11,7 @@ from typing import Final
 
 from structlog.typing import FilteringBoundLogger
 
-from uavlinkd.config import RelayConfig
+from uavlinkd.config.model import RelayConfig
 from uavlinkd.core import constants as c
 from uavlinkd.core import outputs as o
 from uavlinkd.core.constants import NEVER

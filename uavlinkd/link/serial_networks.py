@@ -14,7 +14,7 @@ from typing import Final
 
 from structlog.typing import FilteringBoundLogger
 
-from uavlinkd.config import NetworkConfig
+from uavlinkd.config.model import NetworkConfig
 from uavlinkd.core.constants import LINE_BYTES
 from uavlinkd.core.node import Node
 from uavlinkd.core.path import SERIAL_HOST, Path, SocketAddress

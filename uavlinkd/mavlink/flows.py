@@ -18,7 +18,6 @@ from uavlinkd.mavlink.dialect import Lane
 from uavlinkd.mavlink.frames import MAVLINK2, Frame
 
 FlowKey = tuple[int | bytes, ...]
-"""The key that all frames of one flow share."""
 
 COMMANDS: Final = -1
 """In place of the message id in the flow of commands and answers."""
@@ -29,7 +28,6 @@ forgets its own only."""
 
 
 def flow_key(frame: Frame) -> FlowKey:
-    """The key that all frames of this frame's flow share."""
     raw, header = frame
     kind = header.kind
     if not kind.is_state:

@@ -73,8 +73,6 @@ class FrameFault(Reason):
 
 @final
 class Frame(NamedTuple):
-    """One valid frame."""
-
     raw: bytes
     """Its bytes as received, with the signature."""
     header: Header

@@ -29,9 +29,7 @@ class Header:
 
     msgid: int
     system: int
-    """The sender's system id."""
     component: int
-    """The sender's component id."""
     target_system: int = 0
     """0 in both targets: all, or the message has no target."""
     target_component: int = 0

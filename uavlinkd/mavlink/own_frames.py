@@ -190,7 +190,6 @@ class StatusTextSource:
         self._sequences: dict[int, int] = {}
 
     def frame(self, note: Note) -> bytes:
-        """The next frame, MAVLink 2."""
         seq = self._sequences.get(note.system, 0)
         self._sequences[note.system] = seq + 1
         text = note.text.encode("ascii", "replace")[:TEXT_BYTES]

@@ -50,7 +50,6 @@ def claims_to_be_ground_station(frame: Frame) -> bool:
 
 
 def may_be_old(frame: Frame) -> bool:
-    """Whether this frame may be delivered while freshness is unverified."""
     if not frame.header.kind.may_be_old:
         return False
     return frame.header.msgid != HEARTBEAT or not claims_to_be_ground_station(frame)

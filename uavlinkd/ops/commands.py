@@ -24,7 +24,6 @@ WATCH_INTERVAL_S = 1.0
 
 
 def add_parsers(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the commands to those of the command line."""
     status = _add(commands, "status", _status, "show a daemon's links and problems; exit status 0 if frames can pass")
     form = status.add_mutually_exclusive_group()
     form.add_argument("--watch", action="store_true", help="refresh each second until interrupted")

@@ -75,7 +75,6 @@ class ControlServer:
             raise ControlError(f"{start}: {error.strerror or error}: {_remedy(self._path)}") from None
 
     async def stop(self) -> None:
-        """Close the socket and remove it."""
         if self._server is not None:
             self._server.close()
             with suppress(OSError):
@@ -114,7 +113,6 @@ class ControlServer:
 
 
 def _is_served(path: Path) -> bool:
-    """Whether a daemon listens on this control socket."""
     with suppress(OSError), _unix_socket() as sock:
         sock.setblocking(False)  # a busy daemon has room in its queue, or refuses at once
         with suppress(BlockingIOError):

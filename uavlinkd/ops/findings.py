@@ -23,8 +23,6 @@ class Severity(IntEnum):
 
 
 class Subject(IntEnum):
-    """What a finding is about."""
-
     DAEMON = 0
     PEER = 1
     ENDPOINT = 2

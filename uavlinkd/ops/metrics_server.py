@@ -44,7 +44,6 @@ class MetricsServer:
 
     @property
     def address(self) -> Address:
-        """The address on which it listens."""
         assert self._server is not None
         return Address(*self._server.sockets[0].getsockname()[:2])
 
@@ -61,7 +60,6 @@ class MetricsServer:
         self._server = await asyncio.start_server(self._serve, sock=sock, limit=MAX_REQUEST_BYTES)
 
     def stop(self) -> None:
-        """Stop listening."""
         if self._server is not None:
             self._server.close()
 

@@ -50,9 +50,7 @@ class Recorder:
         self, settings: Recording, log: FilteringBoundLogger, clock: Callable[[], float] = time.time
     ) -> None:
         self.frames = 0
-        """Frames written."""
         self.bytes = 0
-        """Bytes written."""
         self.frames_lost = 0
         """Frames that a full, failing or slow disk did not record."""
         self.failures: Counter[str] = Counter()

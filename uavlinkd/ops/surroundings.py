@@ -19,7 +19,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from uavlinkd.config import Config, NetworkConfig, PeerAddress
+from uavlinkd.config.model import Config, NetworkConfig, PeerAddress
 from uavlinkd.config.network_rules import used_networks
 from uavlinkd.endpoints.sockets import LINK_LOCAL, Presence, family_of, look
 from uavlinkd.endpoints.url import NetworkUrl, SerialUrl

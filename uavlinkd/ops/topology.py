@@ -13,10 +13,9 @@ from rich.table import Table
 from rich.text import Text
 
 from uavlinkd.authority.enrolment import fingerprint_of
-from uavlinkd.config import Config, EndpointConfig, PeerConfig, PolicyData
 from uavlinkd.config.advice import exposure
 from uavlinkd.config.keys import encode_key, looks_private
-from uavlinkd.config.model import FleetConfig
+from uavlinkd.config.model import Config, EndpointConfig, FleetConfig, PeerConfig, PolicyData
 from uavlinkd.config.network_rules import used_networks
 from uavlinkd.core.certificates import parse_bulletin
 from uavlinkd.core.settings import Link

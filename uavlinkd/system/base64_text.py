@@ -6,7 +6,6 @@ from base64 import b64decode, b64encode
 
 
 def to_base64(data: bytes) -> str:
-    """The text."""
     return b64encode(data).decode("ascii")
 
 

@@ -80,7 +80,6 @@ def interface_of(host: str) -> str | None:
 
 
 def interface_names() -> list[str]:
-    """The names of all interfaces."""
     return [name for _, name in socket.if_nameindex()]
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 OK, FAILED, WRONG = 0, 1, 2
-"""Exit statuses."""
 
 
 class CommandError(Exception):

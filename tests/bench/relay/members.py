@@ -19,9 +19,9 @@ from tests.authority.signing import AUTHORITY, FLEET, bulletin, signed
 from tests.bench.relay.load import RELAY_CORE, Generator, host
 from tests.bench.relay.volleys import Flow, Hosts, Received
 from tests.daemon.toml import to_toml
-from uavlinkd.config import RelayConfig
 from uavlinkd.config.build import TIMERS
 from uavlinkd.config.keys import decode_key, encode_key, generate_private_key, public_key_text, write_secret_file
+from uavlinkd.config.model import RelayConfig
 from uavlinkd.core import constants as c
 from uavlinkd.core import outputs as o
 from uavlinkd.core import wire

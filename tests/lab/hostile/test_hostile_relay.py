@@ -10,8 +10,8 @@ from itertools import combinations
 import pytest
 
 from tests.relay.core_member import CoreMember
-from uavlinkd.config import RelayServer
 from uavlinkd.config.build import TIMERS
+from uavlinkd.config.model import RelayServer
 from uavlinkd.core import constants as c
 from uavlinkd.core.crypto import KeyPair, Secret
 from uavlinkd.core.settings import Link, PeerSettings

@@ -8,8 +8,8 @@ from pathlib import Path
 from time import monotonic
 from typing import Final
 
-from uavlinkd.config import RelayServer
 from uavlinkd.config.keys import encode_key
+from uavlinkd.config.model import RelayServer
 from uavlinkd.core import constants as c
 from uavlinkd.core.crypto import KeyPair, Secret
 from uavlinkd.core.settings import Link, PeerSettings

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from time import monotonic
 from typing import Final
 
-from uavlinkd.config import RelayServer
+from uavlinkd.config.model import RelayServer
 from uavlinkd.core.crypto import Secret, x25519_public_key
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Event, Output, RecordReceived, Transmit

@@ -10,9 +10,8 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from uavlinkd.config import ConfigError
 from uavlinkd.config.load import load_config, load_control_socket
-from uavlinkd.config.model import FleetConfig
+from uavlinkd.config.model import ConfigError, FleetConfig
 from uavlinkd.core.constants import FEATURE_FLEET, FEATURE_RECORDS
 from uavlinkd.endpoints.sockets import BindError
 from uavlinkd.lab.hostile.all_attacks import ALL_ATTACKS

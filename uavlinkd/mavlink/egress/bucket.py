@@ -30,7 +30,6 @@ class Bucket:
 
     def __init__(self, budget_bits_s: float, now: float, least_burst: float = 0.0) -> None:
         self.rate = budget_bits_s / 8
-        """In bytes a second."""
         self.burst = 0.0
         """The most bytes that it holds."""
         self.set_least_burst(least_burst)
@@ -41,13 +40,11 @@ class Bucket:
         self._now = now
 
     def set_rate(self, bytes_s: float, now: float) -> None:
-        """Change the budget."""
         self.level(now)
         self.rate = bytes_s
         self.set_least_burst(self._least_burst)
 
     def set_least_burst(self, least_burst: float) -> None:
-        """Have it hold so many bytes at least."""
         self._least_burst = least_burst
         self.burst = max(self.rate * BURST_S, least_burst)
 
@@ -124,12 +121,10 @@ class Supply:
 
     @property
     def burst(self) -> float:
-        """The most bytes that can be there; infinite without a budget."""
         most = max((network.burst for network in self.networks), default=inf)
         return most if self.own is None else min(most, self.own.burst)
 
     def level(self, now: float) -> float:
-        """The bytes that may be spent now; infinite without a budget."""
         level = max(network.level(now) for network in self.networks) if self.networks else inf
         return level if self.own is None else min(level, self.own.level(now))
 
@@ -158,7 +153,6 @@ class Supply:
         return 0.0
 
     def leave(self, queue: object) -> None:
-        """The queue has no frames, or they wait for something else."""
         for network in self.networks:
             network.leave(queue)
 
@@ -172,7 +166,6 @@ class Supply:
         return wait_s if self.own is None else max(wait_s, self.own.wait_s(price, now))
 
     def note_dropped(self, frame_bytes: int) -> None:
-        """Frames were dropped for lack of budget."""
         if self.own is not None:
             self.own.note_dropped(frame_bytes)
         for network in self.networks:

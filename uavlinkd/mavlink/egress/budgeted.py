@@ -120,7 +120,6 @@ class Egress:
 
     @property
     def queued_frames(self) -> int:
-        """How many frames wait."""
         return self.lanes.count
 
     def has_room(self, payload_bytes: int, now: float) -> bool:
@@ -256,11 +255,9 @@ class Coalescer:
 
     @property
     def queued_frames(self) -> int:
-        """How many frames wait."""
         return len(self._waiting)
 
     def has_room(self, payload_bytes: int, now: float) -> bool:
-        """Whether an envelope with this payload may go out now: always, without a budget."""
         return True
 
     def put(self, frames: Sequence[Frame], now: float) -> None:
@@ -277,7 +274,6 @@ class Coalescer:
             self._due_at = -inf
 
     def take(self, now: float) -> list[Frame]:
-        """Pop the frames of the next envelope, in order. Empty if none is due now."""
         if now < self._due_at:
             return []
         if now - self._put_at > self.settings.max_age_s:
@@ -302,15 +298,12 @@ class Coalescer:
         return batch
 
     def next_deadline(self) -> float:
-        """When :meth:`take` is due next; infinity while no frame waits."""
         return self._due_at
 
     def clear(self, now: float) -> None:
-        """Drop all frames that wait: the peer is lost."""
         self._drop_all(EgressDrop.CLOSED)
 
     def pop_all(self) -> list[tuple[Frame, float]]:
-        """Take out all frames that wait, each with the time since when."""
         frames, self._waiting = self._waiting, []
         self._size = 0
         self._due_at = inf

@@ -46,7 +46,6 @@ class PeerEgress:
     def __init__(self, settings: EgressSettings, now: float, class_of: ClassOf) -> None:
         self.settings = settings
         self.totals: Counter[EgressDrop] = Counter()
-        """Dropped frames."""
         self.is_split = False
         """Whether frames wait by class."""
         self._class_of = class_of
@@ -69,7 +68,6 @@ class PeerEgress:
 
     @property
     def queued_frames(self) -> int:
-        """How many frames wait."""
         return sum(queue.queued_frames for queue in self._queues.values())
 
     def set_networks(self, networks: Mapping[Class, Sequence[Bucket | None]], now: float) -> None:
@@ -81,11 +79,9 @@ class PeerEgress:
         self._rebuild(now)
 
     def demand(self, now: float) -> float:
-        """The bytes sent and dropped over the last seconds, as a share of the tightest budget; 0 without a budget."""
         return self._supplies[Class.STREAM].demand(now)
 
     def has_room(self, payload_bytes: int, now: float) -> bool:
-        """Whether an envelope with this payload may go out now: no frame waits, and the budget covers it."""
         return all(queue.has_room(payload_bytes, now) for queue in self._queues.values())
 
     def put(self, frames: Sequence[Frame], now: float, *, is_split: bool) -> None:
@@ -116,7 +112,6 @@ class PeerEgress:
         return Class.STREAM, []
 
     def next_deadline(self) -> float:
-        """When :meth:`take` is due next; infinity while no frame waits."""
         if not self.is_split:
             return self._queues[Class.STREAM].next_deadline()
         at = inf
@@ -132,7 +127,6 @@ class PeerEgress:
             self._own.spend(datagram_bytes + datagrams * self._shape.carrier_bytes, now)
 
     def clear(self, now: float) -> None:
-        """Drop all frames that wait: the peer is lost."""
         for queue in self._queues.values():
             queue.clear(now)
 

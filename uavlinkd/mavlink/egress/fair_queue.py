@@ -115,9 +115,7 @@ class FairQueue:
 
     def __init__(self, on_drop: Callable[[EgressDrop], None]) -> None:
         self.count = 0
-        """Frames that wait."""
         self.size = 0
-        """Their bytes."""
         self._report = on_drop
         self._sources: dict[Source, _SourceFrames] = {}
         self._sources_limit = MAX_SOURCES

@@ -75,7 +75,6 @@ class Queue:
         self.size = 0  # bytes that wait
 
     def add(self, frame: Waiting) -> None:
-        """Put a frame at the end of its flow, and the flow in line."""
         flow = frame.flow
         flow.frames.append(frame)
         self.arrivals.append(frame)
@@ -88,7 +87,6 @@ class Queue:
             self._join_line(flow)
 
     def _join_line(self, flow: Flow) -> None:
-        """Put the flow in line."""
         if len(self.line) > 2 * self.count + 64:
             for *_, other in self.line:
                 other.is_in_line = bool(other.frames)
@@ -116,7 +114,6 @@ class Queue:
         return arrivals[0] if arrivals else None
 
     def remove(self, frame: Waiting) -> None:
-        """Take out the first frame of a flow."""
         frame.flow.frames.popleft()
         frame.flow.size -= len(frame.frame.raw)
         frame.is_waiting = False
@@ -149,13 +146,11 @@ class Lanes:
 
     @property
     def count(self) -> int:
-        """How many frames wait."""
         urgent, events, states = self.queues
         return urgent.count + events.count + states.count
 
     @property
     def size(self) -> int:
-        """How many bytes of frames wait."""
         urgent, events, states = self.queues
         return urgent.size + events.size + states.size
 
@@ -188,7 +183,6 @@ class Lanes:
         return min(heads, key=by_number) if heads else None
 
     def next(self) -> Waiting | None:
-        """The most important frame."""
         return self.next_urgent() or self.next_of_the_rest()
 
     def next_urgent(self) -> Waiting | None:
@@ -216,7 +210,6 @@ class Lanes:
             flow.since = flow.frames[0].put_at
 
     def drop_stale(self, now: float, max_age_s: float) -> None:
-        """Drop the frames that have waited longer than ``max_age_s``."""
         for queue in self.queues:
             while (oldest := queue.oldest()) is not None and now - oldest.put_at > max_age_s:
                 self.drop(oldest, EgressDrop.STALE)
