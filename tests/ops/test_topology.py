@@ -76,7 +76,7 @@ def test_fleet_is_shown_for_a_review(tmp_path: Path) -> None:
     ):
         assert re.search(rf"^{line}$", printed, re.MULTILINE), line
     station = certificate(MemberRole.OPERATOR, "gs2", (250, 254))
-    assert "gs2: operator, system ids 250 to 254, serial 7" in _printed(
+    assert "gs2: operator, system ids 250-254, serial 7" in _printed(
         load_member(tmp_path, member_file(fleet(station)))
     )
 

@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from uavlinkd.authority.trust import HeldCertificate
-from uavlinkd.config.members import fleet_link, member_peer, policies_of
+from uavlinkd.config.members import DEFAULT_POLICIES, fleet_link, member_peer
 from uavlinkd.config.model import (
     Config,
     ContactConfig,
@@ -26,7 +26,7 @@ from uavlinkd.config.model import (
     Routing,
 )
 from uavlinkd.config.network_rules import network_of
-from uavlinkd.config.problems import Sections, Values, role_of
+from uavlinkd.config.problems import Found, Sections, Values, role_of
 from uavlinkd.config.relay_rules import over_ip, peer_of
 from uavlinkd.config.schema import (
     EndpointSection,
@@ -43,6 +43,7 @@ from uavlinkd.core.certificates import Certificate, MemberRole
 from uavlinkd.core.path import RELAY_HOST
 from uavlinkd.core.settings import Link, PeerSettings, Redundancy, Timers
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
+from uavlinkd.mavlink.policy.settings import PolicyError, read_settings
 from uavlinkd.relay.forwarding import MemberSettings, RelayLimits
 from uavlinkd.system.addresses import IPV6_UDP_BYTES
 
@@ -112,11 +113,19 @@ def _fleet(file: Sections, states: Path) -> FleetConfig:
 
 
 def fleet_policies(file: Sections, own: MemberRole) -> dict[MemberRole, PolicyData]:
-    """What members of each role may send to this daemon."""
-    written = {
-        member_role(role.valid["name"]): policy_data(role) for role in file.fleet_roles if "name" in role.valid
-    }
-    return policies_of(own, written, pins_operators=file.fleet.get("operator") == "pinned")
+    """What members of each role may send here, without their system ids. A role without a policy has no link.
+
+    A complete policy of the file replaces the default one, another adds to it.
+    """
+    policies = {**DEFAULT_POLICIES[own]}
+    for section in file.fleet_roles:
+        if "name" in section.valid:
+            role, policy = member_role(section.valid["name"]), policy_data(section)
+            is_complete = "role" in policy or {"allow_in", "allow_out"} <= set(policy)
+            policies[role] = policy if is_complete else {**policies.get(role, {}), **policy}
+    if file.fleet.get("operator") == "pinned":
+        policies.pop(MemberRole.OPERATOR, None)
+    return policies
 
 
 def member_role(name: str) -> MemberRole:
@@ -219,6 +228,14 @@ def policy_data(section: Values) -> PolicyData:
     return MappingProxyType(
         {key: _frozen(key, value) for key, value in section.valid.items() if key in PolicySection.model_fields}
     )
+
+
+def policy_problems(section: Values, policy: PolicyData, *, is_local: bool) -> Found:
+    try:
+        read_settings(policy, is_local=is_local)
+    except PolicyError as error:
+        for problem in error.problems:
+            yield section.at(problem.key), f"{problem.problem}; {problem.remedy}"
 
 
 def _frozen(key: str, value: Any) -> object:

@@ -6,15 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
 from typing import TypeVar
 
-from uavlinkd.config.model import (
-    Config,
-    ConfigError,
-    EndpointConfig,
-    FleetConfig,
-    PeerConfig,
-    Problem,
-    RelayConfig,
-)
+from uavlinkd.config.model import Config, ConfigError, EndpointConfig, FleetConfig, PeerConfig, Problem, RelayConfig
 from uavlinkd.relay.forwarding import MemberSettings
 
 _FIXED = {

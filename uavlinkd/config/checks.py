@@ -8,11 +8,10 @@ from __future__ import annotations
 from itertools import combinations
 
 from uavlinkd.config import fleet_rules, key_rules, network_rules, relay_rules
-from uavlinkd.config.build import inherited, policy_data
+from uavlinkd.config.build import inherited, policy_data, policy_problems
 from uavlinkd.config.problems import Found, Sections, Values, unique
 from uavlinkd.config.schema import LinkSection
 from uavlinkd.endpoints.url import EndpointKind, NetworkUrl
-from uavlinkd.mavlink.policy.settings import PolicyError, read_settings
 from uavlinkd.system.addresses import Address, overlaps
 
 _RETRIES_BEFORE_REJECT = 2
@@ -31,10 +30,10 @@ def check(file: Sections) -> Found:
     yield from _endpoints(file)
     yield from _timers(file.link)
     for endpoint in file.endpoints:
-        yield from _policy(endpoint, is_local=True)
+        yield from policy_problems(endpoint, policy_data(endpoint), is_local=True)
     for peer in file.peers:
         yield from _timers(peer, file.link)
-        yield from _policy(peer, is_local=False)
+        yield from policy_problems(peer, policy_data(peer), is_local=False)
 
 
 def _reachability(file: Sections) -> Found:
@@ -127,11 +126,3 @@ def _timers(section: Values, link: Values | None = None) -> Found:
         # A problem that a peer only inherits is reported once, for [link].
         if is_wrong and not involved & unknown and (link is None or involved & set(section.valid)):
             yield section.at(key), message
-
-
-def _policy(section: Values, *, is_local: bool) -> Found:
-    try:
-        read_settings(policy_data(section), is_local=is_local)
-    except PolicyError as error:
-        for problem in error.problems:
-            yield section.at(problem.key), f"{problem.problem}; {problem.remedy}"

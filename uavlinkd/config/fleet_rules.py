@@ -8,8 +8,7 @@ from typing import NamedTuple
 
 from uavlinkd.authority.enrolment import MOST_CONTACTS
 from uavlinkd.authority.trust import HeldCertificate
-from uavlinkd.config.build import fleet_policies, member_role, policy_data
-from uavlinkd.config.model import PolicyData
+from uavlinkd.config.build import fleet_policies, member_role, policy_data, policy_problems
 from uavlinkd.config.problems import Found, Sections, Values, role_of, unique
 from uavlinkd.config.relay_rules import over_ip
 from uavlinkd.config.schema import ENROLL_AGAIN
@@ -122,15 +121,7 @@ def _roles(file: Sections) -> Found:
             if policy is None:
                 yield section.at("name"), 'has no effect with operator = "pinned": delete one of the two'
             else:
-                yield from _policy(section, policy)
+                yield from policy_problems(section, {**policy, "system_ids": "all"}, is_local=False)
     for name in file.fleet.get("call") or ():
         if member_role(name) not in policies:
             yield "fleet.call", f'names "{name}", but members of that role have no link here: leave it out'
-
-
-def _policy(section: Values, policy: PolicyData) -> Found:
-    try:
-        read_settings({**policy, "system_ids": "all"}, is_local=False)
-    except PolicyError as error:
-        for problem in error.problems:
-            yield section.at(problem.key), f"{problem.problem}; {problem.remedy}"

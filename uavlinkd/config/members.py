@@ -31,22 +31,6 @@ DEFAULT_POLICIES: Final[Mapping[MemberRole, Mapping[MemberRole, PolicyData]]] = 
 """By the role of this daemon, then by that of the other one."""
 
 
-def policies_of(
-    own: MemberRole, written: Mapping[MemberRole, PolicyData], *, pins_operators: bool
-) -> dict[MemberRole, PolicyData]:
-    """What the members of each role may send here, without their system ids. A role without a policy has no link.
-
-    A ``written`` policy that is complete replaces the default one, another adds to it.
-    """
-    policies = {**DEFAULT_POLICIES[own]}
-    for role, policy in written.items():
-        is_complete = "role" in policy or {"allow_in", "allow_out"} <= set(policy)
-        policies[role] = policy if is_complete else {**policies.get(role, {}), **policy}
-    if pins_operators:
-        policies.pop(MemberRole.OPERATOR, None)
-    return policies
-
-
 def fleet_link(link: Link) -> Link:
     """The settings with which a daemon of a fleet talks to members."""
     return replace(link, features=link.features | c.FEATURE_RECORDS | c.FEATURE_FLEET)

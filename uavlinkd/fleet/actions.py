@@ -24,14 +24,7 @@ from uavlinkd.fleet.authority_key import (
     read_paper,
 )
 from uavlinkd.fleet.files import config_file
-from uavlinkd.fleet.manifest import (
-    Fleet,
-    FleetError,
-    FleetSettings,
-    Member,
-    parse_addresses,
-    read_manifest,
-)
+from uavlinkd.fleet.manifest import Fleet, FleetError, FleetSettings, Member, parse_addresses, read_manifest
 from uavlinkd.fleet.operations import Result
 from uavlinkd.fleet.signing import Identity
 from uavlinkd.mavlink.dialect import SYSTEM_ID

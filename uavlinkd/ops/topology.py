@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Final
 
 from rich.box import SIMPLE_HEAD
@@ -12,10 +12,10 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from uavlinkd.authority.enrolment import fingerprint_of
+from uavlinkd.authority.enrolment import fingerprint_of, ids_of
 from uavlinkd.config.advice import exposure
 from uavlinkd.config.keys import encode_key, looks_private
-from uavlinkd.config.model import Config, EndpointConfig, FleetConfig, PeerConfig, PolicyData
+from uavlinkd.config.model import Config, EndpointConfig, FleetConfig, PeerConfig, PolicyData, RelayConfig
 from uavlinkd.config.network_rules import used_networks
 from uavlinkd.core.certificates import parse_bulletin
 from uavlinkd.core.settings import Link
@@ -23,6 +23,7 @@ from uavlinkd.mavlink import dialect
 from uavlinkd.mavlink.policy.compilation import Policy, PolicyRow
 from uavlinkd.mavlink.policy.roles import ROLES
 from uavlinkd.ops.surroundings import Surroundings
+from uavlinkd.relay.forwarding import MemberSettings
 
 _MOST_COLUMNS: Final = 100_000
 """More than any line has."""
@@ -58,11 +59,11 @@ def _facts(config: Config, here: Surroundings | None) -> list[RenderableType]:
 
     Text from the file is always a :class:`rich.text.Text`, so that it cannot act as markup.
     """
-    parts: list[RenderableType] = [_identity(config)]
+    parts: list[RenderableType] = [_grid(_identity(config))]
     if config.fleet is not None:
-        parts += [_heading("Fleet"), _fleet(config.fleet)]
+        parts += [_heading("Fleet"), _grid(_fleet(config.fleet))]
     if config.networks:
-        parts += [_heading("Networks"), _networks(config, here)]
+        parts += [_heading("Networks"), _grid(_networks(config, here), "bold")]
     if config.peers:
         links = _table(("name", "address", "suites", "mode, at least", "PSK"), map(_peer, config.peers))
         keys = _table(
@@ -74,33 +75,14 @@ def _facts(config: Config, here: Surroundings | None) -> list[RenderableType]:
             parts.append(Text(f"(it connects): the peer's file needs an address of this machine, with port {port}"))
         parts += [Text(), keys]
     if config.relays:
-        relays = (
-            (
-                relay.name,
-                _whole(relay.settings.public_key),
-                "\n".join(map(str, relay.addresses)),
-                _yes(relay.settings.psk),
-            )
-            for relay in config.relays
-        )
-        parts += [_heading("Relays"), _table(("name", "public key", "address", "PSK"), relays)]
+        parts += [_heading("Relays"), _table(("name", "public key", "address", "PSK"), map(_relay, config.relays))]
     if config.endpoints:
         columns = ("name", "URL", "RADIO_STATUS", "STATUSTEXT", "plain MAVLink is open to")
         parts += [_heading("Local endpoints"), _table(columns, map(_endpoint, config.endpoints))]
     if config.relay_server is not None:
-        members = (
-            (
-                member.name,
-                _whole(member.peer.public_key),
-                _yes(member.peer.psk),
-                f"{member.most_peers:,}",
-                f"{member.limits.datagrams_s:,}",
-                f"{member.limits.bits_s / 1000:,.0f}",
-            )
-            for member in config.relay_server.members
-        )
         titles = ("name", "public key", "PSK", "members", "datagrams/s", "kbit/s")
-        parts += [_heading("Members of this relay, and their limits"), _table(titles, members)]
+        members = _table(titles, map(_member, config.relay_server.members))
+        parts += [_heading("Members of this relay, and their limits"), members]
     return parts
 
 
@@ -126,43 +108,42 @@ def _whole(public_key: bytes) -> str:
     return "(private?)" if looks_private(public_key) else encode_key(public_key)
 
 
-def _identity(config: Config) -> Table:
+def _grid(rows: Iterable[tuple[str, str | Text]], style: str = "dim") -> Table:
+    """Facts, each with its name in front."""
     table = Table.grid(padding=(0, 2))
-    table.add_column(style="dim")
+    table.add_column(style=style)
     table.add_column(overflow="fold")
-    table.add_row("name", Text(config.name, style="bold"))
-    # Not shortened: the user copies it into the files of the peers.
-    table.add_row("public key", Text(encode_key(config.public_key)))
-    table.add_row("listens on", Text(_listening(config)))
+    for name, fact in rows:
+        table.add_row(Text(name), Text(fact) if isinstance(fact, str) else fact)
+    return table
+
+
+def _identity(config: Config) -> Iterator[tuple[str, str | Text]]:
+    yield "name", Text(config.name, style="bold")
+    yield "public key", encode_key(config.public_key)  # whole: the user copies it into the files of the peers
+    yield "listens on", _listening(config)
     if not config.is_only_relay:
         others = ", and from peer to peer" if config.routing.relay else " only"
-        table.add_row("routing", f"between peers and endpoints{others}")
+        yield "routing", f"between peers and endpoints{others}"
     if config.metrics is not None:
-        table.add_row("metrics", Text(f"http://{config.metrics}/metrics"))
+        yield "metrics", f"http://{config.metrics}/metrics"
     if config.recording is not None:
         free = f"keeps {config.recording.min_free_bytes / 1e9:g} GB of the disk free"
-        table.add_row("recordings", Text(f"{config.recording.folder} ({free})"))
-    return table
+        yield "recordings", f"{config.recording.folder} ({free})"
 
 
-def _fleet(fleet: FleetConfig) -> Table:
-    own, bulletin = fleet.own.certificate, parse_bulletin(fleet.bulletin)
-    first, last = own.system_ids
-    systems = f"system ids {first} to {last}" if last > first else f"system id {first}"
-    table = Table.grid(padding=(0, 2))
-    table.add_column(style="dim")
-    table.add_column(overflow="fold")
-    table.add_row("fingerprint", Text(fingerprint_of(fleet.authority.public), style="bold"))
-    facts = [own.role.name.lower(), systems if last else "", f"serial {own.serial}"]
-    table.add_row("certificate", Text(f"{own.name}: {', '.join(filter(None, facts))}"))
+def _fleet(fleet: FleetConfig) -> Iterator[tuple[str, str | Text]]:
+    own, bulletin, ids = fleet.own.certificate, parse_bulletin(fleet.bulletin), ids_of(fleet.own.certificate)
     assert bulletin is not None  # it was checked
-    table.add_row("bulletin", f"number {bulletin.number} in this file, or a newer one")
+    yield "fingerprint", Text(fingerprint_of(fleet.authority.public), style="bold")
+    systems = f"system id{'s' if '-' in ids else ''} {ids}, " if ids else ""
+    yield "certificate", f"{own.name}: {own.role.name.lower()}, {systems}serial {own.serial}"
+    yield "bulletin", f"number {bulletin.number} in this file, or a newer one"
     for contact in fleet.contacts:
         what = contact.role.name.lower() + (", used as a relay" if contact.relays else "")
-        table.add_row("contact", Text(f"{contact.name}: {what}, at {', '.join(map(str, contact.addresses))}"))
+        yield "contact", f"{contact.name}: {what}, at {', '.join(map(str, contact.addresses))}"
     called = ", ".join(sorted(role.name.lower() for role in fleet.call))
-    table.add_row("connects to", f"contacts{f', and members of the role {called}' if called else ''}")
-    return table
+    yield "connects to", f"contacts{f', and members of the role {called}' if called else ''}"
 
 
 def _listening(config: Config) -> str:
@@ -177,16 +158,13 @@ def _listening(config: Config) -> str:
     return f"{where} (UDP, open to the network; answers only senders that know the public key)"
 
 
-def _networks(config: Config, here: Surroundings | None) -> Table:
+def _networks(config: Config, here: Surroundings | None) -> Iterator[tuple[str, Text]]:
     """Each network with the peers' addresses that are used on it; on this machine, those that it reaches now."""
-    table = Table.grid(padding=(0, 2))
-    table.add_column(style="bold")
-    table.add_column(overflow="fold")
     for number, network in enumerate(config.networks):
-        budget = f"{network.budget_bits_s:,} bits/s" if network.budget_bits_s else "no budget"
-        text = Text(f"{network.exit}, {'metered' if network.metered else 'not metered'}, {budget}")
-        if network.serial is not None:
-            text = Text(network.exit)
+        text = Text(network.exit)
+        if network.serial is None:
+            budget = f"{network.budget_bits_s:,} bits/s" if network.budget_bits_s else "no budget"
+            text.append(f", {'metered' if network.metered else 'not metered'}, {budget}")
         if here is None:
             used = [
                 f"{peer.name} {written.address}"
@@ -202,8 +180,7 @@ def _networks(config: Config, here: Surroundings | None) -> Table:
                 text.append(f"\nreaches {', '.join(reach.reached)}")
             if reach.unreached:
                 text.append(f"\ndoes not reach {', '.join(reach.unreached)}", style="bold red")
-        table.add_row(Text(network.name), text)
-    return table
+        yield network.name, text
 
 
 def _peer(peer: PeerConfig) -> tuple[str, ...]:
@@ -219,6 +196,16 @@ def _peer(peer: PeerConfig) -> tuple[str, ...]:
         mode,
         _yes(peer.settings.psk),
     )
+
+
+def _relay(relay: RelayConfig) -> tuple[str, ...]:
+    addresses = "\n".join(map(str, relay.addresses))
+    return relay.name, _whole(relay.settings.public_key), addresses, _yes(relay.settings.psk)
+
+
+def _member(member: MemberSettings) -> tuple[str, ...]:
+    limits = f"{member.most_peers:,}", f"{member.limits.datagrams_s:,}", f"{member.limits.bits_s / 1000:,.0f}"
+    return member.name, _whole(member.peer.public_key), _yes(member.peer.psk), *limits
 
 
 def _endpoint(endpoint: EndpointConfig) -> tuple[str | Text, ...]:
