@@ -166,7 +166,7 @@ class Trust:
         return ended
 
     def _conflict(self, key: bytes, certificate: Certificate) -> str | None:
-        """Which other member has the name or a system id of this one; None if it is the same member."""
+        """Which other member has the name or a system id of this one. Of one name the highest serial counts."""
         pinned, ids = self.pinned, certificate.systems
         if certificate.name in pinned.names:
             return f"the peer {certificate.name} of the configuration"
@@ -176,7 +176,7 @@ class Trust:
         if self.own is not None and self._overlap(self.own.certificate, certificate):
             return "this daemon's own certificate"
         for _, held in self._rivals(key, certificate):
-            if held.serial >= certificate.serial or not is_same_member(held, certificate):
+            if held.serial >= certificate.serial or held.name != certificate.name:
                 return _label(held)
         return None
 
