@@ -103,6 +103,14 @@ def test_bind_that_is_answered_is_repeated_rarely(scene: Scene) -> None:
     assert scene.link.next_at == T + 1 + c.BIND_INTERVAL_S
 
 
+def test_peer_that_was_added_before_the_answer_is_bound_at_once(scene: Scene) -> None:
+    """The answer is to the bind before, which did not name it."""
+    assert scene.binds(T)
+    scene.link.follow([ONE, TWO, ELSE])
+    scene.bound(T, (ONE, 5), (TWO, 6))
+    assert scene.binds(T) == [(ONE, TWO, ELSE)]
+
+
 def test_data_with_an_unknown_handle_causes_a_bind(scene: Scene) -> None:
     """A bound record was lost. An attacker that sends such data causes a few binds a second, and only at a relay."""
     assert scene.binds(T)

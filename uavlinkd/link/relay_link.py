@@ -324,7 +324,8 @@ class RelayLink:
         )
 
     def _hurry(self, binding: _Binding) -> None:
-        binding.due_at, binding.tries = -NEVER, 0
+        """Bind as soon as possible. An answer to the bind before does not put this off."""
+        binding.due_at, binding.tries, binding.unanswered = -NEVER, 0, frozenset(self.keys)
 
     def _assign(self, binding: _Binding) -> None:
         handles = [handle for of_key in binding.handles.values() for handle in of_key]
