@@ -146,7 +146,7 @@ def test_member_that_does_not_have_its_newer_certificate_yet() -> None:
 
 
 def test_new_key_of_a_member() -> None:
-    """The old key ends, also if role and ids changed too: whoever replays its initiations keeps no new one out.
+    """The old key ends, also if role and ids changed too: who replays its initiations keeps no new one out.
 
     Two relays have no system id in common.
     """
