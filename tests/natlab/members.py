@@ -37,7 +37,9 @@ _INTO: Final = "127.0.0.1", 14550
 _EAR: Final = "127.0.0.1", 14551
 """Where a daemon receives frames of its client, and sends those of its peers."""
 FRAME_S: Final = 0.02
-"""Interval of the frames that the revoked member sends."""
+"""Interval of the frames that the revoked member sends to few. To many it sends more rarely: they share processors."""
+FRAMES_PER_S: Final = 500.0
+"""That all others get of it at most."""
 SPREAD_S: Final = 3.0
 """How long bytes are counted after a publication, and before it."""
 SETTLE_S: Final = 1.0
@@ -165,7 +167,7 @@ class Fleet:
         talkers = [one for one in self.members if one is not revoked and self._has_link(one)]
         with ExitStack() as stack:
             ears = [stack.enter_context(_listen(self._places[one.name].host)) for one in talkers]
-            talking = asyncio.create_task(self._talk(revoked))
+            talking = asyncio.create_task(self._talk(revoked, max(FRAME_S, len(talkers) / FRAMES_PER_S)))
             try:
                 await asyncio.sleep(SETTLE_S)
                 to_last, published = await self._publish(revoked)
@@ -207,7 +209,7 @@ class Fleet:
     def _state(self, daemon: DaemonProcess) -> Path:
         return daemon.config_file.with_name(f"{daemon.name}.fleet-state")
 
-    async def _talk(self, vehicle: DaemonProcess) -> None:
+    async def _talk(self, vehicle: DaemonProcess, interval_s: float) -> None:
         """Positions, without end."""
         sock = udp_socket_in(self._places[vehicle.name].host.path)
         number, system = 0, self.systems[vehicle.name]
@@ -216,7 +218,7 @@ class Fleet:
                 with suppress(OSError):
                     sock.sendto(numbered(number & 255, system), _INTO)
                 number += 1
-                await asyncio.sleep(FRAME_S)
+                await asyncio.sleep(interval_s)
 
     # Cost.
 
