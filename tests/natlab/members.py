@@ -37,7 +37,7 @@ _INTO: Final = "127.0.0.1", 14550
 _EAR: Final = "127.0.0.1", 14551
 """Where a daemon receives frames of its client, and sends those of its peers."""
 FRAME_S: Final = 0.02
-"""Interval of the frames that the revoked member sends to few. To many it sends more rarely: they share processors."""
+"""Interval of the frames that the revoked member sends to few, and to many more rarely: they share processors."""
 FRAMES_PER_S: Final = 500.0
 """That all others get of it at most."""
 SPREAD_S: Final = 3.0
