@@ -54,7 +54,7 @@ def test_member_is_configured_by_its_line(tmp_path: Path) -> None:
     made = config.fleet
     assert made is not None
     assert made.authority.public == authority()
-    assert made.certificate == b64decode(certificate())
+    assert made.own.data == b64decode(certificate())
     assert (set(made.call), made.required_bulletin, set(made.denied)) == ({_OPERATOR}, 0, set())
     assert made.state_file == tmp_path / "drone0.fleet-state"
     assert made.link.confidential

@@ -74,17 +74,21 @@ def compare(old: Config, new: Config) -> ConfigChanges:
         raise ConfigError(tuple(Problem(str(new.path), key, _NEEDS_RESTART) for key in fixed))
     peers = _compare(old.peers, new.peers, _is_same_peer)
     new_peers = {peer.name for peer in peers[1]}
+
+    def is_same_relay(before: RelayConfig, relay: RelayConfig) -> bool:
+        return (relay.settings, relay.peer) == (before.settings, before.peer) and relay.peer not in new_peers
+
     return ConfigChanges(
         *peers,
         *_compare(old.endpoints, new.endpoints, lambda before, endpoint: before.url == endpoint.url),
         *_compare(_members(old), _members(new), lambda before, member: True),
-        *_compare(old.relays, new.relays, lambda *both: _is_same_relay(*both) and both[1].peer not in new_peers),
-        tuple(field.name for field in fields(FleetConfig) if _value(old, field.name) != _value(new, field.name)),
+        *_compare(old.relays, new.relays, is_same_relay),
+        tuple(
+            field.name
+            for field in fields(FleetConfig)
+            if getattr(old.fleet, field.name, None) != getattr(new.fleet, field.name, None)
+        ),
     )
-
-
-def _value(config: Config, field: str) -> object:
-    return getattr(config.fleet, field, None)
 
 
 def _compare(
@@ -107,7 +111,3 @@ def _members(config: Config) -> tuple[MemberSettings, ...]:
 def _is_same_peer(before: PeerConfig, peer: PeerConfig) -> bool:
     link = replace(peer.settings.link, features=before.settings.link.features)  # new keys are enough for others
     return replace(peer.settings, link=link) == before.settings
-
-
-def _is_same_relay(before: RelayConfig, relay: RelayConfig) -> bool:
-    return (relay.settings, relay.peer) == (before.settings, before.peer)

@@ -216,11 +216,6 @@ class FleetConfig:
     def contact(self, key: bytes) -> ContactConfig | None:
         return next((contact for contact in self.contacts if contact.key == key), None)
 
-    @property
-    def certificate(self) -> bytes:
-        """The own certificate as it is sent."""
-        return self.own.data
-
 
 @dataclass(frozen=True, slots=True)
 class Routing:

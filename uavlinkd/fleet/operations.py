@@ -10,7 +10,6 @@ from __future__ import annotations
 import errno
 import os
 import secrets
-import shutil
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -75,12 +74,6 @@ def init(
     check_settings(settings)
     if min(counts.values()) < 0 or sum(counts.values()) > 255:
         raise FleetError("a fleet has at most 255 members: MAVLink has no more system ids")
-    try:
-        is_taken = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
-    except OSError as error:
-        raise _cannot_create(folder, error) from None
-    if is_taken:
-        raise _exists(folder)
     private, successor = (Secret(secrets.token_bytes(32)) for _ in range(2))
     signer = SigningKey(private)
     fleet = signing.new_fleet(signer, sha256(SigningKey(successor).public), settings)
@@ -96,27 +89,26 @@ def init(
             full = name if len(each) == 1 and role is not MemberRole.VEHICLE else f"{name}{number}"
             private_keys[full] = keys.generate_private_key()
             fleet = signing.certify(fleet, signer, _public(private_keys[full]), full, Identity(role, None, addresses))
-    passphrase = None if ask is None else ask(AUTHORITY_FILE)
     try:
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise _exists(folder)
+        passphrase = None if ask is None else ask(AUTHORITY_FILE)
         folder.parent.mkdir(parents=True, exist_ok=True)
-        building = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
-    except OSError as error:
-        raise _cannot_create(folder, error) from None
-    try:
-        with changing() as changes:
-            for file, key in ((AUTHORITY_FILE, private), (SUCCESSOR_FILE, successor)):
-                changes.write_secret(building / file, signing_key_pem(key, passphrase, os.urandom))
-            for member in fleet.members:
-                _write_member(changes, building, fleet, member, private_keys[member.name])
-            changes.write(building / FILE_NAME, write_manifest(fleet))
-        building.chmod(0o755)
-        building.rename(folder)
+        prefix = f".{folder.name}-"
+        with tempfile.TemporaryDirectory(prefix=prefix, dir=folder.parent, ignore_cleanup_errors=True) as name:
+            building = Path(name)
+            with changing() as changes:
+                for file, key in ((AUTHORITY_FILE, private), (SUCCESSOR_FILE, successor)):
+                    changes.write_secret(building / file, signing_key_pem(key, passphrase, os.urandom))
+                for member in fleet.members:
+                    _write_member(changes, building, fleet, member, private_keys[member.name])
+                changes.write(building / FILE_NAME, write_manifest(fleet))
+            building.chmod(0o755)
+            building.rename(folder)
     except OSError as error:
         if error.errno in (errno.EEXIST, errno.ENOTEMPTY):  # another command created it meanwhile
             raise _exists(folder) from None
-        raise _cannot_create(folder, error) from None
-    finally:
-        shutil.rmtree(building, ignore_errors=True)
+        raise FleetFileError(f"{folder} cannot be created: {error.strerror}") from None
     return Result(fleet, tuple(member.name for member in fleet.members)), private
 
 
@@ -130,22 +122,32 @@ def _exists(folder: Path) -> FleetError:
     return FleetError(f"{folder} exists already: choose the name of a new folder, or use `uavlinkd fleet add`")
 
 
-def _cannot_create(folder: Path, error: OSError) -> FleetFileError:
-    return FleetFileError(f"{folder} cannot be created: {error.strerror}")
-
-
 def sign(
-    folder: Path, request: Request, identity: Identity, ask: Passphrase, *, replaces: bool = False
+    folder: Path,
+    request: Request,
+    identity: Identity,
+    ask: Passphrase,
+    *,
+    replaces: bool = False,
+    private: str | None = None,
 ) -> tuple[Result, str]:
-    """Sign a request; also returns the reply line. The same request again, for the same identity, changes nothing."""
+    """Sign a request; also returns the reply line. The same request again, for the same identity, changes nothing.
+
+    ``replaces``: it is for a new key of a member. ``private``: the key, if it was made here: write it into the
+    member's folder, with a configuration.
+    """
     with _changing(folder) as (before, changes):
         known = next((member for member in before.current if member.public_key == request.public_key), None)
         if known is not None and known.name == request.name and identity.is_of(known):
             return Result(before), files.reply_for(before, known).line()
         signer = _signer(folder, before, ask)
         fleet = signing.certify(before, signer, request.public_key, request.name, identity, replaces=replaces)
-        result = _save(changes, folder, fleet, before, but=request.name)
-    return result, files.reply_for(fleet, fleet.member(request.name)).line()
+        member = fleet.member(request.name)
+        if private is not None:
+            _write_member(changes, folder, fleet, member, private)
+        changed = () if private is None else (member.name,)
+        result = _save(changes, folder, fleet, before, but=member.name, changed=changed)
+    return result, files.reply_for(fleet, member).line()
 
 
 def line_of(folder: Path, name: str) -> str:
@@ -156,14 +158,10 @@ def line_of(folder: Path, name: str) -> str:
 
 def add(folder: Path, name: str, identity: Identity, ask: Passphrase, *, replaces: bool = False) -> Result:
     """Make a key and a folder for a new member. ``replaces``: a new key for a member, whose old one is revoked."""
-    with _changing(folder) as (before, changes):
-        if replaces:
-            before.member(name)
-        private = keys.generate_private_key()
-        signer = _signer(folder, before, ask)
-        fleet = signing.certify(before, signer, _public(private), name, identity, replaces=replaces)
-        _write_member(changes, folder, fleet, fleet.member(name), private)
-        return _save(changes, folder, fleet, before, but=name, changed=(name,))
+    if replaces:
+        read_manifest(folder).member(name)
+    private = keys.generate_private_key()
+    return sign(folder, Request(name, _public(private)), identity, ask, replaces=replaces, private=private)[0]
 
 
 def revoke(folder: Path, name: str, ask: Passphrase, *, resign: bool = False) -> Result:

@@ -59,7 +59,7 @@ def relay_main(arguments: Sequence[str]) -> int:
 def _membership(fleet: FleetConfig) -> HostileMembership:
     return HostileMembership(
         authority=fleet.authority,
-        certificate=fleet.certificate,
+        certificate=fleet.own.data,
         bulletin=fleet.bulletin,
         link=replace(fleet.link, features=FEATURE_RECORDS | FEATURE_FLEET),
         limits=fleet.member_limits,
