@@ -26,8 +26,6 @@ from uavlinkd.core.drops import Drop, DropReason
 
 
 class HeldCertificate(NamedTuple):
-    """A certificate that the authority signed, and its bytes."""
-
     certificate: Certificate
     data: bytes
 

@@ -129,7 +129,6 @@ def fleet_policies(file: Sections, own: MemberRole) -> dict[MemberRole, PolicyDa
 
 
 def member_role(name: str) -> MemberRole:
-    """The role with a name as the file writes it."""
     return MemberRole[name.upper()]
 
 
@@ -146,7 +145,6 @@ def _contact(file: Sections, section: Values) -> ContactConfig:
 
 
 def _contact_peers(file: Sections, fleet: FleetConfig) -> Iterator[PeerConfig]:
-    """The contacts whose role has a policy here."""
     for section in file.contacts:
         certificate: Certificate = section.valid["certificate"].certificate
         if certificate.role in fleet.policies:

@@ -18,7 +18,6 @@ _RETRIES_BEFORE_REJECT = 2
 
 
 def check(file: Sections) -> Found:
-    """Yield every problem between the values of a file."""
     for sections in (file.endpoints, file.peers, file.members):
         yield from unique(sections, "name", "the name of {other} too: write another")
     yield from key_rules.check(file)

@@ -18,7 +18,6 @@ from uavlinkd.mavlink.policy.settings import PolicyError, read_settings
 
 
 def check(file: Sections) -> Found:
-    """Yield a problem for each value that the rest of the file contradicts."""
     if not file.has_fleet:
         for kind, sections in (("contact", file.contacts), ("fleet_role", file.fleet_roles)):
             if sections:

@@ -31,7 +31,6 @@ _EXPOSED = "it is exposed: make a new one there with `uavlinkd keygen`, and writ
 
 
 def check(file: Sections) -> Found:
-    """Yield a problem for each key that is in the wrong place, or belongs to two daemons."""
     for what, sections in (("peer", file.peers), ("member", file.members), ("relay", file.relays)):
         yield from unique(sections, "public_key", f"the key of {{other}} too: each {what} has its own")
     yield from _public_keys(file)

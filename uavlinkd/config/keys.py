@@ -20,7 +20,6 @@ from uavlinkd.system.folders import sync_folder
 from uavlinkd.system.terminal import CommandError
 
 KEY_TEXT_LENGTH = 44
-"""Characters of a key in base64."""
 CREDENTIALS = "CREDENTIALS_DIRECTORY"
 """The environment variable in which systemd names the folder with a service's keys."""
 _READ_LIMIT = 256

@@ -132,7 +132,6 @@ def _read_toml(path: Path) -> dict[str, Any]:
 
 
 def syntax_problem(path: Path, text: str, error: Exception) -> Problem:
-    """The problem of a text that is not TOML."""
     if message := _foreign_file(text):
         return Problem(str(path), "", message)
     match = _AT.fullmatch(str(error))
@@ -236,7 +235,6 @@ _FOR_A_SERVICE = (
 
 
 def _how_to_get(key: str, path: Path, config: Path) -> str:
-    """The remedy for a key file that is not there."""
     where = shlex.quote(str(path))
     if key == "psk_file":
         remedy = f"copy it from the peer, or make it on one of the two with `uavlinkd psk --out {where}`"

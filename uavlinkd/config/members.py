@@ -51,7 +51,6 @@ def member_peer(fleet: FleetConfig, key: bytes, certificate: Certificate) -> Pee
 
 
 def relay_member(fleet: FleetConfig, key: bytes, certificate: Certificate) -> MemberSettings:
-    """A member by certificate of the relay that this daemon is."""
     link = replace(fleet.link, features=c.FEATURE_RECORDS | c.FEATURE_FLEET)
     peer = PeerSettings(certificate.name, key, None, link, initiates=False, is_certified=True)
     return MemberSettings(peer, fleet.member_most_peers, fleet.member_limits)

@@ -151,7 +151,6 @@ class Problems:
             raise ConfigError(tuple(self._found))
 
     def read(self, model: type[schema.Section], table: Mapping[str, Any], section: str) -> Values:
-        """Check one section by its model and add its problems."""
         valid: dict[str, Any] = {}
         invalid: set[str] = set()
         try:
@@ -260,7 +259,6 @@ _REMOVED = (
 
 
 def unknown_key(key: str, model: type[schema.Section]) -> str:
-    """What to write for a key that the section does not have."""
     if key in ("previous_public_key", "previous_private_key_file"):  # files of earlier versions may have them
         return _REMOVED
     plain = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|[ -]", "_", key).lower()

@@ -84,7 +84,6 @@ class Reader:
         self._waiting = array("i", [0])
 
     def start(self) -> None:
-        """Read whenever datagrams are there."""
         self._is_watched = True
         self._loop.add_reader(self._sock, self._on_readable)
 

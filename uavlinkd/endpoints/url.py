@@ -51,7 +51,6 @@ class NetworkUrl:
 
     @property
     def listens(self) -> bool:
-        """Whether clients connect to it."""
         return self.kind in _LISTENING
 
     @property

@@ -99,7 +99,6 @@ class Member:
 
     @property
     def ids(self) -> str:
-        """Its system ids for a person."""
         return ids_of(self.certificate) or "-"
 
 

@@ -97,7 +97,6 @@ class Router(Generic[P]):
         self._forget_decisions()
 
     def remove_port(self, port: P) -> None:
-        """Forget the port and the addresses behind it."""
         self._is_peer.pop(port, None)
         self._silent.discard(port)
         for address in self._received_at.pop(port, {}):

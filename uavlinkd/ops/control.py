@@ -122,7 +122,6 @@ def _is_served(path: Path) -> bool:
 
 
 def _remedy(path: Path) -> str:
-    """What to do about a socket that cannot be made."""
     # The folder for the socket of a service is RuntimeDirectory= in systemd.exec(5).
     folder, of_service = path.parent, os.environ.get("RUNTIME_DIRECTORY", "/run/uavlinkd").partition(":")[0]
     if folder.is_relative_to(of_service):

@@ -84,7 +84,6 @@ class LogFile:
             self._room.register(descriptor, select.POLLOUT)
 
     def write(self, line: str) -> None:
-        """Write a line, or lose and count it."""
         data = line.encode("utf-8", "backslashreplace")
         rest = memoryview(b"\n" + data if self._is_cut else data)
         try:

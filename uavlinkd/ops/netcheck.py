@@ -122,7 +122,6 @@ _UNREACHABLE: Final = " (ICMP: not reachable)"
 
 
 def report(answer: Answer) -> Iterator[str]:
-    """The lines of the report for a daemon's answer."""
     relays = answer["relays"]
     if not relays:
         yield (
@@ -159,7 +158,6 @@ def report(answer: Answer) -> Iterator[str]:
 
 
 def _headline(answer: Answer, down: list[str], ports: list[str]) -> str:
-    """Which case it is."""
     count = len(answer["relays"])
     counted = f"{count - len(down)} of {count} relays answer"
     if answer["is_udp_blocked"]:
@@ -232,7 +230,6 @@ def _filtered(passes: set[bool | None]) -> Filtered:
 
 
 def meaning(mapped: Mapped, filtered: Filtered) -> str:
-    """What both mean for direct paths."""
     match mapped, filtered:
         case ((Mapped.BY_ADDRESS | Mapped.BY_EITHER | Mapped.BY_PORT), _):
             return FEW_PEERS

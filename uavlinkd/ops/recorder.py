@@ -40,7 +40,6 @@ _LINK_BITS = 3
 _SETUP_SIGNING = SETUP_SIGNING.to_bytes(3, "little")
 
 _Batch = dict[tuple[str, int], list[bytes]]
-"""Records by peer and epoch."""
 
 
 class Recorder:

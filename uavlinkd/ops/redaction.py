@@ -46,7 +46,6 @@ class Redactor:
             self._peers.setdefault(_normal(host), f"peer-address-{len(self._peers) + 1}")
 
     def redact(self, text: str) -> str:
-        """The text with pseudonyms."""
         text = _KEY.sub(lambda match: self._key(match[0]), text)
         text = _KEY_VALUE.sub(lambda match: match[1] + self._value(match[2]), text)
         text = _LONG.sub(lambda match: self._key(match[0]) if _is_mixed(match[0]) else match[0], text)

@@ -37,7 +37,6 @@ this machine's own addresses are readable. Read it before you send it."""
 
 
 def make_report(configs: Sequence[Path], sockets: Sequence[Path]) -> str:
-    """Collect everything, and redact it."""
     interfaces = _run("ip", "-brief", "address")
     redactor = Redactor(re.findall(r"[0-9A-Fa-f:.]+(?=/\d)", interfaces))
     statuses = [_status(socket) for socket in sockets]

@@ -62,7 +62,6 @@ class Surroundings(NamedTuple):
 
 
 def look_around(config: Config) -> Surroundings:
-    """What this machine has for a configuration."""
     answers = _look_up_names(config)
     networks = look_at_networks(config, answers)
     others = _serial(config), _addresses(config), _names(config, answers), _control_socket(config)
@@ -185,7 +184,6 @@ class _Target(NamedTuple):
 
 
 def look_at_networks(config: Config, answers: Answers) -> Surroundings:
-    """What the networks of a configuration reach now."""
     targets = [
         _Target(peer.name, written, _hosts_of(written, answers))
         for peer in config.peers

@@ -35,7 +35,6 @@ class Address:
 
     @classmethod
     def of(cls, sockaddr: tuple[Any, ...]) -> Address:
-        """The address of an Internet socket address."""
         return cls(numeric_host(sockaddr), sockaddr[1])
 
     def __str__(self) -> str:

@@ -128,7 +128,6 @@ class Egress:
         return not self.queued_frames and self._bytes >= self.shape.overhead + payload_bytes
 
     def put(self, frames: Sequence[Frame], now: float) -> None:
-        """Let frames for the peer wait, in their order."""
         self._advance(now)
         if not self.queued_frames:
             self._waiting_since = now
@@ -183,7 +182,6 @@ class Egress:
         return [(waiting.frame, waiting.put_at) for waiting in self.lanes.pop_all()]
 
     def clear(self, now: float) -> None:
-        """Drop all frames that wait: the peer is lost."""
         self._advance(now)
         self.supply.leave(self)
         self.lanes.clear()

@@ -229,7 +229,6 @@ class Lanes:
         return popped
 
     def clear(self) -> None:
-        """Drop all frames that wait: the link is lost."""
         for waiting in self.pop_all():
             self._on_drop(waiting, EgressDrop.CLOSED)
 
