@@ -111,8 +111,8 @@ class Initiator:
         return interval_s if interval_s > self.settings.link.timers.retry_min_s else 0.0
 
     def shown(self, *, is_answering: bool) -> bytes:
-        """The certificate, if the next attempt shows it. To a peer that may have restarted, every other one does."""
-        return b"" if self.is_known and (is_answering or self.attempts % 2) else self.certificate
+        """The certificate, if the next attempt shows it. A peer that does not answer may have restarted."""
+        return b"" if self.is_known and is_answering else self.certificate
 
     def _jitter(self) -> float:
         return 1.0 + c.RETRY_JITTER * int.from_bytes(self._entropy(2), "big") / 2**16
