@@ -275,3 +275,12 @@ def test_burst_grows_with_the_peers_and_is_bounded(peers: int, expected: int) ->
     for peer in added:
         node.remove_peer(peer, 0.0)
     assert not bucket.has(0.0, c.INITIATIONS.burst + 1)
+
+
+def test_burst_is_there_for_peers_that_may_come_by_certificate() -> None:
+    """A daemon that starts knows none of them. Those that came are among them."""
+    node = Node(Secret(bytes([200]) * 32), seeded(0), 0.0, most_admitted=256)
+    node.add_peer(PeerSettings("m1", KeyPair(bytes([1]) * 32).public), 0.0)
+    bucket = node._handshakes.admission._initiations
+    assert bucket.has(0.0, 512)
+    assert not bucket.has(0.0, 513)

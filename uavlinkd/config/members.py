@@ -7,7 +7,9 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import Final
 
-from uavlinkd.config.model import FleetConfig, PeerConfig, PolicyData
+from uavlinkd.authority.constants import CERTIFIED_PEERS
+from uavlinkd.config.model import Config, FleetConfig, PeerConfig, PolicyData
+from uavlinkd.config.relay_rules import MOST_MEMBERS
 from uavlinkd.core import constants as c
 from uavlinkd.core.certificates import Certificate, MemberRole
 from uavlinkd.core.settings import Link, PeerSettings
@@ -29,6 +31,13 @@ DEFAULT_POLICIES: Final[Mapping[MemberRole, Mapping[MemberRole, PolicyData]]] = 
     },
 }
 """By the role of this daemon, then by that of the other one."""
+
+
+def most_members(config: Config) -> int:
+    """How many members by certificate the daemon may have at once."""
+    if config.fleet is None:
+        return 0
+    return CERTIFIED_PEERS if config.relay_server is None else MOST_MEMBERS
 
 
 def fleet_link(link: Link) -> Link:

@@ -43,11 +43,13 @@ class Message(NamedTuple):
 class Admission:
     """The budgets for handshake messages of one daemon. Each method returns if the message may cost that work.
 
-    ``is_known`` says whether a peer is configured or was last seen at an address.
+    ``is_known`` says whether a peer is configured or was last seen at an address. ``most_admitted``: peers that may
+    come by certificate.
     """
 
-    def __init__(self, is_known: Callable[[SocketAddress], bool], now: float) -> None:
+    def __init__(self, is_known: Callable[[SocketAddress], bool], now: float, most_admitted: int = 0) -> None:
         self._is_known = is_known
+        self._most_admitted = most_admitted
         # Two budgets: a flood of initiations must not keep our own handshakes from finishing.
         self._initiations = TokenBucket(*c.INITIATIONS, now)
         self._responses = TokenBucket(*c.INITIATIONS, now)
@@ -61,10 +63,14 @@ class Admission:
         self._prefixes = SourceLimiter(*c.COOKIE_REPLIES_PER_PREFIX)
         self._known = SourceLimiter(*c.COOKIE_REPLIES_PER_KNOWN)
         self._group = GroupBudget(now)
+        self.set_peers(0)
 
     def set_peers(self, count: int) -> None:
-        """So many peers may initiate at once, when this daemon starts again. The rate afterwards stays as it is."""
-        burst = min(c.INITIATIONS_BURST_PER_PEER * count, c.INITIATIONS_BURST_MOST)
+        """So many peers may initiate at once, when this daemon starts again. The rate afterwards stays as it is.
+
+        Those by certificate are not known then.
+        """
+        burst = min(c.INITIATIONS_BURST_PER_PEER * max(count, self._most_admitted), c.INITIATIONS_BURST_MOST)
         self._initiations.set_burst(max(c.INITIATIONS.burst, burst))
 
     def read(self, path: Path, now: float) -> None:

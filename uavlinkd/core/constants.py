@@ -134,7 +134,8 @@ each: with 200 peers 40 MB, and not before 34 hours of flight."""
 INITIATIONS = Rate(50.0, 50)
 """Messages a second that may reach a key exchange without a cookie. Beyond that we are under load."""
 INITIATIONS_BURST_PER_PEER = 2
-"""Or so many for each peer, if that is more: all of them initiate when this daemon starts again, some twice."""
+"""Or so many for each peer, if that is more: all of them initiate when this daemon starts again, some twice. Those
+that may come by certificate count too: a daemon that starts does not know them."""
 INITIATIONS_BURST_MOST = 2000
 """But no more than this: an attacker can use it up, which takes half a second of a desktop's core."""
 COOKIED_PER_SOURCE = Rate(10.0, 10)

@@ -47,6 +47,7 @@ class Node:
         now: monotonic seconds.
         screen: splits a payload into frames that may be old and frames that must be new. By default all must be new.
         admit: decides on certificates. Without it, none is valid.
+        most_admitted: by certificate.
     """
 
     def __init__(
@@ -57,6 +58,7 @@ class Node:
         *,
         screen: Screen = hold_all,
         admit: Admit | None = None,
+        most_admitted: int = 0,
     ) -> None:
         self._screen = screen
         self._entropy = entropy
@@ -66,7 +68,7 @@ class Node:
         self.facts = SocketFacts()
         """About the networks behind the sockets."""
         self._schedule = Schedule[Peer]()
-        identity, admission = KeyPair(private_key.reveal()), Admission(self._is_known, now)
+        identity, admission = KeyPair(private_key.reveal()), Admission(self._is_known, now, most_admitted)
         cookies = CookieJar(MacKeys(identity.public), entropy, now)
         self._handshakes = HandshakeReceiver(identity, cookies, self._indices, admission, self.facts, self._schedule)
         self._certificate = b""

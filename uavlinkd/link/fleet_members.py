@@ -13,19 +13,14 @@ from dataclasses import dataclass
 from typing import Final, Protocol
 
 from uavlinkd.authority import state_file
-from uavlinkd.authority.constants import (
-    CERTIFICATES,
-    CERTIFIED_PEERS,
-    CONTACTS_FIRST_S,
-)
+from uavlinkd.authority.constants import CERTIFICATES, CONTACTS_FIRST_S
 from uavlinkd.authority.enrolment import fingerprint_of
 from uavlinkd.authority.exchange import BulletinExchange, Reaction
 from uavlinkd.authority.places import longest_down
 from uavlinkd.authority.state_file import FleetState
 from uavlinkd.authority.trust import BulletinVerdict, Pinned, Trust
-from uavlinkd.config.members import member_peer, relay_member
+from uavlinkd.config.members import member_peer, most_members, relay_member
 from uavlinkd.config.model import Config, FleetConfig, PeerConfig
-from uavlinkd.config.relay_rules import MOST_MEMBERS
 from uavlinkd.core import constants as c
 from uavlinkd.core import outputs as o
 from uavlinkd.core.certificates import Certificate, parse_certificate, role_bits
@@ -89,6 +84,7 @@ class FleetMembers:
         self._links = daemon.links
         self._relays = daemon.relays
         self._relay = daemon.relay
+        self._most_members = most_members(config)
         self._membership = daemon.membership
         self._perform = daemon.perform
         self._evidence = daemon.evidence
@@ -226,7 +222,7 @@ class FleetMembers:
 
     def _make_room(self, now: float) -> None:
         """Give up the member that is down for longest, if there are as many as may be."""
-        if len(self.trust.held) < (CERTIFIED_PEERS if self._relay is None else MOST_MEMBERS):
+        if len(self.trust.held) < self._most_members:
             return
         contacts = {contact.key for contact in self._fleet.contacts}
         if (peer := longest_down(self._node.peers.values(), contacts)) is None:

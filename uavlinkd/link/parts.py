@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 
 from structlog.typing import FilteringBoundLogger
 
+from uavlinkd.config.members import most_members
 from uavlinkd.config.model import Config
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import LinkedPeer, Output
@@ -41,7 +42,9 @@ class DaemonParts:
         """The one in force."""
         self.log = log
         admit = None if config.fleet is None else self._admit
-        self.node = node = Node(config.private_key, os.urandom, now, screen=screen, admit=admit)
+        self.node = node = Node(
+            config.private_key, os.urandom, now, screen=screen, admit=admit, most_admitted=most_members(config)
+        )
         self.fleet: FleetMembers | None = None
         """Who is a member by certificate; None without a fleet."""
         self.links: dict[str, PeerLink] = {}
