@@ -8,7 +8,7 @@ import sys
 import time
 from base64 import b64encode
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkProcess
@@ -19,6 +19,8 @@ from tests.authority.signing import AUTHORITY, FLEET, bulletin, signed
 from tests.bench.relay.load import RELAY_CORE, Generator, host
 from tests.bench.relay.volleys import Flow, Hosts, Received
 from tests.daemon.toml import to_toml
+from uavlinkd.authority.exchange import BulletinExchange
+from uavlinkd.authority.trust import Trust
 from uavlinkd.config.build import TIMERS
 from uavlinkd.config.keys import decode_key, encode_key, generate_private_key, public_key_text, write_secret_file
 from uavlinkd.config.model import RelayConfig
@@ -27,9 +29,10 @@ from uavlinkd.core import outputs as o
 from uavlinkd.core import wire
 from uavlinkd.core.certificates import Certificate, MemberRole
 from uavlinkd.core.crypto import KeyPair, Secret
+from uavlinkd.core.drops import Drop
 from uavlinkd.core.node import Node
 from uavlinkd.core.path import RELAY_HOST, Path
-from uavlinkd.core.relay_records import RELAYED
+from uavlinkd.core.relay_records import RELAYED, FleetRecord
 from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.lab.child_processes import end_with_parent
 from uavlinkd.lab.evaluation.records import cpu_seconds
@@ -53,8 +56,9 @@ class Member:
         self.hosts = hosts
         now = time.monotonic()
         self.node = Node(Secret(private), os.urandom, now)
-        certificate = Certificate(FLEET, 2 + number, MemberRole.RELAY, (0, 0), f"member{number}")
-        self.node.set_certificate(signed(certificate, self.key))
+        certificate = signed(Certificate(FLEET, 2 + number, MemberRole.RELAY, (0, 0), f"member{number}"), self.key)
+        self.node.set_certificate(certificate)
+        self.exchange = BulletinExchange(Trust(AUTHORITY, self.key, certificate, bulletin(1)), os.urandom)
         settings = PeerSettings(RELAY_HOST + "relay", relay.key, None, LINK, is_certified=relay.has_fleet)
         self.link = RelayLink(RelayConfig(settings, ()), self.node, RelayHandles(), lambda keys, now: None, now)
         self.path = Path(0, self.relay)
@@ -87,6 +91,9 @@ class Member:
             self.perform(self.node.handle_timeout(now))
         if self.link.next_at <= now:
             self.perform(self.link.do_due(now))
+        if self.exchange.next_at <= now:
+            for _, record in self.exchange.do_due(now):
+                self.perform(self.node.send_record(self.link.peer, None, record, now))
 
     def receive(self, datagram: bytes, now: float) -> None:
         """A datagram that is not relayed data."""
@@ -94,18 +101,24 @@ class Member:
         self.do_timers(now)
 
     def perform(self, outputs: Sequence[o.Output]) -> None:
+        now, peer = time.monotonic(), self.link.peer
         for output in outputs:
             if isinstance(output, o.Transmit):
                 self.initiations += output.datagram[0] == wire.INITIATION
                 self.envelopes += output.datagram[:1] in wire.ENVELOPE_STARTS
                 self.hosts.send(self.host, output.datagram, self.relay)
             elif isinstance(output, o.RecordReceived):
-                self._receive_record(output, time.monotonic())
+                self._receive_record(output, now)
             elif not isinstance(output, o.Deliver | o.Dropped):
-                self.link.on_event(output, time.monotonic())
+                self.link.on_event(output, now)
+                if isinstance(output, o.SessionEstablished) and peer.session_with(c.FEATURE_FLEET, now) is not None:
+                    self.exchange.on_handshake(peer.settings.public_key, 2 * peer.answer_s, now)
 
     def _receive_record(self, received: o.RecordReceived, now: float) -> None:
-        if self.link.on_record(received, now) is None:
+        if isinstance(received.record, FleetRecord):
+            with suppress(Drop):  # introductions: it knows the key
+                self.exchange.receive(self.link.peer.settings.public_key, received.record, received.order, now)
+        elif self.link.on_record(received, now) is None:
             was_bound = bool(self.handle)
             paths = (path for key in self.link.keys for at in self.link.paths_to(key) for path in at)
             self.handle = max((path.address[1] for path in paths), default=0)
