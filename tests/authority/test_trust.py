@@ -10,14 +10,7 @@ from hypothesis import strategies as st
 
 from tests.authority.signing import AUTHORITY, CERTIFICATE, FLEET, bulletin, published, signed, vehicle
 from uavlinkd.authority.trust import BulletinVerdict, Pinned, Trust
-from uavlinkd.core.certificates import (
-    GENERATION,
-    MOST_REVOKED,
-    Bulletin,
-    Certificate,
-    MemberRole,
-    parse_bulletin,
-)
+from uavlinkd.core.certificates import GENERATION, MOST_REVOKED, Bulletin, Certificate, MemberRole, parse_bulletin
 from uavlinkd.core.drops import Drop, DropReason
 
 OWN, KEY, OTHER = (bytes((number,)) * 32 for number in (1, 2, 3))

@@ -88,10 +88,7 @@ def write_report(folder: Path, name: str) -> str:
 
 def page_text(findings: Findings) -> str:
     facts = findings.facts
-    head = [
-        f"Made by `{facts.get('command', 'python -m tests.bench')}`.",
-        _MEASURED,
-    ]
+    head = [f"Made by `{facts.get('command', 'python -m tests.bench')}`.", _MEASURED]
     parts = [
         ReportSection("CPU and highest rate", tables=[_costs(findings)]),
         ReportSection("Latency, memory, bytes", tables=[_rest(findings)]),

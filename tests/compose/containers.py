@@ -47,9 +47,7 @@ class Containers(Cluster):
 
     async def open(self) -> None:
         settings = FleetSettings(
-            swarm=True,
-            control_socket="/run/uavlinkd/control.sock",
-            ground_station_url="udpin:127.0.0.1:14550",
+            swarm=True, control_socket="/run/uavlinkd/control.sock", ground_station_url="udpin:127.0.0.1:14550"
         )
         fleet = self._folder / "fleet"
         create(fleet, settings, drones=3, stations=1, at=[Address("ground-station", 5790)])

@@ -95,11 +95,7 @@ def make(case: Case) -> Vector:
         draw=draw("initiator"),
     )
     responder = Responder(
-        theirs,
-        ours.public_key().public_bytes_raw(),
-        psk=psk,
-        parameters=case.responder,
-        draw=draw("responder"),
+        theirs, ours.public_key().public_bytes_raw(), psk=psk, parameters=case.responder, draw=draw("responder")
     )
     initiation = initiator.initiation(certificate=case.certificate)
     response, answered = responder.answer(initiation)

@@ -4,18 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.core.harness import (
-    AT_A,
-    ELSEWHERE,
-    KEY_A,
-    KEY_B,
-    Pair,
-    flipped,
-    initiation_of,
-    reasons,
-    seeded,
-    state_of,
-)
+from tests.core.harness import AT_A, ELSEWHERE, KEY_A, KEY_B, Pair, flipped, initiation_of, reasons, seeded, state_of
 from uavlinkd.core import constants as c
 from uavlinkd.core import wire
 from uavlinkd.core.cookie import OTHERS, CookieJar, MacKeys, mac1_of, version_of

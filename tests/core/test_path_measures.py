@@ -242,8 +242,7 @@ OLD_S = REGULAR_AFTER_S
             ["ask 0 0 old", "count 1 5 0", "ask 2 2 old", "count 3 5 2", "count 4 6 2"], id="a later report explains"
         ),
         pytest.param(
-            ["ask 0 9 old", "count 1 0 0", "count 2 4 4", "ask 22 0 old", "count 22 5 4"],
-            id="lost along one path",
+            ["ask 0 9 old", "count 1 0 0", "count 2 4 4", "ask 22 0 old", "count 22 5 4"], id="lost along one path"
         ),
         pytest.param(["ask 0 5 old", "count 1 2 2", "count 2 5 5", "count 3 6 5"], id="several gaps"),
         pytest.param(["answer 0 0 old", "count 1 3 3"], id="answers alone"),

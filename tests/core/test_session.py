@@ -31,10 +31,7 @@ def pair(parameters: Parameters = PLAIN) -> tuple[Session, Session]:
     """Initiator's and responder's session, from second 100 to second 280."""
     transport = Secret(b"\1" * 32), Secret(b"\2" * 32)
     ours, theirs = (Keys(X25519, transport, bytes(range(32)), parameters, remote_index=index) for index in (9, 7))
-    return (
-        Session(ours, 7, 100.0, 180.0, is_initiator=True),
-        Session(theirs, 9, 100.0, 180.0, is_initiator=False),
-    )
+    return (Session(ours, 7, 100.0, 180.0, is_initiator=True), Session(theirs, 9, 100.0, 180.0, is_initiator=False))
 
 
 def opened(session: Session, datagram: bytes, now: float = 100.0) -> bytes | DropReason | None:

@@ -45,9 +45,7 @@ async def swarm(stage: Stage) -> Swarm:
     return await start_swarm(stage, [])
 
 
-async def test_station_that_relays(
-    swarm: Swarm,
-) -> None:
+async def test_station_that_relays(swarm: Swarm) -> None:
     """Vehicles meet there, and its bulletin revokes one of them at the other, which tells a member that was off."""
     fleet, ground, one, two = swarm
     await two.stop()
@@ -79,9 +77,7 @@ async def test_member_gets_a_new_key(stage: Stage, swarm: Swarm) -> None:
     await two.until(lambda status: is_up(status, "v1") and status["peers"]["v1"]["public_key"] == new.public_key)
 
 
-async def test_members_get_newer_certificates(
-    swarm: Swarm,
-) -> None:
+async def test_members_get_newer_certificates(swarm: Swarm) -> None:
     """All get new certificates, each along live links. Then the least serial rises: no link ends."""
     fleet, *daemons = swarm
     ground = daemons[0]

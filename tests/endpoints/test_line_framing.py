@@ -12,14 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20.all import MAVLink
 
-from uavlinkd.endpoints.line_framing import (
-    MAX_ENCODED,
-    LineDecoder,
-    Noise,
-    encode,
-    parse_report,
-    report_bytes,
-)
+from uavlinkd.endpoints.line_framing import MAX_ENCODED, LineDecoder, Noise, encode, parse_report, report_bytes
 
 DATAGRAMS = [bytes(20), b"", b"\x40" + bytes(range(1, 255)) * 2, b"\x01" * 147, bytes(range(256)), b"\xfe\xfd" * 60]
 FIGURES = {"rssi": 200, "remrssi": 190, "txbuf": 98, "noise": 50, "remnoise": 0xFE, "rxerrors": 0, "fixed": 3}

@@ -32,10 +32,7 @@ class NetworkFault(NamedTuple):
 
 NETWORK_FAULTS: Mapping[str, NetworkFault] = {
     "interface_down": NetworkFault(
-        "the interface is down",
-        f"ip link set {_DEVICE} down",
-        f"ip link set {_DEVICE} up",
-        ("ENETUNREACH", "EINVAL"),
+        "the interface is down", f"ip link set {_DEVICE} down", f"ip link set {_DEVICE} up", ("ENETUNREACH", "EINVAL")
     ),
     "interface_gone": NetworkFault(
         "the interface and its address are deleted", f"ip link delete {_DEVICE}", "", ("ENETUNREACH", "EINVAL")

@@ -23,14 +23,7 @@ from uavlinkd.core.certificates import MemberRole
 from uavlinkd.fleet import operations, transaction
 from uavlinkd.fleet.authority_key import AUTHORITY_FILE, SUCCESSOR_FILE
 from uavlinkd.fleet.files import reply_for
-from uavlinkd.fleet.manifest import (
-    Fleet,
-    FleetError,
-    FleetSettings,
-    check_settings,
-    fill,
-    read_manifest,
-)
+from uavlinkd.fleet.manifest import Fleet, FleetError, FleetSettings, check_settings, fill, read_manifest
 from uavlinkd.fleet.signing import Identity
 from uavlinkd.fleet.transaction import lock
 from uavlinkd.lab.child_processes import end_with_parent
@@ -203,7 +196,7 @@ def test_added_member_changes_no_other_file(folder: Path) -> None:
     assert result.changed == ("scout",)
     after = snapshot(folder)
     assert {path for path in after if after[path] != before.get(path)} == {
-        *("fleet.toml", "scout/scout.toml", "scout/scout.key"),
+        *("fleet.toml", "scout/scout.toml", "scout/scout.key")
     }
 
 

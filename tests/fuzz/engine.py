@@ -187,14 +187,7 @@ class Hunt(NamedTuple):
     """The script that escaped."""
 
 
-def hunt(
-    target: Target,
-    *,
-    kept: Sequence[bytes],
-    seed: int = 0,
-    runs: float = inf,
-    seconds: float = inf,
-) -> Hunt:
+def hunt(target: Target, *, kept: Sequence[bytes], seed: int = 0, runs: float = inf, seconds: float = inf) -> Hunt:
     """Run the kept inputs and then variations of them until a script escapes, or the runs or the time are used up."""
     run = target.make()
     ends_at = time.monotonic() + seconds

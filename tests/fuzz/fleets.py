@@ -21,14 +21,7 @@ from uavlinkd.authority.trust import Trust
 from uavlinkd.core.certificates import Bulletin, MemberRole, digest_of, parse_bulletin, parse_certificate
 from uavlinkd.core.crypto import AuthorityKey, sha256
 from uavlinkd.core.drops import Drop
-from uavlinkd.core.relay_records import (
-    BulletinRecord,
-    CertificateRecord,
-    FleetRecord,
-    Have,
-    Who,
-    parse_record,
-)
+from uavlinkd.core.relay_records import BulletinRecord, CertificateRecord, FleetRecord, Have, Who, parse_record
 
 OWN: Final = b"own." * 8
 KEYS: Final = tuple(bytes((number,)) * 32 for number in (1, 2, 3))

@@ -15,17 +15,7 @@ from typing import Final
 
 from tests.core.harness import ONLY_COUNTED, exchange, of, state_of
 from tests.fuzz.engine import Run, Script
-from tests.fuzz.stages import (
-    LINKS,
-    PSK,
-    Stage,
-    copier,
-    idle,
-    initiator,
-    responder,
-    session,
-    with_suite,
-)
+from tests.fuzz.stages import LINKS, PSK, Stage, copier, idle, initiator, responder, session, with_suite
 from uavlinkd.core import constants as c
 from uavlinkd.core import wire
 from uavlinkd.core.cookie import MacKeys, mac1_of

@@ -10,19 +10,7 @@ from dataclasses import dataclass, replace
 from types import BuiltinFunctionType, FunctionType, ModuleType
 from typing import Any, Final, TypeVar
 
-from tests.core.harness import (
-    AT_A,
-    AT_B,
-    ELSEWHERE,
-    KEY_C,
-    PLAIN,
-    UNUSED_INDEX,
-    Pair,
-    Side,
-    datagrams,
-    only,
-    quiet,
-)
+from tests.core.harness import AT_A, AT_B, ELSEWHERE, KEY_C, PLAIN, UNUSED_INDEX, Pair, Side, datagrams, only, quiet
 from uavlinkd.core import wire
 from uavlinkd.core.cookie import MacKeys, mac1_of
 from uavlinkd.core.crypto import AeadKey, KeyPair, MacKey, Secret

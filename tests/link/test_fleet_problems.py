@@ -144,7 +144,7 @@ async def test_revoked_here_and_elsewhere(tmp_path: Path) -> None:
     member.have(2, bulletin(2, 2, 7, 9), serial=9)
     findings = member.findings()
     assert set(findings) == {
-        *("own_certificate_revoked", "contact_refused", "bulletin_awaited", "revoked_but_pinned"),
+        *("own_certificate_revoked", "contact_refused", "bulletin_awaited", "revoked_but_pinned")
     }
     assert "revokes the certificate of this daemon (serial 7)" in findings["own_certificate_revoked"].text
     assert "the contact gs (serial 2) is refused: the bulletin revokes" in findings["contact_refused"].text

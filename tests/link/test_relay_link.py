@@ -338,12 +338,7 @@ def test_token_after_its_answers_ends_the_test(tester: FilterTester) -> None:
 
 @pytest.mark.parametrize(
     ("path", "change"),
-    [
-        (AT_B, b""),
-        (ELSEWHERE, b""),
-        (Path(AT_B.socket + 1, OTHER_PORT.address), b""),
-        (OTHER_PORT, b"\0"),
-    ],
+    [(AT_B, b""), (ELSEWHERE, b""), (Path(AT_B.socket + 1, OTHER_PORT.address), b""), (OTHER_PORT, b"\0")],
     ids=["the relay's own port", "another host", "another socket", "another length"],
 )
 def test_other_datagrams_with_the_token_show_nothing(path: Path, change: bytes, tester: FilterTester) -> None:

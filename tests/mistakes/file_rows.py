@@ -136,12 +136,7 @@ _ROWS: tuple[tuple[str, str, str, Change], ...] = (
     ),
     ("13", "key file that others may read", r"chmod 600", _mode),
     ("14", "key file missing", r"uavlinkd keygen --out", _replaced("drone0.key", "drone9.key")),
-    (
-        "15",
-        "closing quotation mark missing",
-        r':1:.*write name = "drone0"',
-        _replaced('"drone0"\n', '"drone0\n'),
-    ),
+    ("15", "closing quotation mark missing", r':1:.*write name = "drone0"', _replaced('"drone0"\n', '"drone0\n')),
     ("15b", "`[peer]`", r"\[\[peer\]\]", _replaced("[[peer]]", "[peer]")),
     (
         "15c",
@@ -270,12 +265,7 @@ _FLEET: tuple[tuple[str, str, str, Make], ...] = (
     ),
     ("56b", "fleet whose members would not meet", r"needed \(init --relay", _fleet("init", "--drones", "2", *_NEW)),
     ("56c", "fleet of 300", r"at most 255 members", _fleet("init", "--drones", "300", *_NEW)),
-    (
-        "56d",
-        "unknown suite",
-        r"does not exist: use one of x25519",
-        _fleet("init", "--suite", "rsa", *_NEW),
-    ),
+    ("56d", "unknown suite", r"does not exist: use one of x25519", _fleet("init", "--suite", "rsa", *_NEW)),
     ("56e", "relay without a port", r"--relay: has no port", _fleet("init", "--relay", "relay.example.org", *_NEW)),
     ("56f", "address of no machine", r"write the one that the others", _fleet("init", "--relay", "0.0.0.0:1", *_NEW)),
     (
@@ -286,12 +276,7 @@ _FLEET: tuple[tuple[str, str, str, Make], ...] = (
     ),
     ("56h", "name that exists", r'has a "drone1" already', _fleet("add", "drone1")),
     ("56i", "name with a space", r"write 1 to 21 of a-z", _fleet("add", "drone 9")),
-    (
-        "56j",
-        "system id that is taken",
-        r"would have the system id of drone1",
-        _fleet("add", "scout", "--id", "1"),
-    ),
+    ("56j", "system id that is taken", r"would have the system id of drone1", _fleet("add", "scout", "--id", "1")),
     ("56k", "unknown member", r'has no "drone9": its members are', _fleet("revoke", "drone9")),
     ("56l", "name that looks like another", r'looks like "drone1"', _fleet("add", "dronel")),
 )

@@ -76,12 +76,7 @@ RELAY_ROWS = (
         check=r'relay "m88-there": .*key of an example.*`uavlinkd pubkey` printed',
     ),
     Mistake("89", "key file of the relay that others may read", scenes.key_file, check=r"chmod 600"),
-    Mistake(
-        "90",
-        "port of the relay in use",
-        scenes.port_in_use,
-        command=r"ss -lntup",
-    ),
+    Mistake("90", "port of the relay in use", scenes.port_in_use, command=r"ss -lntup"),
     Mistake(
         "91",
         "`uavlinkd relay` with a vehicle's file",

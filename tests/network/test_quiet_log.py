@@ -47,9 +47,7 @@ class LoggedDaemon:
         assert drone.node is not None
         limits, self.captured = LineLimits(), LogCapture()
         log = structlog.wrap_logger(
-            None,
-            processors=[self.captured],
-            wrapper_class=structlog.make_filtering_bound_logger(logging.DEBUG),
+            None, processors=[self.captured], wrapper_class=structlog.make_filtering_bound_logger(logging.DEBUG)
         )
         self.drops, self.events = DropSummary(log, limits), EventLog(log, limits)
         carriage = Carriage(drone.node, lambda _: None)

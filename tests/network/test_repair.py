@@ -276,8 +276,7 @@ def promises() -> dict[tuple[str, float], tuple[float, float]]:
 
 
 @pytest.mark.parametrize(
-    ("what", "loss"),
-    [pytest.param(*key, marks=() if key in SHORT else pytest.mark.long) for key in promises()],
+    ("what", "loss"), [pytest.param(*key, marks=() if key in SHORT else pytest.mark.long) for key in promises()]
 )
 def test_as_much_arrives_as_promised(what: str, loss: float) -> None:
     """Alone, and beside a path that drops everything or is 1.9 s late; the latter only up to 50 %."""

@@ -51,10 +51,7 @@ def test_newer_certificate_of_a_member_takes_the_place_of_the_one_before() -> No
     assert operator.ask(VEHICLE, after=8) == [one.key]
     assert operator.ask(VEHICLE, after=9) == []
     relay.service.introductions.renew(
-        {
-            one.key: held._replace(certificate=held.certificate._replace(serial=11)),
-            bytes(32): held,
-        }
+        {one.key: held._replace(certificate=held.certificate._replace(serial=11)), bytes(32): held}
     )
     assert operator.ask(VEHICLE, after=10) == [one.key]
     relay.service.introductions.renew({})

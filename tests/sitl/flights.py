@@ -252,10 +252,7 @@ async def two_vehicles(world: World, pilots: list[Pilot]) -> Figures:
         assert stayed_m < FOLLOW_OFFSET_M / 2, "the other vehicle moved too"
         await pilots[1].go_to(starts[1].moved(-LEG_M, 0.0))
         await asyncio.gather(*(pilot.return_and_land() for pilot in pilots))
-        return {
-            "parameters": [len(table) for _, table in tables],
-            "parameters_s": [seconds for seconds, _ in tables],
-        }
+        return {"parameters": [len(table) for _, table in tables], "parameters_s": [seconds for seconds, _ in tables]}
 
     figures = await counted(world, act)
     if world.daemons:

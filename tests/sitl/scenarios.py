@@ -65,11 +65,7 @@ SCENARIOS = (
     ),
     Scenario("two-vehicles", two_vehicles, ("ardupilot", "px4", "own"), vehicles=2),
     Scenario(
-        "follow-me",
-        lambda world, pilots: follow_me(world, *pilots),
-        kinds=("ardupilot",),
-        vehicles=2,
-        swarm=True,
+        "follow-me", lambda world, pilots: follow_me(world, *pilots), kinds=("ardupilot",), vehicles=2, swarm=True
     ),
     Scenario("outages", _alone(outages), can_cut=True),
     Scenario("restarts", _alone(restarts)),
@@ -151,11 +147,7 @@ async def _fly(run: Run, record: Record, folder: Path) -> None:
         for system in systems
     ]
     async with flying(
-        simulators,
-        scenario,
-        BY_NAME[run.condition],
-        with_daemons=run.with_daemons,
-        maintenance_port=maintenance_port,
+        simulators, scenario, BY_NAME[run.condition], with_daemons=run.with_daemons, maintenance_port=maintenance_port
     ) as world:
         pilots = [Pilot(world.station, system, kind) for system in systems]
         record.version = await version(world.station, 1)

@@ -49,8 +49,7 @@ def test_what_may_not_come_out_is_a_fault(ledger: Ledger, receiver: str, frame: 
 
 
 @pytest.mark.parametrize(
-    ("before", "is_fault"),
-    [(b"\x02" * 7, False), (b"\x02" * 280, False), (b"\x02" * 281, True), (b"\x02\xfe", True)],
+    ("before", "is_fault"), [(b"\x02" * 7, False), (b"\x02" * 280, False), (b"\x02" * 281, True), (b"\x02\xfe", True)]
 )
 def test_separator_bytes_may_precede_a_frame(ledger: Ledger, before: bytes, *, is_fault: bool) -> None:
     """Neither too many, nor with a start byte."""

@@ -83,9 +83,7 @@ def check_flown(flight: Flight) -> None:
 async def fly_with_mavsdk(url: str) -> Seen:
     """MAVSDK's own library flies the vehicle."""
     process = await asyncio.create_subprocess_exec(
-        *end_with_parent(PYTHON, str(CLIENTS), url),
-        stdout=asyncio.subprocess.PIPE,
-        stderr=asyncio.subprocess.STDOUT,
+        *end_with_parent(PYTHON, str(CLIENTS), url), stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT
     )
     try:
         output, _ = await asyncio.wait_for(process.communicate(), TIMEOUT_S)

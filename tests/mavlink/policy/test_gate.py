@@ -363,11 +363,7 @@ def test_refused_commands_are_counted_by_name() -> None:
         (ANY_OTHER, ANY_OTHER, Refusal.UNKNOWN_MESSAGE): 1,
     }
     assert gate.refused_systems == {9: 2}
-    assert gate.totals == {
-        Refusal.MESSAGE_NOT_ALLOWED: 5,
-        Refusal.FOREIGN_SYSTEM: 2,
-        Refusal.UNKNOWN_MESSAGE: 1,
-    }
+    assert gate.totals == {Refusal.MESSAGE_NOT_ALLOWED: 5, Refusal.FOREIGN_SYSTEM: 2, Refusal.UNKNOWN_MESSAGE: 1}
 
 
 entries = st.sampled_from(

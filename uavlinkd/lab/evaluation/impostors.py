@@ -37,15 +37,7 @@ from uavlinkd.lab.evaluation.tampering_bench import Bench, KeyHolder
 from uavlinkd.lab.evaluation.tampering_plan import HANDSHAKE, KEYS, TrialPlan
 from uavlinkd.lab.evaluation.tampering_records import RELAY
 from uavlinkd.lab.mitm.anatomy import DatagramKind, kind_of
-from uavlinkd.lab.mitm.attack import (
-    NEVER,
-    Action,
-    Direction,
-    Intervention,
-    Operation,
-    PassiveAttack,
-    Send,
-)
+from uavlinkd.lab.mitm.attack import NEVER, Action, Direction, Intervention, Operation, PassiveAttack, Send
 
 RETRY_S = 0.02
 """How often the attacker initiates, much faster than a daemon, and how often it sends frames."""
@@ -298,14 +290,7 @@ def key_attacks(stage: DaemonStage) -> list[KeyAttack]:
 
 async def run_key_attack(bench: Bench, attack: KeyAttack) -> None:
     now, lies = monotonic(), attack.lies
-    impostor = Impostor(
-        attack.name,
-        attack.disguises,
-        now,
-        relays=attack.relays,
-        frames=attack.frames,
-        lies=lies,
-    )
+    impostor = Impostor(attack.name, attack.disguises, now, relays=attack.relays, frames=attack.frames, lies=lies)
     impostor.records = cycle(attack.records)
 
     def total(name: str) -> int:

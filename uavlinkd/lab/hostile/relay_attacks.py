@@ -15,16 +15,7 @@ from typing import ClassVar, Final, Protocol
 from uavlinkd.core import constants as c
 from uavlinkd.core.relay_records import Bound, CertificateRecord, wrap
 from uavlinkd.lab.mitm.anatomy import DatagramKind
-from uavlinkd.lab.mitm.attack import (
-    NEVER,
-    Action,
-    AttackContext,
-    Direction,
-    Intervention,
-    Operation,
-    Send,
-    Timed,
-)
+from uavlinkd.lab.mitm.attack import NEVER, Action, AttackContext, Direction, Intervention, Operation, Send, Timed
 from uavlinkd.lab.mitm.attacks.forgery import COMMAND_FRAMES
 
 RECORDED: Final = 512

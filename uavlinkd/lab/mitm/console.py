@@ -44,9 +44,7 @@ def add_attack_options(parser: argparse.ArgumentParser, parse: Callable[[str], o
     parser.add_argument("--log", metavar="FILE", type=Path, help="append each intervention to FILE, in JSON lines")
     parser.add_argument("--seconds", metavar="N", type=read_by(_seconds), help="stop after N seconds")
     parser.add_argument(
-        "--ask",
-        metavar="REQUEST",
-        help=f"send a request to the running process by its control socket: {requests}",
+        "--ask", metavar="REQUEST", help=f"send a request to the running process by its control socket: {requests}"
     )
 
 

@@ -74,12 +74,7 @@ class Autopilot:
         self.pilot = MissionPilot(self.vehicle, self.missions)
         self.streams = Streams(default_rates(self.settings.attitude_rate_hz), started_at)
         self.commands = Commands(self)
-        self._telemetry = Telemetry(
-            self.vehicle,
-            self.missions,
-            seed=self.settings.seed,
-            unix_epoch_us=unix_epoch_us,
-        )
+        self._telemetry = Telemetry(self.vehicle, self.missions, seed=self.settings.seed, unix_epoch_us=unix_epoch_us)
         self._codec = mavlink.MAVLink(None, self.settings.system_id, COMPONENT_ID)
         self._on_event = on_event
         self._started_at = started_at

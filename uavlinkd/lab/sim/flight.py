@@ -28,10 +28,7 @@ class Flight:
         self._loop = asyncio.get_running_loop()
         self._started_at = self._loop.time()
         self.autopilot = Autopilot(
-            settings,
-            started_at=self._started_at,
-            unix_epoch_us=time.time_ns() // 1000,
-            on_event=on_event,
+            settings, started_at=self._started_at, unix_epoch_us=time.time_ns() // 1000, on_event=on_event
         )
         self._timer: asyncio.TimerHandle | None = None
         self._deadline = self._started_at

@@ -180,11 +180,7 @@ def _item(message: Message) -> Item:
     return Item(message.frame, message.command, 0, message.autocontinue, four, message.x, message.y, message.z)
 
 
-LOCAL_FRAMES: Final = (
-    mavlink.MAV_FRAME_LOCAL_NED,
-    mavlink.MAV_FRAME_LOCAL_ENU,
-    mavlink.MAV_FRAME_LOCAL_OFFSET_NED,
-)
+LOCAL_FRAMES: Final = (mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_LOCAL_ENU, mavlink.MAV_FRAME_LOCAL_OFFSET_NED)
 
 
 ABSOLUTE_FRAMES: Final = (mavlink.MAV_FRAME_GLOBAL, mavlink.MAV_FRAME_GLOBAL_INT)

@@ -10,16 +10,7 @@ from collections import deque
 from typing import ClassVar
 
 from uavlinkd.lab.mitm.anatomy import DatagramKind, has_cookie, kind_of, matches_kind
-from uavlinkd.lab.mitm.attack import (
-    CATCH_UP_LIMIT,
-    NEVER,
-    Action,
-    Attack,
-    AttackError,
-    Direction,
-    Operation,
-    Send,
-)
+from uavlinkd.lab.mitm.attack import CATCH_UP_LIMIT, NEVER, Action, Attack, AttackError, Direction, Operation, Send
 from uavlinkd.lab.mitm.options import STRANGERS
 
 RECORD_LIMIT = 4096
