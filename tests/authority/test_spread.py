@@ -1,25 +1,116 @@
-"""How fast a bulletin reaches all members, and what holds in any history of links, restarts and disks."""
+"""How fast a bulletin reaches all members, with the real rules and the real exchange, in virtual time."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from itertools import combinations
-from typing import Any
-from unittest.mock import ANY
+import heapq
+import random
+from collections.abc import Callable, Iterable
+from itertools import combinations, count
+from math import inf
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from tests.authority.signing import bulletin
-from tests.authority.simulation import SimulatedFleet, key_of
-from uavlinkd.authority.constants import HAVE_INTERVAL_S
+from tests.authority.signing import AUTHORITY, bulletin, signed, vehicle
+from uavlinkd.authority.exchange import BulletinExchange, Reaction
+from uavlinkd.authority.trust import Trust
+from uavlinkd.core.relay_records import FleetRecord, parse_record
+from uavlinkd.core.wire import LONG_HEADER_BYTES
 
+ONE_WAY_S = 0.02
+WRITE_S = 0.005
+OVERHEAD_BYTES = LONG_HEADER_BYTES + 1 + 16 + 16
 MEMBERS = 50
 NEW = bulletin(2, 101, 102, 103)
 MESH = tuple(combinations(range(1, MEMBERS + 1), 2))
 STAR = tuple((1, other) for other in range(2, MEMBERS + 1))
 LINE = tuple((number, number + 1) for number in range(1, MEMBERS))
+
+
+def key_of(number: int) -> bytes:
+    """The static public key of a member."""
+    return number.to_bytes(2, "big") * 16
+
+
+class Member:
+    """What its daemon knows, and the members with which it has a link."""
+
+    def __init__(self, number: int, entropy: Callable[[int], bytes]) -> None:
+        self.key = key_of(number)
+        self.trust = Trust(AUTHORITY, self.key, signed(vehicle(number, number), self.key), bulletin(1))
+        self.exchange = BulletinExchange(self.trust, entropy)
+        self.up: set[int] = set()
+        self.wakes_at = inf
+
+
+class Fleet:
+    """The members, and what is on its way between them."""
+
+    def __init__(self, links: Iterable[tuple[int, int]]) -> None:
+        self._rng = random.Random(1)
+        self.loss = 0.0
+        self.now = 100.0
+        self.members = {number: Member(number, self._rng.randbytes) for number in range(1, MEMBERS + 1)}
+        self.bytes_sent = 0
+        self._coming: list[tuple[float, int, Callable[[], None]]] = []
+        self._numbers = count(1)
+        for one, other in links:
+            for here, there in ((one, other), (other, one)):
+                self.members[here].up.add(there)
+                self.members[here].exchange.on_handshake(key_of(there), 4 * ONE_WAY_S, self.now)
+
+    def publish(self, number: int, data: bytes) -> None:
+        """The operator gives a bulletin to one member."""
+        member = self.members[number]
+        self._react(member, member.exchange.publish(data, self.now)[1])
+
+    def have_all(self, number: int) -> bool:
+        """Whether each member enforces the bulletin of this number."""
+        return all(member.trust.bulletin.number == number for member in self.members.values())
+
+    def run(self, seconds: float, until: Callable[[], bool] = lambda: False) -> float:
+        """Let time pass until a condition holds. Returns how long it took, infinity if it did not hold."""
+        start, end = self.now, self.now + seconds
+        for member in self.members.values():
+            self._wake(member)
+        while not until():
+            if not self._coming or self._coming[0][0] > end:
+                self.now = end
+                return inf
+            self.now, _, action = heapq.heappop(self._coming)
+            action()
+        return self.now - start
+
+    def _later(self, seconds: float, action: Callable[[], None]) -> None:
+        heapq.heappush(self._coming, (self.now + seconds, next(self._numbers), action))
+
+    def _wake(self, member: Member) -> None:
+        if member.exchange.next_at < member.wakes_at:
+            member.wakes_at = member.exchange.next_at
+            self._later(max(0.0, member.wakes_at - self.now), lambda: self._send(member))
+
+    def _send(self, member: Member) -> None:
+        member.wakes_at = inf
+        for key, record in member.exchange.do_due(self.now):
+            order, data = next(self._numbers), record.encode()
+            self.bytes_sent += len(data) + OVERHEAD_BYTES
+            if self._rng.random() >= self.loss:
+                other = self.members[int.from_bytes(key[:2], "big")]
+                self._later(ONE_WAY_S, lambda a=(other, member.key, data, order): self._deliver(*a))  # type: ignore[misc]
+        self._wake(member)
+
+    def _deliver(self, member: Member, sender: bytes, data: bytes, order: int) -> None:
+        record = parse_record(data)
+        assert isinstance(record, FleetRecord)
+        self._react(member, member.exchange.receive(sender, record, order, self.now))
+
+    def _react(self, member: Member, reaction: Reaction) -> None:
+        if reaction.persists:
+            self._later(WRITE_S, lambda: self._write(member))
+        self._wake(member)
+
+    def _write(self, member: Member) -> None:
+        member.exchange.note_persisted(member.trust.bulletin.number, member.trust.digest)
+        self._wake(member)
 
 
 @pytest.mark.parametrize(
@@ -39,13 +130,11 @@ def test_last_of_fifty_members_has_it(
     links: Iterable[tuple[int, int]], loss: float, within_s: float, most_kb: int
 ) -> None:
     """Round trips of 40 ms. Once all have it, nothing more is sent."""
-    fleet = SimulatedFleet(MEMBERS, seed=1)
-    for one, other in links:
-        fleet.link(one, other)
+    fleet = Fleet(links)
     fleet.run(1.0)
     fleet.loss, fleet.bytes_sent = loss, 0
     fleet.publish(1, NEW)
-    assert fleet.run(60.0, lambda: set(fleet.newest()) == {2}) <= within_s
+    assert fleet.run(60.0, lambda: fleet.have_all(2)) <= within_s
     fleet.run(60.0)
     assert fleet.bytes_sent <= 1000 * most_kb
     fleet.loss, fleet.bytes_sent = 0.0, 0
@@ -53,110 +142,3 @@ def test_last_of_fifty_members_has_it(
     assert fleet.bytes_sent == 0
     for member in fleet.members.values():
         assert all(member.exchange.shown(key_of(other)) == 2 for other in member.up)
-
-
-SIZE = 5
-PAIRS = tuple(combinations(range(1, SIZE + 1), 2))
-COPIES = tuple(
-    {number: bulletin(number, *sorted({101 + copy, *(2 + copy, 4)[: number // 4]})) for number in range(2, 9)}
-    for copy in (0, 1)
-)
-"""Of two copies of the authority that do not know of each other. Each revokes one or two members."""
-
-UNION = bulletin(9, 2, 3, 4, 101, 102)
-
-STEPS = st.one_of(
-    st.tuples(st.just("connect"), st.sampled_from(PAIRS)),
-    st.tuples(st.just("disconnect"), st.sampled_from(PAIRS), st.booleans()),
-    st.tuples(st.just("restart"), st.integers(1, SIZE), st.booleans(), st.booleans()),
-    st.tuples(st.just("keep a copy of the disk"), st.integers(1, SIZE)),
-    st.tuples(st.just("disk full"), st.integers(1, SIZE)),
-    st.tuples(st.just("publish"), st.integers(1, SIZE), st.sampled_from((0, 0, 0, 1)), st.integers(2, 8)),
-    st.tuples(st.just("wait"), st.sampled_from((0.001, 0.03, 0.3, 0.3, 3.0))),
-)
-
-
-class History:
-    """A fleet of five, to which anything happens. Each has a link with each in the beginning."""
-
-    def __init__(self, seed: int) -> None:
-        self.fleet = SimulatedFleet(SIZE, seed, is_reordered=True)
-        self.connect_all()
-        self.fleet.run(1.0)
-        self.fleet.loss = (0.0, 0.1, 0.4)[seed % 3]
-
-    def connect_all(self) -> None:
-        """All that accept each other."""
-        for pair in PAIRS:
-            self.fleet.connect(*pair)
-
-    def step(self, what: str, *arguments: Any) -> None:
-        """One step. The fleet checks what always holds."""
-        fleet = self.fleet
-        match what, *arguments:
-            case "connect", (one, other):
-                fleet.connect(one, other)
-            case "disconnect", (one, other), is_noticed:
-                fleet.disconnect(one, other, is_noticed=is_noticed)
-            case "restart", number, is_restored, is_noticed:
-                fleet.restart(number, is_restored=is_restored, is_noticed=is_noticed)
-            case "keep a copy of the disk", number:
-                fleet.members[number].old_disk = fleet.members[number].disk
-            case "disk full", number:
-                fleet.members[number].is_writable = False
-            case "publish", member, copy, number:
-                fleet.publish(member, COPIES[copy][number])
-            case _:
-                fleet.run(arguments[0])
-
-    def heal(self) -> None:
-        """Every disk can be written, and all links are made. After half a minute they lose no more datagrams."""
-        for number in self.fleet.members:
-            self.fleet.repair_disk(number)
-        self.connect_all()
-        self.fleet.run(3 * HAVE_INTERVAL_S)
-        self.fleet.loss = 0.0
-        self.fleet.run(3 * HAVE_INTERVAL_S)
-
-    def check_agreement(self) -> None:
-        """All that are connected have one bulletin, know that of each other, and have written it."""
-        for member in self.fleet.members.values():
-            for other in member.up:
-                assert self.fleet.members[other].trust.digest == member.trust.digest
-                assert member.exchange.shown(key_of(other)) == member.trust.bulletin.number
-            assert member.disk == member.trust.bulletin_bytes
-        self.fleet.bytes_sent = 0
-        self.fleet.run(3 * HAVE_INTERVAL_S)
-        assert self.fleet.bytes_sent == 0, "they are not silent"
-
-
-@given(st.integers(0, 10_000), st.lists(STEPS, max_size=30))
-@settings(max_examples=100, deadline=None)
-def test_any_history(seed: int, steps: list[tuple[Any, ...]]) -> None:
-    """After it, all that are connected have the newest bulletin, or report that two copies of the authority disagree.
-
-    The union of both bulletins, with a higher number, ends that. In the history, no *have* of a member falls, unless
-    its disk was restored: then each peer that saw more reports it. No link exists whose serial an end has revoked.
-    """
-    history = History(seed)
-    for step in steps:
-        history.step(*step)
-    history.heal()
-    fleet = history.fleet
-    for member in fleet.members.values():
-        others = [fleet.members[other] for other in member.up]
-        newest = max((other.trust.bulletin.number for other in others), default=0)
-        if newest > member.trust.bulletin.number:
-            assert (ANY, "bulletin_shrinks") in member.events
-        if any(
-            other.trust.bulletin.number == member.trust.bulletin.number
-            for other in others
-            if other.trust.digest != member.trust.digest
-        ):
-            assert (ANY, "bulletin_conflict") in member.events
-    copies = {step[2] for step in steps if step[0] == "publish"}
-    if len(copies) == 2:
-        for number in fleet.members:
-            fleet.publish(number, UNION)
-        fleet.run(6 * HAVE_INTERVAL_S)
-    history.check_agreement()
