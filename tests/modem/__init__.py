@@ -1,1 +1,1 @@
-"""Attacks on the line between two emulated telemetry modems, in virtual time."""
+"""A member by certificate behind an emulated telemetry modem."""
