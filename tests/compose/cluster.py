@@ -1,4 +1,4 @@
-"""A fleet of real daemons on hosts of their own, and what can befall a host: for containers and network namespaces.
+"""A fleet of real daemons on hosts of their own, in containers or network namespaces.
 
 The test's own process opens sockets in the hosts' network namespaces, which takes root. A client that speaks MAVLink
 there needs no process of its own.
@@ -42,10 +42,7 @@ SYSTEM_IDS = {"drone1": 1, "drone2": 2, "drone3": 3, "ground-station": 255}
 
 
 class Cluster(ABC):
-    """Hosts by name, a daemon on each. What is done to a host is done when the call returns."""
-
-    cut_s = 0.0
-    """How long the test cuts a host from the network at least."""
+    """Hosts by name, a daemon on each."""
 
     @abstractmethod
     def namespace_of(self, name: str) -> Path:
@@ -54,34 +51,6 @@ class Cluster(ABC):
     @abstractmethod
     def control_socket_of(self, name: str) -> Path:
         """The control socket of the daemon there."""
-
-    @abstractmethod
-    async def stop(self, name: str) -> None:
-        """End the daemon as a shutdown does."""
-
-    @abstractmethod
-    async def kill(self, name: str) -> None:
-        """End it as a power failure does."""
-
-    @abstractmethod
-    async def start(self, name: str) -> None:
-        """Start it again."""
-
-    @abstractmethod
-    async def pause(self, name: str) -> None:
-        """Stop its processes where they are."""
-
-    @abstractmethod
-    async def resume(self, name: str) -> None:
-        """Let them go on."""
-
-    @abstractmethod
-    async def cut(self, name: str) -> None:
-        """Take the host off the network."""
-
-    @abstractmethod
-    async def join(self, name: str, *, elsewhere: bool = False) -> None:
-        """Put it on the network again; ``elsewhere``: with another address."""
 
     @abstractmethod
     def logs(self) -> str:
@@ -112,13 +81,6 @@ class Cluster(ABC):
         names, values = (line.split() for line in lines if line.startswith("Udp:"))
         return dict(zip(names, values, strict=True))
 
-    def is_linked(self, name: str) -> bool:
-        states = self.states(name)
-        others = [other for other in SYSTEM_IDS if other != name]
-        return all(states.get(other) == "up" for other in others) and all(
-            self.states(peer).get(name) == "up" for peer in others
-        )
-
     def are_all_linked(self) -> bool:
         return all(
             len(states) == len(SYSTEM_IDS) - 1 and set(states.values()) == {"up"}
@@ -137,11 +99,6 @@ class Cluster(ABC):
             path["state"] == "usable" and path["answered_s"] is not None and path["answered_s"] < handshake_s
             for path, handshake_s in best
         )
-
-    def is_missed(self, name: str) -> bool:
-        """Whether all others have noticed that it is gone."""
-        states = [self.states(other) for other in SYSTEM_IDS if other != name]
-        return all(name in there and there[name] != "up" for there in states)  # not: the daemon was slow to answer
 
     async def until_linked(self) -> None:
         """Wait until all daemons listen, and see that all links are up in time from there.
@@ -317,6 +274,17 @@ class Conversation:
                 f"{name} missed {(expected - received).total()} of {expected.total()} frames, and received"
                 f" {(received - expected).total()} too much"
             )
+
+
+async def check_frames(cluster: Cluster, count: int = 200) -> None:
+    """Each vehicle's frames reach all others once."""
+    conversation = Conversation(cluster, tuple(SYSTEM_IDS))
+    try:
+        await conversation.open()
+        await conversation.say_many(count)
+        await conversation.check()
+    finally:
+        conversation.close()
 
 
 async def run(*command: str, environ: dict[str, str] | None = None, check: bool = True) -> str:

@@ -9,7 +9,7 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
-from tests.compose import images, outages
+from tests.compose import images
 from tests.compose.cluster import SYSTEM_IDS, Cluster, run
 from tests.fleet.vehicles import create
 from uavlinkd.fleet.manifest import FleetSettings
@@ -25,8 +25,6 @@ SUBNET, MITM_SUBNET = f"{NETWORK}.0.0/24", f"{NETWORK}.1.0/24"
 class Containers(Cluster):
     """The services of compose.yaml."""
 
-    cut_s = outages.OUTAGE_S
-
     def __init__(self, folder: Path, image: str, *, mitm: bool = False) -> None:
         self._folder = folder
         self.project = f"uavlinkd-test-{os.getpid()}{'-mitm' if mitm else ''}"
@@ -40,7 +38,7 @@ class Containers(Cluster):
             "UAVLINKD_IMAGE": image,
             "FLEET": str(folder / "fleet"),
             "SUBNET": MITM_SUBNET if mitm else SUBNET,
-            "RESTART": "no",  # here it is the test that starts what it stopped
+            "RESTART": "no",
         }
         self._pids: dict[str, int] = {}
         self._logs = ""
@@ -61,7 +59,9 @@ class Containers(Cluster):
                 break
             path.chmod(0o755)
         await self.compose("up", "--detach", "--no-build")
-        await self._look_up()
+        for name in (*SYSTEM_IDS, *(("mitm",) if self._mitm else ())):
+            pid = await run("docker", "inspect", "--format", "{{.State.Pid}}", await self.container(name))
+            self._pids[name] = int(pid)
 
     async def close(self) -> None:
         """Stop and remove everything but the image."""
@@ -78,46 +78,11 @@ class Containers(Cluster):
         assert len(containers.split()) == 1, f"{service} has the containers: {containers}"
         return containers.strip()
 
-    async def inspect(self, service: str, what: str) -> str:
-        return (await run("docker", "inspect", "--format", what, await self.container(service))).strip()
-
-    async def _look_up(self, *names: str) -> None:
-        for name in names or (*SYSTEM_IDS, *(("mitm",) if self._mitm else ())):
-            self._pids[name] = int(await self.inspect(name, "{{.State.Pid}}"))
-
     def namespace_of(self, name: str) -> Path:
         return Path(f"/proc/{self._pids[name]}/ns/net")
 
     def control_socket_of(self, name: str) -> Path:
         return Path(f"/proc/{self._pids[name]}/root/run/uavlinkd/control.sock")
-
-    async def stop(self, name: str) -> None:
-        await run("docker", "stop", await self.container(name))
-        assert await self.inspect(name, "{{.State.ExitCode}}") == "0"
-
-    async def kill(self, name: str) -> None:
-        await run("docker", "kill", await self.container(name))
-
-    async def start(self, name: str) -> None:
-        await run("docker", "start", await self.container(name))
-        await self._look_up(name)
-
-    async def pause(self, name: str) -> None:
-        # `docker pause` needs the freezer of the control groups, which now and then answers "unable to freeze".
-        await run("docker", "kill", "--signal", "STOP", await self.container(name))
-
-    async def resume(self, name: str) -> None:
-        await run("docker", "kill", "--signal", "CONT", await self.container(name))
-
-    async def cut(self, name: str) -> None:
-        await run("docker", "network", "disconnect", f"{self.project}_air", await self.container(name))
-
-    async def join(self, name: str, *, elsewhere: bool = False) -> None:
-        address = ["--ip", f"{NETWORK}.0.77"] if elsewhere else []
-        await run(
-            *("docker", "network", "connect", "--alias", name, *address),
-            *(f"{self.project}_air", await self.container(name)),
-        )
 
     def logs(self) -> str:
         return self._logs

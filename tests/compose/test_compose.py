@@ -1,36 +1,29 @@
-"""A fleet in containers, by a real `docker compose up` of compose.yaml: links, outages, and a man in the middle."""
+"""A fleet in containers, by a real `docker compose up` of compose.yaml: links, confinement, a man in the middle."""
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
 import pytest_asyncio
 
-from tests.compose import outages
-from tests.compose.cluster import Cluster, Conversation, run, until
+from tests.compose.cluster import Conversation, check_frames, run, until
 from tests.compose.containers import USER, Containers, health, opened
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
 
 
 @pytest_asyncio.fixture(scope="module", loop_scope="module")
-async def containers(image: str, tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Containers]:
+async def cluster(image: str, tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Containers]:
     """Three drones and a ground station, for all tests of this file."""
-    async with opened(Containers(tmp_path_factory.mktemp("fleet"), image)) as cluster:
-        yield cluster
-
-
-@pytest_asyncio.fixture(loop_scope="module")
-async def cluster(containers: Containers) -> Containers:
-    await until(containers.are_all_calm, "all links are up, along a path that answers")
-    return containers
+    async with opened(Containers(tmp_path_factory.mktemp("fleet"), image)) as opened_cluster:
+        yield opened_cluster
 
 
 async def test_frames_reach_all_others_once(cluster: Containers) -> None:
     """What each vehicle's client says comes to each other's once, byte for byte; the autopilots beside them fly."""
-    await outages.check_frames(cluster)
+    await check_frames(cluster)
 
     def from_endpoint(name: str) -> int:
         status = cluster.status(name)
@@ -38,7 +31,7 @@ async def test_frames_reach_all_others_once(cluster: Containers) -> None:
         (endpoint,) = status["endpoints"].values()
         return int(endpoint["frames_received"])
 
-    for name in ("drone1", "drone2"):  # drone3's container is started again in other tests, its autopilot's is not
+    for name in ("drone1", "drone2", "drone3"):
         before = from_endpoint(name)
         await until(lambda name=name, before=before: from_endpoint(name) > before, f"{name}'s autopilot flies")  # type: ignore[misc]
 
@@ -53,14 +46,6 @@ async def test_containers_are_healthy_confined_and_unprivileged(cluster: Contain
         assert "Read-only file system" in await run("docker", "exec", drone, "touch", path, check=False)
     capabilities = await run("docker", "exec", drone, "grep", "CapEff", "/proc/1/status")
     assert int(capabilities.split()[1], 16) == 0
-
-
-@pytest.mark.parametrize("outage", outages.OUTAGES.values(), ids=outages.OUTAGES)
-async def test_outage_ends_in_time_and_disturbs_no_other_link(
-    cluster: Containers, outage: Callable[[Cluster], Awaitable[None]]
-) -> None:
-    """A container that was gone is linked again two seconds after it can be reached; the others lose no frame."""
-    await outage(cluster)
 
 
 ATTACKS = (

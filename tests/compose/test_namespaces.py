@@ -1,18 +1,17 @@
-"""A fleet in network namespaces: what the containers show, on machines without an engine for them."""
+"""A fleet in network namespaces, and what befalls one of its hosts while the others talk."""
 
 from __future__ import annotations
 
 import asyncio
 import signal
 import sys
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
 import pytest_asyncio
 
-from tests.compose import images, outages
-from tests.compose.cluster import SYSTEM_IDS, Cluster, until
+from tests.compose.cluster import SYSTEM_IDS, Cluster, Conversation, check_frames, until
 from tests.fleet.vehicles import create
 from tests.namespaces import Namespace, connect, need_namespaces
 from uavlinkd.fleet.manifest import FleetSettings
@@ -24,9 +23,6 @@ pytestmark = pytest.mark.asyncio(loop_scope="module")
 
 class Namespaces(Cluster):
     """A bridge in a namespace of its own, and a namespace with a cable to it for each host."""
-
-    cut_s = outages.OUTAGE_S if images.why_not() else 0.0
-    """Where there are containers, they show the long one."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -82,29 +78,37 @@ class Namespaces(Cluster):
         config = self._folder / "fleet" / name / f"{name}.toml"
         self._daemons[name] = await self._run(name, "run", "--config", str(config))
 
-    async def _end(self, name: str, number: signal.Signals) -> int:
+    async def end(self, name: str, number: signal.Signals) -> None:
+        """End a daemon as a shutdown or a power failure does."""
         self._daemons[name].send_signal(number)
-        return await self._daemons[name].wait()
+        assert await self._daemons[name].wait() == (0 if number is signal.SIGTERM else -number)
 
-    async def stop(self, name: str) -> None:
-        assert await self._end(name, signal.SIGTERM) == 0
+    async def start_again(self, name: str) -> None:
+        """It can be reached once it listens."""
+        await self.start(name)
+        await until(lambda: self.status(name) is not None, f"{name} listens")
 
-    async def kill(self, name: str) -> None:
-        await self._end(name, signal.SIGKILL)
+    def signal(self, name: str, number: signal.Signals) -> None:
+        self._daemons[name].send_signal(number)
 
-    async def pause(self, name: str) -> None:
-        self._daemons[name].send_signal(signal.SIGSTOP)
+    def set_cable(self, name: str, state: str) -> None:
+        """Take the host off the network (``down``), or put it there again (``up``)."""
+        self._air.ip(f"link set to-{SYSTEM_IDS[name]} {state}")
 
-    async def resume(self, name: str) -> None:
-        self._daemons[name].send_signal(signal.SIGCONT)
+    def give_other_address(self, name: str) -> None:
+        self._hosts[name].ip("address flush dev eth0", "address add 10.13.0.77/24 dev eth0")
 
-    async def cut(self, name: str) -> None:
-        self._air.ip(f"link set to-{SYSTEM_IDS[name]} down")
+    def is_linked(self, name: str) -> bool:
+        states = self.states(name)
+        others = [other for other in SYSTEM_IDS if other != name]
+        return all(states.get(other) == "up" for other in others) and all(
+            self.states(peer).get(name) == "up" for peer in others
+        )
 
-    async def join(self, name: str, *, elsewhere: bool = False) -> None:
-        if elsewhere:
-            self._hosts[name].ip("address flush dev eth0", "address add 10.13.0.77/24 dev eth0")
-        self._air.ip(f"link set to-{SYSTEM_IDS[name]} up")
+    def is_missed(self, name: str) -> bool:
+        """Whether all others have noticed that it is gone."""
+        states = [self.states(other) for other in SYSTEM_IDS if other != name]
+        return all(name in there and there[name] != "up" for there in states)  # not: the daemon was slow to answer
 
     def logs(self) -> str:
         return "\n".join(f"--- {path.stem}\n{path.read_text()}" for path in sorted(self._folder.glob("*.log")))
@@ -131,12 +135,58 @@ async def cluster(namespaces: Namespaces) -> Namespaces:
 
 async def test_frames_reach_all_others_once(cluster: Namespaces) -> None:
     """What each vehicle's client says comes to each other's once, byte for byte."""
-    await outages.check_frames(cluster)
+    await check_frames(cluster)
 
 
-@pytest.mark.parametrize("outage", outages.OUTAGES.values(), ids=outages.OUTAGES)
-async def test_outage_ends_in_time_and_disturbs_no_other_link(
-    cluster: Namespaces, outage: Callable[[Cluster], Awaitable[None]]
-) -> None:
+BACK_S = 2.0
+"""From the end of an outage until the link is up, on an idle machine."""
+VICTIM = "drone3"
+OTHERS = ("drone1", "drone2", "ground-station")
+
+
+async def begin(cluster: Namespaces, outage: str) -> None:
+    match outage:
+        case "stopped" | "moved":
+            await cluster.end(VICTIM, signal.SIGTERM)
+        case "killed":
+            await cluster.end(VICTIM, signal.SIGKILL)
+        case "paused":
+            cluster.signal(VICTIM, signal.SIGSTOP)
+        case _:
+            cluster.set_cable(VICTIM, "down")
+
+
+async def end(cluster: Namespaces, outage: str) -> None:
+    """Returns once the host can be reached again."""
+    match outage:
+        case "paused":
+            cluster.signal(VICTIM, signal.SIGCONT)
+        case "cut off":
+            cluster.set_cable(VICTIM, "up")
+        case _:
+            if outage == "moved":
+                cluster.give_other_address(VICTIM)
+            await cluster.start_again(VICTIM)
+
+
+@pytest.mark.parametrize("outage", ["stopped", "killed", "paused", "cut off", "moved"])
+async def test_outage_ends_in_time_and_disturbs_no_other_link(cluster: Namespaces, outage: str) -> None:
     """A host that was gone is linked again two seconds after it can be reached; the others lose no frame."""
-    await outage(cluster)
+    took_s = 0.0
+
+    async def happen() -> None:
+        nonlocal took_s
+        await begin(cluster, outage)
+        await until(lambda: cluster.is_missed(VICTIM), f"{VICTIM} is missed")
+        await end(cluster, outage)
+        took_s = await until(lambda: cluster.is_linked(VICTIM), f"{VICTIM} is back")
+
+    conversation = Conversation(cluster, OTHERS)
+    try:
+        await conversation.open()
+        said = await conversation.during(happen())
+        await conversation.check()
+    finally:
+        conversation.close()
+    print(f"back after {took_s:.2f} s; meanwhile each other said {said} frames")
+    assert took_s < BACK_S
