@@ -62,7 +62,7 @@ def test_psk_as_public_key(tmp_path: Path) -> None:
     """The PSK of its file."""
     load(tmp_path, GOOD)
     (tmp_path / "pair.psk").write_text(psk := _odd_key())
-    assert "is a PSK, which must stay secret" in _problem(tmp_path, psk, _WITH_PSK)
+    assert "is a PSK, which must stay secret: make a new PSK" in _problem(tmp_path, psk, _WITH_PSK)
 
 
 def test_public_key_in_the_private_key_file(tmp_path: Path) -> None:

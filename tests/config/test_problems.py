@@ -70,13 +70,14 @@ _CHANGE_ROWS = [
     ('["0.0.0.0:5790"]', '["0.0.0.0:5790", "127.0.0.1:5790"]', "listen", "cannot listen on at once"),
     ("[[endpoint]]", "[endpoint]", "endpoint", "[[endpoint]]"),
     (f'url = "{URL}"', "", "endpoint[0].url (autopilot)", f'url = "{URL}"'),
-    ("14550", "5790", "endpoint[0].url (autopilot)", "has the port that `listen` has for peers"),
+    ("14550", "5790", "endpoint[0].url (autopilot)", "has the port that `listen` has for peers, 5790: write another"),
     (URL, "udpout:127.0.0.1:5790", "endpoint[0].url (autopilot)", "own port for peers"),
     ("[[peer]]", "Port = 14550\n[[peer]]", "endpoint[0].Port (autopilot)", f'write url = "{URL}"'),
     ("[[peer]]", "Baud = 57600\n[[peer]]", "endpoint[0].Baud (autopilot)", 'write url = "serial:/dev/ttyACM0:57600"'),
     ("[[peer]]", "[[peers]]", "peers", "did you mean [[peer]]?"),
     ("swarm-member", "pilot", "peer[0].role (drone1)", "the roles are vehicle, "),
     ("system_ids", "#", "peer[0].system_ids (drone1)", "which systems"),
+    (KEY["drone1"], "A" * 40, "peer[0].public_key (drone1)", "is not a key: "),
     ("public_key", "#", "peer[0].public_key (drone1)", "what `uavlinkd pubkey` prints there"),
     ("10.13.0.2", "0.0.0.0", "peer[0].addresses[0] (drone1)", "every address of this machine"),
     ("10.13.0.2", "localhost", "peer[0].addresses (drone1)", "where this daemon listens"),
@@ -103,13 +104,17 @@ _FILE_ROWS = [
     (link("reject_after_s = 100"), "link.reject_after_s", "123 or more"),
     (link('redundancy = "double"'), "link.redundancy", "'critical', 'all' or 'none'"),
     ((GOOD + GCS).replace(URL, "serial:/dev/a:57600"), _URLS, f"is the device of {_SECOND} too"),
-    (GOOD + GCS.replace("127.0.0.1", "0.0.0.0"), _URLS, f"listens where {_SECOND} does"),
+    (GOOD + GCS.replace("127.0.0.1", "0.0.0.0"), _URLS, f"listens where {_SECOND} does: write another port"),
     ((GOOD + GCS).replace("udpin", "tcpin"), _URLS, f"listens where {_SECOND} does"),
     (GOOD + GCS.replace("udpin", "udpout"), _URLS, "frames would loop"),
     ((GOOD + GCS).replace("udpin", "udpout"), _URLS, "arrive twice"),
     (GOOD + GCS.replace("gcs", "autopilot").replace("14550", "1"), "endpoint[1].name (autopilot)", f"of {_SECOND}"),
     (GOOD + PEER.replace(KEY["drone1"], KEY["b"]), "peer[1].name (drone1)", "is the name of peer[0] (drone1) too"),
-    (GOOD + PEER.replace('"drone1"', '"b"'), "peer[1].public_key (b)", "is the key of peer[0] (drone1) too"),
+    (
+        GOOD + PEER.replace('"drone1"', '"b"'),
+        "peer[1].public_key (b)",
+        "key of peer[0] (drone1) too: each peer has its own",
+    ),
     (TOP + ENDPOINT + OTHER_PEER, "peer[0].addresses (drone2)", "neither end could initiate"),
     (GOOD + '[metrics]\nlisten = "127.0.0.1"\n', "metrics.listen", "127.0.0.1:5790"),
     (
@@ -276,7 +281,7 @@ def test_own_key_belongs_to_no_other(tmp_path: Path, section: str, place: str) -
     load(tmp_path, GOOD)
     public = keys.public_key_text((tmp_path / "drone0.key").read_text())
     problems = refused(tmp_path, f"{HEAD}{ENDPOINT}{section}".replace("OWN", public))
-    assert "this daemon's own" in problems[place]
+    assert "this daemon's own key: write what `uavlinkd pubkey` prints" in problems[place]
 
 
 def test_every_problem_is_listed_at_once(tmp_path: Path) -> None:

@@ -172,10 +172,10 @@ def test_fleet_is_made_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.M
     [
         (FleetSettings(), {"drones": -1}, "at most 255"),
         (FleetSettings(), {"drones": 200, "stations": 56}, "at most 255"),
-        (FleetSettings(), {"drones": 1}, "drone1 would find no other member"),
+        (FleetSettings(), {"drones": 1}, r"drone1 would find no other member: a relay is needed \(init --relay"),
         (FleetSettings(), {"drones": 1, "stations": 1}, "ground-station would find no other member"),
         (FleetSettings(), {"at": (Address("10.13.0.254", 5790),)}, "more --station-address than --ground-stations"),
-        (FleetSettings(suite="rot13"), {}, "suite .* does not exist"),
+        (FleetSettings(suite="rot13"), {}, "suite .* does not exist: use one of x25519"),
         (FleetSettings(control_socket="{x}"), {}, "--control-socket.*only braces"),
     ],
 )

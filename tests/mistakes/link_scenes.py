@@ -12,12 +12,15 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from tests.daemon.frames import command_long, ground_heartbeat, heartbeat, numbered
+from tests.daemon.members import CertifiedFleet
 from tests.daemon.process import DaemonProcess
 from tests.mistakes.scene import WITHOUT_RIGHTS, Frames, Scene, checked, said_by_process
 from tests.needs import need
 from uavlinkd.config import keys
 from uavlinkd.config.key_rules import EXAMPLE_KEYS
+from uavlinkd.core.certificates import MemberRole
 from uavlinkd.lab.sim.loopback_ports import free_port
+from uavlinkd.system.base64_text import to_base64
 
 ANOTHER_USER = 65534
 """Any user that is not the daemon's."""
@@ -340,3 +343,13 @@ async def no_client(scene: Scene) -> None:
     scene.introduce()
     scene.here.add_endpoint("autopilot")
     await _linked(scene)
+
+
+async def revoked_card(scene: Scene) -> None:
+    """The vehicle `there` starts from a card that is older than its revocation, of which the station `here` knows."""
+    fleet = CertifiedFleet()
+    fleet.join(scene.here, MemberRole.OPERATOR, 255)
+    fleet.join(scene.there, MemberRole.VEHICLE, 2, scene.here)
+    fleet.revoke(scene.there.name)
+    scene.here.config["fleet"]["bulletin"] = to_base64(fleet.bulletin)
+    await scene.start()

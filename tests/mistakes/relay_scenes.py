@@ -11,7 +11,6 @@ from tests.daemon.process import DaemonProcess
 from tests.mistakes.scene import Scene, checked, said_by_process
 from tests.needs import need
 from uavlinkd.config import keys
-from uavlinkd.config.key_rules import EXAMPLE_KEYS
 
 
 def _key() -> str:
@@ -111,34 +110,6 @@ def _relay_of_both(scene: Scene) -> DaemonProcess:
     scene.here.add_peer(scene.there, [])
     scene.there.add_peer(scene.here, [])
     return relay_for(scene.stage, scene.here, scene.there, name=f"m{scene.row}-vps")
-
-
-async def readable(scene: Scene) -> None:
-    """Neither end asks for `confidential`."""
-    _member(scene.here, scene.there)
-    scene.here.config["link"]["confidential"] = False
-    scene.check = checked(scene.here)
-
-
-async def private_key(scene: Scene) -> None:
-    """`here` has the private key of the relay."""
-    _member(scene.here, scene.there)
-    _used(scene.here)["public_key"] = scene.there.private_key
-    scene.check = checked(scene.here)
-
-
-async def example_key(scene: Scene) -> None:
-    """`here` has the key of an example for the relay."""
-    _member(scene.here, scene.there)
-    _used(scene.here)["public_key"] = min(EXAMPLE_KEYS)
-    scene.check = checked(scene.here)
-
-
-async def key_file(scene: Scene) -> None:
-    """Others may read the private key of the relay."""
-    _member(scene.there, scene.here)
-    (scene.here.folder / "daemon.key").chmod(0o644)
-    scene.check = checked(scene.here)
 
 
 async def port_in_use(scene: Scene) -> None:

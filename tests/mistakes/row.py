@@ -27,7 +27,6 @@ class Mistake:
     """One row. ``check`` and ``command`` are patterns of what `check`, or the command itself, prints."""
 
     row: str
-    name: str
     make: Callable[[Scene], Awaitable[None]]
     """Makes the mistake. If it needs no remedy, this waits for the link, which works in spite of it."""
     check: str = ""

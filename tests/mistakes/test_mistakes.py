@@ -86,7 +86,7 @@ def results() -> dict[str, Result]:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("mistake", MISTAKES, ids=lambda mistake: f"{mistake.row} {mistake.name}")
+@pytest.mark.parametrize("mistake", MISTAKES, ids=lambda mistake: f"{mistake.row} {mistake.make.__name__}")
 def test_remedy_is_shown(mistake: Mistake, results: dict[str, Result]) -> None:
     """`check` or a command prints its essential words; `status` and the log have the expected causes at both ends."""
     result = results[mistake.row]
