@@ -2,88 +2,23 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
-from collections import Counter
-from collections.abc import Mapping
 from pathlib import Path
 from statistics import median
-from struct import Struct
-from typing import Any, Final
 
 import pytest
 
 from tests.lab.evaluation.quick_runs import run_quickly
-from tests.waiting import PATIENCE_S
 from uavlinkd.lab.evaluation import tampering_plan as plans
 from uavlinkd.lab.evaluation.fleet_plan import FLEET_PLANS, FLEET_RELAY_PLANS
-from uavlinkd.lab.evaluation.middle import MiddleHere
 from uavlinkd.lab.evaluation.paper_attacks import CHANGES
-from uavlinkd.lab.evaluation.stage import DaemonStage
 from uavlinkd.lab.evaluation.tampering_plan import LINE_PLANS, PATH_PLANS, RELAYED_PLANS, SPOILED_PLANS, TrialPlan
 from uavlinkd.lab.evaluation.tampering_records import NOT_IN_TIME, OURS, PAPER, RECOVERY_LIMIT_S, RELAY, Verdict
 from uavlinkd.lab.evaluation.tampering_run import TAMPERING
 from uavlinkd.lab.hostile.all_attacks import RELAY_ATTACKS
-from uavlinkd.lab.mitm.anatomy import mavlink_frame
 from uavlinkd.lab.mitm.attack import AttackContext
 from uavlinkd.lab.mitm.attacks import ATTACKS, parse_attack
 from uavlinkd.lab.mitm.line_attacks import LINE_ATTACKS, parse_line_attack
-from uavlinkd.mavlink.dialect import IDS, MESSAGES
-
-_REFUSED: Final = "MAV_CMD_COMPONENT_ARM_DISARM"
-_COMMAND: Final = Struct("<7fHBBB")
-_COMMAND_LONG: Final = IDS["COMMAND_LONG"]
-_ARM: Final = 400
-_COMMANDS_INTERVAL_S: Final = 0.2
-
-
-class RefusingStage(DaemonStage):
-    """Two drones that refuse commands of each other, and report that: are the claims that they show true?"""
-
-    def rules(self, one: str, other: str) -> dict[str, object]:
-        return {**super().rules(one, other), "deny_in": [_REFUSED]}
-
-    false_claims = 0
-
-    async def _talk(self) -> None:
-        await asyncio.gather(super()._talk(), self._send_commands(), self._check_claims())
-
-    async def _send_commands(self) -> None:
-        seq = 0
-        while True:
-            for number, name in enumerate(self.names):
-                self.send(name, arm_command(number + 1, seq))
-            seq = (seq + 1) % 256
-            await asyncio.sleep(_COMMANDS_INTERVAL_S)
-
-    async def _check_claims(self) -> None:
-        """A drone claims at most what it has refused when it is asked afterwards."""
-        while True:
-            await asyncio.sleep(_COMMANDS_INTERVAL_S)
-            for shown_by, claimed_by in (self.names, self.names[::-1]):
-                claims = claims_of(await self.drones[shown_by].ask(), claimed_by)
-                refused = refused_by(await self.drones[claimed_by].ask(), shown_by)
-                self.false_claims += (claims - refused).total()
-
-
-def arm_command(system: int, seq: int) -> bytes:
-    payload = _COMMAND.pack(1.0, *(0.0,) * 6, _ARM, 3 - system, 1, 0)
-    return mavlink_frame(_COMMAND_LONG, payload, MESSAGES[_COMMAND_LONG][1], system, seq)
-
-
-def claims_of(status: Mapping[str, Any], peer: str) -> Counter[str]:
-    """What a drone's status shows as the claims of its peer."""
-    peers = status.get("peers", {})
-    listed = peers[peer]["refused_there"] if peer in peers else []
-    return Counter({f"{claim['command'] or claim['message']} {claim['reason']}": claim["count"] for claim in listed})
-
-
-def refused_by(status: Mapping[str, Any], peer: str) -> Counter[str]:
-    """What a drone has refused of its peer's commands."""
-    peers = status.get("peers", {})
-    commands = peers[peer]["refused_commands"]["in"] if peer in peers else {}
-    return Counter({f"{command} {reason}": n for command, counts in commands.items() for reason, n in counts.items()})
-
 
 ALL_PLANS: tuple[TrialPlan, ...] = (
     *plans.HANDSHAKE_PLANS,
@@ -136,38 +71,6 @@ def test_plans_can_be_made(plan: TrialPlan) -> None:
         for spec in reported.split():
             parse_attack(spec).make(around)
     assert not [name for name in plan.names if name not in ATTACKS]
-
-
-PAIR = ("drone0", "drone1")
-
-
-def test_a_false_claim_is_found() -> None:
-    """A greater count, another reason, and another command differ from what was refused."""
-    claim = {"message": "COMMAND_LONG", "command": "X", "reason": "r", "count": 5, "last_s": 0.0}
-    claimed = claims_of({"peers": {"b": {"refused_there": [claim]}}}, "b")
-    for counts, false in (({"r": 5}, {}), ({"r": 9}, {}), ({"r": 4}, {"X r": 1}), ({"q": 5}, {"X r": 5})):
-        refused = refused_by({"peers": {"a": {"refused_commands": {"in": {"X": counts}}}}}, "a")
-        assert claimed - refused == Counter(false)
-    assert claims_of({}, "b") == refused_by({}, "b") == Counter()
-
-
-async def test_altered_reports_change_no_claim(tmp_path: Path) -> None:
-    """The attacker alters reports beside the genuine ones: drones show claims, and each is true."""
-    middle = MiddleHere(PAIR, tmp_path / "mitm.jsonl", 1)
-    async with RefusingStage(PAIR, tmp_path, middle, {"probe_interval_s": 1.0}, rate_hz=20.0) as stage:
-        await middle.attack(["bit-flip,kinds=report,beside=true"])
-        async with asyncio.timeout(PATIENCE_S):
-            while True:
-                attempts = sum((await middle.statistics()).counts.values())
-                statuses = {name: await drone.ask() for name, drone in stage.drones.items()}
-                shown = [claims_of(statuses[one], other) for one, other in (PAIR, PAIR[::-1])]
-                if attempts >= 2 and all(shown):
-                    break
-                await asyncio.sleep(0.05)
-        assert not stage.ledger.faults
-        assert not stage.false_claims
-        for claimed in shown:
-            assert set(claimed) == {"MAV_CMD_COMPONENT_ARM_DISARM command_not_allowed"}
 
 
 @pytest.mark.long
