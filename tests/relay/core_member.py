@@ -15,7 +15,7 @@ from uavlinkd.core.crypto import KeyPair, Secret
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Output, RecordReceived, Transmit
 from uavlinkd.core.path import Path
-from uavlinkd.core.relay_records import RELAYED, TOKEN, Bind, Bound, FilterTest, FilterTested, Record, token_of, wrap
+from uavlinkd.core.relay_records import RELAYED, Bind, Bound, wrap
 from uavlinkd.core.settings import Link, PeerSettings
 
 LINK = Link(features=c.FEATURE_RECORDS)
@@ -24,11 +24,11 @@ LINK = Link(features=c.FEATURE_RECORDS)
 class CoreMember:
     """Keeps a session with the relay. It does not bind by itself."""
 
-    def __init__(self, relay_key: bytes, relay: Sockaddr, *, link: Link = LINK) -> None:
+    def __init__(self, relay_key: bytes, relay: Sockaddr) -> None:
         private = os.urandom(c.KEY_BYTES)
         self.key = KeyPair(private).public
         self.node = Node(Secret(private), os.urandom, monotonic())
-        self.peer = self.node.add_peer(PeerSettings("relay", relay_key, None, link), monotonic())
+        self.peer = self.node.add_peer(PeerSettings("relay", relay_key, None, LINK), monotonic())
         self.path = Path(0, relay)
         self.node.set_paths(self.peer, [self.path], monotonic())
         self.sock = open_socket("127.0.0.1")
@@ -36,10 +36,6 @@ class CoreMember:
         """What the relay reported, in order."""
         self.data: list[bytes] = []
         """What came along the relay: from the handle on."""
-        self.tokens: list[tuple[bytes, Sockaddr]] = []
-        """Those that arrived, with their sources."""
-        self.tested: list[bytes] = []
-        """Those that the relay says that it sent from another port."""
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
         self._loop.add_reader(self.sock, self._on_readable)
@@ -61,16 +57,7 @@ class CoreMember:
     async def bind(self, *keys: bytes) -> None:
         """Ask the relay, once the path to it works."""
         await self.until(lambda: self.peer.is_up and self.peer.paths.works)
-        self.send_record(Bind(keys))
-
-    def send_record(self, record: Record) -> None:
-        """Send any record to the relay."""
-        self.perform(self.node.send_record(self.peer, self.path, record, monotonic()))
-
-    async def test_filter(self, token: bytes) -> None:
-        """Ask the relay for a token, once the path to it works."""
-        await self.until(lambda: self.peer.is_up and self.peer.paths.works)
-        self.send_record(FilterTest(token))
+        self.perform(self.node.send_record(self.peer, self.path, Bind(keys), monotonic()))
 
     async def until_bound(self, key: bytes) -> int:
         """Wait for a handle for a key, and return it."""
@@ -96,8 +83,6 @@ class CoreMember:
                 self.sock.sendto(output.datagram, output.path.address)
             elif isinstance(output, RecordReceived) and isinstance(output.record, Bound):
                 self.bounds.append(output.record)
-            elif isinstance(output, RecordReceived) and isinstance(output.record, FilterTested):
-                self.tested.append(output.record.token)
 
     def close(self) -> None:
         """Leave without a word, as a process does that is killed."""
@@ -116,8 +101,6 @@ class CoreMember:
                 continue
             if datagram[:1] == bytes((RELAYED,)):
                 self.data.append(datagram[1:])
-            elif token := token_of(datagram) if datagram[:1] == bytes((TOKEN,)) else b"":
-                self.tokens.append((token, source))
             else:
                 self.perform(self.node.receive(datagram, Path(0, source), monotonic()))
         self._arm()
