@@ -108,11 +108,10 @@ def run(
     make: MakeStream = filtered,
     receivers: Sequence[Receiver] | None = None,
     share: int = 1,
-    stops_at: int | None = None,
 ) -> Result:
     """Run so many streams.
 
-    ``share``: one in so many receivers reads a batch, in turn. ``stops_at``: stop after so many forbidden frames.
+    ``share``: one in so many receivers reads a batch, in turn.
     """
     receivers = all_receivers() if receivers is None else receivers
     generator, deliverer, judge = Generator(seed), Deliverer(make), Judge()
@@ -130,8 +129,6 @@ def run(
         result.counts["streams"] += size
         result.counts["separators"] += sum(author is None for stream in batch for _, author in stream.authors)
         number += 1
-        if stops_at is not None and result.breaches_by_receiver.total() >= stops_at:
-            break
     result.counts.update(frames=deliverer.admitted, refused=deliverer.refused)
     for receiver in receivers:
         result.counts.update(parses=receiver.counts.parses, losses=receiver.counts.losses)
