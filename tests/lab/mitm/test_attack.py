@@ -13,7 +13,6 @@ from uavlinkd.core.crypto import Secret, x25519_public_key
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Deliver, Output, Transmit
 from uavlinkd.core.path import Path
-from uavlinkd.core.relay_records import RELAYED
 from uavlinkd.core.settings import PeerSettings
 from uavlinkd.lab.mitm.anatomy import has_certificate, mavlink_frame
 from uavlinkd.lab.mitm.attack import CATCH_UP_LIMIT, NEVER, Action, AttackContext, AttackObject, Direction, Send
@@ -181,15 +180,6 @@ def test_length_of_a_certificate() -> None:
     drop = parse_attack("drop,kinds=certificate").make(CONVERSATION.context, 1)
     assert sends(drop.on_datagram(short, AB, 0.0))
     assert not sends(drop.on_datagram(long.datagram, AB, 0.0))
-
-
-def test_inside_attacks_what_is_in_relayed_data_only() -> None:
-    """The header of the data stays as it is."""
-    header = bytes((RELAYED, 0, 7))
-    attack = parse_attack("extend,inside=true,kinds=any").place(CONVERSATION.context, 1)
-    assert sends(attack.on_datagram(ENVELOPE, AB, 0.0)) == [Send(ENVELOPE, AB)]
-    (sent,) = sends(attack.on_datagram(header + ENVELOPE, AB, 0.0))
-    assert sent.datagram[:-1] == header + ENVELOPE
 
 
 # What an attacker without keys cannot do: the full relay (H2), group keys and stolen keys (H6, H7, D19, D20), clocks

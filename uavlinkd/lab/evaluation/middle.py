@@ -117,7 +117,7 @@ class MiddleHere:
     async def attack(self, specs: Sequence[str], objects: Sequence[AttackObject] = ()) -> None:
         now = monotonic()
         made = [
-            parse_attack(text).place(self.context, f"{self._seed} {position}", now)
+            parse_attack(text).make(self.context, f"{self._seed} {position}", now)
             for position, text in enumerate(specs)
         ]
         self.proxy.change_attacks([*made, *objects])

@@ -252,7 +252,7 @@ class ChannelService(Service):
 
     def make(self, specs: Sequence[AttackSpec]) -> list[AttackObject]:
         now = monotonic()
-        return [spec.place(self.context, f"{self._run.seed} {number}", now) for number, spec in enumerate(specs)]
+        return [spec.make(self.context, f"{self._run.seed} {number}", now) for number, spec in enumerate(specs)]
 
     def attack(self, texts: Sequence[str]) -> list[str]:
         """Replace the attacks by those that the texts select, and return their names.

@@ -8,9 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from random import Random
-from typing import Final
 
-from uavlinkd.core.relay_records import RELAYED, handle_of
 from uavlinkd.lab.mitm.attack import NEVER, Action, AttackContext, AttackObject, Direction, Intervention, Send
 from uavlinkd.lab.mitm.radio import Radio, RadioSettings
 
@@ -82,49 +80,3 @@ class AttackChannel:
 
     def _arrived(self, now: float) -> list[Action]:
         return [Send(datagram, direction) for direction, radio in self.radios.items() for datagram in radio.due(now)]
-
-
-_RELAYED: Final = bytes((RELAYED,))
-_HEADER_BYTES: Final = 3
-
-
-class InsideData:
-    """An attack on what is inside data along a relay, between a member and its relay (core/README.md, section 21).
-
-    The attack sees only the inner datagrams. What it sends gets the header of its direction, which is in the clear.
-
-    Other datagrams pass. An inner datagram for a direction without data so far is dropped: it has no handle.
-    """
-
-    def __init__(self, attack: AttackObject) -> None:
-        self._attack = attack
-        self._headers: dict[Direction, bytes] = {}
-
-    @property
-    def name(self) -> str:
-        return self._attack.name
-
-    def on_datagram(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
-        if not datagram.startswith(_RELAYED) or not handle_of(datagram):
-            return [Send(datagram, direction)]
-        self._headers[direction] = datagram[:_HEADER_BYTES]
-        return self._wrapped(self._attack.on_datagram(datagram[_HEADER_BYTES:], direction, now))
-
-    def on_answer(self, datagram: bytes, peer: str, stranger: int, now: float) -> list[Action]:
-        del datagram, peer, stranger, now
-        return []
-
-    def due(self, now: float) -> list[Action]:
-        return self._wrapped(self._attack.due(now)) if self._headers else []
-
-    def next_deadline(self) -> float:
-        return self._attack.next_deadline() if self._headers else NEVER
-
-    def _wrapped(self, actions: Sequence[Action]) -> list[Action]:
-        wrapped: list[Action] = []
-        for action in actions:
-            if isinstance(action, Intervention):
-                wrapped.append(action)
-            elif (header := self._headers.get(action.direction)) is not None:
-                wrapped.append(action._replace(datagram=header + action.datagram))
-        return wrapped

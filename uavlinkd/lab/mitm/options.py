@@ -24,9 +24,6 @@ class Options(BaseModel):
     direction: str = Field("both", description="both, or one direction: A>B; of one path: both/2, A>B/2")
     share: float = Field(1.0, gt=0, le=1, description="share of the matching datagrams that are attacked")
     limit: int | None = Field(None, ge=1, description="maximum number of attacked datagrams")
-    inside: bool = Field(
-        False, description="attack what is inside data along a relay, between a member and its relay"
-    )
     kinds: KindFilter = Field("any", description=KINDS)
     block_handshakes: bool = Field(True, description="drop the handshake messages of both directions")
     back: Literal["echoes", "all"] = Field("echoes", description="what is dropped in the other direction")
@@ -77,7 +74,7 @@ class Options(BaseModel):
     )
 
 
-COMMON = ("begin_s", "seconds", "direction", "share", "limit", "inside")
+COMMON = ("begin_s", "seconds", "direction", "share", "limit")
 
 
 def options_with(takes: Mapping[str, Any]) -> type[Options]:

@@ -12,9 +12,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from uavlinkd.lab.mitm.attack import Attack, AttackContext, AttackError, AttackObject
+from uavlinkd.lab.mitm.attack import Attack, AttackContext, AttackError
 from uavlinkd.lab.mitm.attacks import floods, forgery, key_exchange, replays, withholding
-from uavlinkd.lab.mitm.channel import InsideData
 from uavlinkd.lab.mitm.options import COMMON, Options, describe_options
 
 _MODULES = (key_exchange, replays, forgery, floods, withholding)
@@ -51,15 +50,6 @@ class AttackSpec:
             AttackError: the attack needs another peer or a public key.
         """
         return self.kind(self.options, context, Random(f"{self.name} {seed}"), now)  # noqa: S311  not a secret
-
-    def place(self, context: AttackContext, seed: int | str = 0, now: float = 0.0) -> AttackObject:
-        """Create the attack for the datagrams that its option ``inside`` selects.
-
-        Raises:
-            AttackError: the attack needs another peer or a public key.
-        """
-        attack = self.make(context, seed, now)
-        return InsideData(attack) if self.options.inside else attack
 
 
 def parse_attack(text: str, attacks: Mapping[str, type[Attack]] = ATTACKS) -> AttackSpec:
