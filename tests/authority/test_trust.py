@@ -235,39 +235,6 @@ def test_bulletin_that_may_not_be_verified() -> None:
 
 
 SERIALS = range(2, 12)
-SIGNED = {serial: (bytes((serial,)) * 32, signed(vehicle(serial), bytes((serial,)) * 32)) for serial in SERIALS}
-BULLETINS = st.builds(
-    lambda count, copy, least, revoked: Bulletin(
-        FLEET, count, least, tuple(sorted({serial for serial in (*revoked, least + copy) if serial >= least}))
-    ),
-    st.integers(1, 8) | st.sampled_from((GENERATION, GENERATION + 3)),
-    st.integers(0, 1),
-    st.integers(1, 10),
-    st.lists(st.sampled_from(SERIALS), max_size=4),
-)
-"""Of two copies of the authority, which do not know of each other, in any order."""
-
-
-@given(st.lists(BULLETINS, max_size=12))
-@settings(max_examples=50, deadline=None)
-def test_any_history_of_bulletins(history: list[Bulletin]) -> None:
-    """The number grows, what is refused stays refused, and no certificate that is refused is held or accepted."""
-    known = Trust(AUTHORITY, OWN, OWN_DATA, bulletin(1))
-    for key, data in SIGNED.values():
-        known.hold(key, data)
-    refused_serials: set[int] = set()
-    for received in history:
-        before = known.bulletin
-        held = {key for key, item in known.held.items() if received.refuses(item.certificate.serial)}
-        verdict, ended = known.receive_bulletin(published(received))
-        assert known.bulletin.number >= before.number
-        assert (verdict is BulletinVerdict.NEWER) == (known.bulletin.number > before.number)
-        assert set(ended) == (held if verdict is BulletinVerdict.NEWER else set())
-        assert all(map(known.bulletin.refuses, refused_serials))
-        refused_serials = {serial for serial in SERIALS if known.bulletin.refuses(serial)}
-    assert {item.certificate.serial for item in known.held.values()} == set(SERIALS) - refused_serials
-    for serial in refused_serials:
-        assert refused(known, *SIGNED[serial]) is DropReason.CERTIFICATE_REVOKED
 
 
 @settings(max_examples=50, deadline=None)
