@@ -50,8 +50,8 @@ def write_report(folder: Path, name: str) -> str:
         f" {DISTURBED_MOST} times."
     )
     sections += [
-        ReportSection("Not measured", ["\n".join(missing)]),
-        ReportSection("The run", [disturbed], [Table(("", ""), [(fact, str(facts[fact])) for fact in facts])]),
+        ReportSection("Not measured", text=["\n".join(missing)]),
+        ReportSection("The run", [Table(("", ""), [(fact, str(facts[fact])) for fact in facts])], text=[disturbed]),
     ]
     text = to_markdown("What a frame costs: medians over the rounds", (), sections, ())
     (folder / PAGE).write_text(text, encoding="utf-8")

@@ -40,7 +40,7 @@ def add_evaluations(commands: _Commands) -> None:
         metavar="STAGE",
         choices=STAGES,
         action="append",
-        help=f"run this stage alone; may be repeated: {', '.join(STAGES)} (default: all, and floods)",
+        help=f"run this stage alone; may be repeated: {', '.join(STAGES)} (default: all)",
     )
     paths.add_argument(
         "--tlog",

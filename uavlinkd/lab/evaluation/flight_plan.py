@@ -57,14 +57,8 @@ class AttackPhase(StrEnum):
     DROP = "drop"
 
 
-MEANINGS: Final = {
-    AttackPhase.REPLAY: "after each datagram, the attacker sends an earlier one again",
-    AttackPhase.ALTER: "the attacker moves the position in half of the datagrams, and repairs the checksum",
-    AttackPhase.HOLD: "the attacker passes each datagram later",
-    AttackPhase.KEYS: "the attacker replaces the public keys of an exchange, and moves positions",
-    AttackPhase.DROP: "the attacker drops everything",
-}
-ATTACKS: Final = tuple(MEANINGS)
+ATTACKS: Final = tuple(phase for phase in AttackPhase if phase is not AttackPhase.QUIET)
+"""RESULTS-flight.md has what each does."""
 
 POSITION_RATE_HZ: Final = 10.0
 SAMPLE_S: Final = 0.1

@@ -14,10 +14,6 @@ from typing import Any, Generic, TypeVar
 from uavlinkd.lab.child_processes import private_folder
 from uavlinkd.lab.evaluation.records import Record, RecordWriter, RunRecords, Value, load, machine_facts, read_records
 
-THE_PAPER = (
-    "The paper: Ouadah and Merazka, Securing UAV Communication: Authentication and Integrity, 2024 (arXiv "
-    "2410.09085)."
-)
 NOTHING = "-"
 Show = Callable[[str], None]
 F = TypeVar("F", bound=RunRecords)
@@ -59,12 +55,12 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class ReportSection:
-    """A heading, paragraphs, tables, and the name of a figure."""
+    """A heading, tables, the name of a figure, and paragraphs."""
 
     title: str
-    text: Sequence[str] = ()
     tables: Sequence[Table] = ()
     figure: str = ""
+    text: Sequence[str] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,11 +90,7 @@ class Evaluation(Generic[F, S]):
             writer.add(Record("end", {}, {"elapsed_s": elapsed_s, "load_after": load(), **values}))
 
     def read(self, folder: Path) -> F:
-        """The findings in a folder.
-
-        Raises:
-            EvaluationError: there are no records, or they cannot be read.
-        """
+        """The findings in a folder. Raises EvaluationError if there are no records, or they cannot be read."""
         return self.findings(*read_records(folder / f"{self.name}.jsonl"))
 
     def deviations(self, findings: F) -> list[str]:
@@ -143,14 +135,15 @@ def _run_section(findings: RunRecords) -> ReportSection:
     facts = {**findings.run, **(findings.of("end")[0].values if findings.of("end") else {})}
     text = (
         f"Made by `{facts.pop('command', '')}`. `uavlinkd evaluate report DIR` writes this report again from the "
-        "records. The seed determines the choices of the run, but no key. Times contain other load on the machine."
+        "records. The seed determines the choices of the run, but no key. Times contain other load on the machine. "
+        "`uavlinkd/lab/evaluation/RESULTS*.md` of this project explain the tables, with the results of full runs."
     )
     rows = [
         [name.replace("_", " "), str(value)]
         for name, value in facts.items()
         if name not in ("quick", "seed") and isinstance(value, str | int | float)
     ]
-    return ReportSection("Run", [text], [Table(["fact", "value"], rows)])
+    return ReportSection("Run", [Table(["fact", "value"], rows)], text=[text])
 
 
 def to_markdown(

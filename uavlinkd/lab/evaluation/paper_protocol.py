@@ -53,11 +53,7 @@ class PaperKey:
         return self._key.public.to_bytes(KEY_BYTES, "big")
 
     def mac_key(self, public: bytes) -> bytes:
-        """The HMAC key shared with the owner of ``public``.
-
-        Raises:
-            ValueError: the library refuses the key.
-        """
+        """The HMAC key shared with the owner of ``public``. Raises ValueError if the library refuses the key."""
         with _ffdh():
             return mac_key(self._key.secret(int.from_bytes(public, "big")), MAC_KEY_BITS)
 

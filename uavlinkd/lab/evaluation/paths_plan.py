@@ -25,7 +25,7 @@ DEAD_S: Final = 4.0
 
 
 class Means(StrEnum):
-    """What carries the frames."""
+    """What carries the frames. RESULTS-paths.md has the meanings, and those of the scenarios."""
 
     OURS = "two paths"
     ALL = "everything twice"
@@ -34,14 +34,6 @@ class Means(StrEnum):
     DUPLICATES = "plain duplicates"
 
 
-MEANINGS: Final = {
-    Means.OURS: "two daemons with their default settings; the vehicle's daemon has both addresses of the station",
-    Means.ALL: 'the same with `redundancy = "all"`',
-    Means.ONE: "two daemons, and only the path that fails",
-    Means.OTHER: "two daemons, and only the path that does not fail",
-    Means.DUPLICATES: "no daemon: plain MAVLink along both paths, and each copy is delivered, as mavlink-router and "
-    "MAVProxy do with two endpoints",
-}
 RADIOS: Final[Mapping[Means, tuple[int, ...]]] = {Means.ONE: (0,), Means.OTHER: (1,)}
 """The radios of means that do not use both."""
 
@@ -62,21 +54,6 @@ class Scenario(StrEnum):
     DEATHS = "deaths"
     RECORDED = "recorded"
 
-
-SCENARIO_MEANINGS: Final = {
-    Scenario.QUIET: "both paths work",
-    Scenario.DIES: "one path carries nothing, then returns",
-    Scenario.STALLS: f"one path holds everything for {STALL_S:g} s and then delivers all of it",
-    Scenario.DEGRADES: "one path loses 8 % more and becomes 20 ms slower in each of ten steps, then recovers",
-    Scenario.FLAPS: "one path fails four times, for as long as it works between",
-    Scenario.ALTERNATES: "one path fails and returns; later the other one fails and returns",
-    Scenario.SWAPS: "one path fails at the moment at which the other one returns, again and again",
-    Scenario.ASYMMETRIC: "one path loses 30 % towards the station, the other one 30 % towards the vehicle",
-    Scenario.METERED: "the other path is metered at the vehicle; the unmetered one dies and returns",
-    Scenario.MANUAL: "manual control at 25 Hz; a path of 50 ms loses 30 %, the other one has a round trip of 400 ms",
-    Scenario.DEATHS: f"the path that carries the stream is dead for {DEAD_S:g} s, many times",
-    Scenario.RECORDED: "a recorded flight over two working paths",
-}
 
 MEANS_OF: Final[Mapping[Scenario, tuple[Means, ...]]] = {
     Scenario.QUIET: tuple(Means),

@@ -298,11 +298,7 @@ class PathLink:
             await self._connect(VEHICLE, f"udpout:{address}")
 
     async def check(self) -> None:
-        """Check that the daemons run.
-
-        Raises:
-            DroneError: a daemon has ended.
-        """
+        """Check that the daemons run. Raises DroneError if a daemon has ended."""
         for daemon in self.daemons.values():
             await daemon.ask()
 

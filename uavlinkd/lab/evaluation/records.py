@@ -53,11 +53,7 @@ class Record:
         return self.status is Status.OK
 
     def number(self, name: str) -> float:
-        """A measured number.
-
-        Raises:
-            KeyError: the record has no such number.
-        """
+        """A measured number. Raises KeyError if the record has no such number."""
         value = self.values[name]
         if isinstance(value, int | float):
             return float(value)
@@ -111,11 +107,7 @@ class RecordWriter:
 
 
 def read_records(path: Path) -> tuple[dict[str, Value], list[Record]]:
-    """The facts of a run, and its records.
-
-    Raises:
-        EvaluationError: there are no records, or a line is malformed.
-    """
+    """The facts of a run, and its records. Raises EvaluationError if there are no records, or a line is malformed."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except OSError as error:

@@ -36,11 +36,7 @@ _MOST_A_TICK = 20
 
 
 async def until(condition: Callable[[], Awaitable[object]], problem: str, limit_s: float = PATIENCE_S) -> None:
-    """Wait for a condition.
-
-    Raises:
-        EvaluationError: it does not hold in time.
-    """
+    """Wait for a condition. Raises EvaluationError if it does not hold in time."""
     end = monotonic() + limit_s
     while not await condition():
         if monotonic() > end:

@@ -25,7 +25,7 @@ class TamperingSettings(EvaluationSettings):
     """The extent of the evaluation."""
 
     only: tuple[str, ...] = ()
-    """The stages that run; empty: all of them, and the floods."""
+    """The stages that run; empty: all of them."""
 
     @property
     def rate_hz(self) -> float:

@@ -25,27 +25,13 @@ _WITHHELD = (Operation.DROPPED, Operation.HELD, Operation.REORDERED)
 
 
 class Verdict(StrEnum):
-    """The result of an attack."""
+    """The result of an attack; RESULTS-tampering.md has what each means."""
 
     SUCCEEDED = "succeeded"
     DETECTED = "detected"
     BLOCKED = "blocked"
     HARMLESS = "harmless"
     BROKEN = "broken"
-
-
-MEANINGS = {
-    Verdict.SUCCEEDED: "a forged, altered, replayed, reflected or misrouted frame was delivered, or the attacker has "
-    "session keys with a drone that believes it to be another, or a drone answered where it must be silent, or the "
-    f"link did not carry frames again within {RECOVERY_LIMIT_S:g} s after the attack",
-    Verdict.DETECTED: "the attack did not succeed, and the drones noticed it: a counter grew more than without an "
-    "attack, or the log has the loss of a peer or a change of path. A bad radio also drops and delays frames: such "
-    "attacks look like loss",
-    Verdict.BLOCKED: "the attack did not succeed, but frames were lost or late meanwhile. Dropping and delaying show "
-    "no datagram to refuse",
-    Verdict.HARMLESS: "the attack did not succeed, all frames were delivered, and there was nothing to notice",
-    Verdict.BROKEN: "the attack never reached the network",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,7 +168,7 @@ class TamperingFindings(RunRecords):
 
     def problems(self) -> list[str]:
         lines = [
-            f"{trial.attack}: {trial.verdict.value}: {'; '.join(trial.successes) or MEANINGS[Verdict.BROKEN]}"
+            f"{trial.attack}: {trial.verdict.value}: {'; '.join(trial.successes) or 'it never reached the network'}"
             for trial in self.on(OURS)
             if trial.verdict in (Verdict.SUCCEEDED, Verdict.BROKEN)
         ]

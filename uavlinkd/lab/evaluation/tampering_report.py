@@ -2,82 +2,24 @@
 
 from __future__ import annotations
 
-from uavlinkd.lab.evaluation.frame import NOTHING, THE_PAPER, ReportSection, Table, duration
-from uavlinkd.lab.evaluation.records import Record
+from uavlinkd.lab.evaluation.frame import NOTHING, ReportSection, Table, duration
 from uavlinkd.lab.evaluation.tampering_plan import DATA, FLEET, HANDSHAKE, KEYS, LINE, PATHS, RELAYED
-from uavlinkd.lab.evaluation.tampering_records import MEANINGS, OURS, PAPER, TamperingFindings, Trial, Verdict
+from uavlinkd.lab.evaluation.tampering_records import OURS, PAPER, TamperingFindings, Trial, Verdict
 
 _EFFECT = ["attack", "duration", "attempts", "false frames accepted", "genuine frames lost", "recovery", "noticed by"]
 
 
 def sections(run: TamperingFindings) -> list[ReportSection]:
-    meanings = [f"{verdict.value}: {meaning}." for verdict, meaning in MEANINGS.items()]
     parts = [
-        ReportSection("Summary", [THE_PAPER], [_summary(run)]),
-        ReportSection("Every attack, both systems", [*meanings, _ON_TIMES], [_table(run)]),
-        ReportSection("Spoofed initiations", _ON_FLOOD, [_floods(run)]),
-        ReportSection("Attackers with keys", _ON_KEYS, [_keys(run)]),
-        ReportSection("Two paths", _ON_PATHS, [_paths(run)]),
-        ReportSection("On a serial line", _ON_LINE, [_effects(run, LINE)]),
-        ReportSection("A hostile relay", _ON_RELAY, [_effects(run, RELAYED)]),
-        ReportSection("A fleet with an authority", _ON_FLEET, [_effects(run, FLEET)]),
-        ReportSection("The paper's protocol", _ON_PAPER),
+        ReportSection("Summary", [_summary(run)]),
+        ReportSection("Every attack, both systems", [_table(run)]),
+        ReportSection("Attackers with keys", [_keys(run)]),
+        ReportSection("Two paths", [_paths(run)]),
+        ReportSection("On a serial line", [_effects(run, LINE)]),
+        ReportSection("A hostile relay", [_effects(run, RELAYED)]),
+        ReportSection("A fleet with an authority", [_effects(run, FLEET)]),
     ]
-    return [part for part in parts if not part.tables or part.tables[0].rows]
-
-
-_ON_TIMES = (
-    "Each frame of the run is unique and compared byte for byte. Recovery: from the end of an attack until both "
-    "clients received frames sent after it, without help. At 50 frames per second, the next frame may be 20 ms away. "
-    "Noticed by: the three counters of all drones that grew most, as in `uavlinkd status`; the logs are in the same "
-    "folder. Each daemon is a process, with the man in the middle between them on loopback. Several stages ran at "
-    "once, so the times are those of a busy machine. An attack whose time is over makes fewer attempts than it aims "
-    "at."
-)
-_ON_FLOOD = [
-    "Initiations from 256 addresses to one drone, with a valid mac1. Processor time is a share of one core, in the "
-    "median of samples. Delivered: the share of the genuine frames sent during the flood."
-]
-_ON_KEYS = [
-    "uavlink-mitm holds no keys. These attackers do: their own, or stolen ones. They run the protocol's own code. "
-    "Answers are the drone's responses to initiations; with a session, the attacker could send frames."
-]
-_ON_PATHS = [
-    "A pair of daemons with two paths. The second one is 20 ms slower. The attacks change what happens on the first "
-    "one, move datagrams from one path to the other, or send from other addresses. Unless the peer is restarted, the "
-    "second path works: then the link must stay up, and no critical frame may be lost. Critical frames are "
-    "heartbeats of a ground station, one frame in twenty: they must be new. Where both paths are spoiled first, all "
-    "frames are heartbeats, and those later than 0.5 s count as lost; the first path works after 7 s, and the row "
-    "begins there. Lost are also states that arrive after a newer one: the daemon drops them. Longest silence: "
-    "without a frame at either client. Changes: of the best path of a drone."
-]
-_ON_LINE = [
-    "A pair of daemons whose only path is a serial line with two emulated SiK modems: 57,600 baud, 24 kbit/s in both "
-    "directions together, half duplex, ten frames per second of each client. The attacker is the firmware of the "
-    "modems or a device on the wires. An attempt is one injection, or one modem that holds everything back. Injected "
-    "bytes take room on the line and damage the genuine frames that they hit."
-]
-_ON_RELAY = [
-    "Three daemons that reach each other only along a hostile relay. It holds a relay's key, and no key of a member. "
-    "It makes of the datagrams that it forwards what a man in the middle makes, and lies in its own records. When it "
-    "bound the wrong members, it reports the true handles at the end. An attempt is one datagram or record. What a "
-    "relay can do is to deny service."
-]
-_ON_FLEET = [
-    "Members by certificate. First two daemons: the second one has the first as its contact, which knows it only by "
-    "the certificate that it shows. A man in the middle without keys attacks what only a fleet sends; an attempt is "
-    "one datagram. A captured member has a valid key and certificate, or a key and a certificate that do not belong "
-    "together. Then three daemons along a hostile relay of their fleet, which has a relay's certificate and recorded "
-    "older ones; an attempt is one record. No attack may change a bulletin or a certificate that counts at a drone: "
-    "else the run fails."
-]
-_ON_PAPER = [
-    "Two drones exchange bare Diffie-Hellman public keys over UDP and authenticate data with an HMAC under the "
-    "shared secret. Where the paper is silent, we decided: the keys change every 0.25 s, so that attacks have a "
-    "target. The key before the newest stays valid, and older ones are refused. A datagram has the header of our "
-    "envelopes, covered by the HMAC. Its number and the sender's address are not checked, so replayed and duplicated "
-    "datagrams are accepted."
-]
+    return [part for part in parts if part.tables[0].rows]
 
 
 def _summary(run: TamperingFindings) -> Table:
@@ -129,32 +71,6 @@ def _noticed_by(trial: Trial) -> str:
 
 def _recovery(trial: Trial) -> str:
     return "not in 5 s" if trial.recovery_s is None else duration(trial.recovery_s)
-
-
-def _floods(run: TamperingFindings) -> Table:
-    rows = [_flood(record, name) for record in run.of("flood") for name in record.values["cpu_before"]]
-    head = [
-        "initiations per second",
-        "sent",
-        "genuine frames delivered",
-        "drone",
-        "CPU before",
-        "CPU under the flood",
-    ]
-    return Table([*head, "memory before", "memory added"], rows)
-
-
-def _flood(record: Record, drone: str) -> list[str]:
-    before, after = (record.values[f"memory_{when}"][drone] / 2**20 for when in ("before", "after"))
-    return [
-        f"{record.number('initiations') / record.number('seconds'):,.0f}",
-        f"{record.number('initiations'):,.0f}",
-        f"{100 * record.number('delivered') / max(1.0, record.number('sent')):.1f} %",
-        drone,
-        *(f"{100 * record.values[f'cpu_{when}'][drone]:.0f} %" for when in ("before", "under")),
-        f"{before:.1f} MiB",
-        f"{after - before:.1f} MiB",
-    ]
 
 
 def _keys(run: TamperingFindings) -> Table:

@@ -23,7 +23,7 @@ from uavlinkd.lab.evaluation.impostors import key_attacks, run_key_attack, run_p
 from uavlinkd.lab.evaluation.middle import MiddleHere
 from uavlinkd.lab.evaluation.paper_attacks import CHANGES, AlterKeys
 from uavlinkd.lab.evaluation.stage import DaemonStage, PaperStage, Stage
-from uavlinkd.lab.evaluation.tampering_bench import Bench, KeyHolder, run_floods
+from uavlinkd.lab.evaluation.tampering_bench import Bench, KeyHolder
 from uavlinkd.lab.evaluation.tampering_plan import TamperingSettings, TrialPlan
 from uavlinkd.lab.evaluation.tampering_records import TamperingFindings, Trial
 from uavlinkd.lab.evaluation.tampering_report import sections
@@ -121,8 +121,6 @@ class _Run:
                     group.create_task(lane)
         except ExceptionGroup as failed:  # the first is the cause: the others were cancelled
             raise failed.exceptions[0] from None
-        if not self._settings.only:
-            await self._floods()
         return {"unlogged": self._unlogged}
 
     def _add(self, trial: Trial) -> None:
@@ -204,12 +202,6 @@ class _Run:
             await run_paper_relay(bench)
 
         await self._try("paper", stage, work)
-
-    async def _floods(self) -> None:
-        rates = (500.0,) if self._settings.quick else (200.0, 1000.0, 2000.0)
-        async with self._stage("flood", _Lane(PAIR, {}, 100.0, ())) as stage:
-            for record in await run_floods(stage, rates, 0.5 if self._settings.quick else 5.0):
-                self._work.add(record)
 
 
 TAMPERING = Evaluation(

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from statistics import median
 
 from uavlinkd.core.suites import SUITES_BY_NAME
-from uavlinkd.lab.evaluation.frame import NOTHING, THE_PAPER, ReportSection, Table, duration, spread
+from uavlinkd.lab.evaluation.frame import NOTHING, ReportSection, Table, duration, spread
 from uavlinkd.lab.evaluation.records import RunRecords, Status, Value
 
 SUITE_OF_SIZE = {int(name.removeprefix("ffdhe")): name for name in SUITES_BY_NAME if name.startswith("ffdhe")}
@@ -66,34 +66,11 @@ def _median(times: Sequence[float]) -> float | None:
 
 def sections(findings: TimingFindings) -> list[ReportSection]:
     return [
-        ReportSection("At equal size of the group", _ON_COMPARISON, [comparison(findings)]),
-        ReportSection("Time over the length of the HMAC key (the paper's Fig. 6)", _ON_SCATTER, [], "scatter"),
-        ReportSection("Does the length of the HMAC key matter?", _ON_TAGS, [tag_times(findings)]),
-        ReportSection("The suites", _ON_SUITES, [suites(findings)]),
+        ReportSection("At equal size of the group", [comparison(findings)]),
+        ReportSection("Time over the length of the HMAC key (the paper's Fig. 6)", [], "scatter"),
+        ReportSection("Does the length of the HMAC key matter?", [tag_times(findings)]),
+        ReportSection("The suites", [suites(findings)]),
     ]
-
-
-_ON_COMPARISON = [
-    THE_PAPER,
-    "The paper's method searches a new safe prime for each exchange; the third column is the share of that search. "
-    "RFC 7919's groups need no search. A precomputation for a group that many share (Logjam) is feasible up to 1024 "
-    "bits and far out of reach from 2048 bits. An unfinished exchange counts as the limit. Cells have the median, "
-    "the range and the number of exchanges. OpenSSL generates the parameters (`dh.generate_parameters`). "
-    "HMAC-SHA256 over 280 bytes with a key that is derived from the shared secret, between two processes over UDP on "
-    "loopback.",
-]
-_ON_SCATTER = ["Each point is one exchange."]
-_ON_TAGS = [
-    "Time of one tag, least of the batches, with the hash states that uavlinkd prepares for each session. HMAC pads "
-    "a key to the hash's block of 512 bits and hashes a longer key first (RFC 2104): it is no stronger than its hash "
-    "of 256 bits."
-]
-_ON_SUITES = [
-    "Each handshake is between two new processes with new static, pre-shared and ephemeral keys. The time starts "
-    "before the initiation is computed (measured in the core). It ends when the other daemon delivers the first "
-    "frame (measured at a proxy between both). The start of the processes takes about 0.5 s and is not included. "
-    "Bytes and datagrams contain the first frame."
-]
 
 
 def comparison(findings: TimingFindings) -> Table:
