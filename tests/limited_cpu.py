@@ -64,11 +64,7 @@ def limited_cpu(share: float) -> Iterator[LimitedCpu]:
 
 
 def _make(share: float) -> Path:
-    """A new group.
-
-    Raises:
-        OSError: there is no such controller here, or it is not ours to use.
-    """
+    """A new group. Raises OSError if there is no such controller here, or it is not ours to use."""
     root, is_v2 = _controller()
     folder = root / f"uavlinkd-test-{os.getpid()}-{next(_numbers)}"
     folder.mkdir()

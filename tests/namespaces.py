@@ -112,11 +112,7 @@ class Namespace:
         _run("ip", "-n", self.name, "-batch", "-", text="\n".join(lines))
 
     def run(self, *command: str) -> str:
-        """Run a command there to its end; returns its output.
-
-        Raises:
-            NamespaceError: it failed.
-        """
+        """Run a command there to its end; returns its output. Raises NamespaceError if it failed."""
         return _run(*self.launcher, *command)
 
     def nft(self, rules: str) -> None:

@@ -102,11 +102,7 @@ def last_words(folder: Path) -> str:
 
 
 def until(condition: Callable[[], bool], what: str, timeout_s: float = 20.0) -> None:
-    """Wait for a condition.
-
-    Raises:
-        NotMeasuredError: it does not happen.
-    """
+    """Wait for a condition. Raises NotMeasuredError if it does not happen."""
     deadline = time.monotonic() + timeout_s
     while not condition():
         if time.monotonic() > deadline:

@@ -52,11 +52,7 @@ class Bench:
 
 
 def used(running: Running) -> Used:
-    """All threads of all processes of each side.
-
-    Raises:
-        NotMeasuredError: one has ended.
-    """
+    """All threads of all processes of each side. Raises NotMeasuredError if one has ended."""
     for process in (*running.left, *running.right):
         if process.poll() is not None:
             raise NotMeasuredError(f"it ended with status {process.returncode}")
@@ -68,11 +64,7 @@ def used(running: Running) -> Used:
 
 
 def resident_bytes(pid: int) -> int:
-    """Memory of a process that is in RAM (VmRSS of proc_pid_status(5)).
-
-    Raises:
-        NotMeasuredError: it has ended.
-    """
+    """Memory of a process that is in RAM (VmRSS of proc_pid_status(5)). Raises NotMeasuredError if it has ended."""
     try:
         for line in Path(f"/proc/{pid}/status").read_text(encoding="ascii", errors="replace").splitlines():
             if line.startswith("VmRSS:"):
@@ -83,11 +75,7 @@ def resident_bytes(pid: int) -> int:
 
 
 def until_carried(bench: Bench, running: Running, tries: int) -> None:
-    """Until frames come through, then until all do at an easy rate.
-
-    Raises:
-        NotMeasuredError: they do not.
-    """
+    """Until frames come through, then until all do at an easy rate. Raises NotMeasuredError if they do not."""
     for _ in range(tries):
         if bench.traffic.flow(running.target, 100, 0.3).received:
             break

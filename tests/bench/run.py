@@ -61,11 +61,7 @@ def laboratory(frames: FrameSet) -> Iterator[Bench]:
 
 @contextmanager
 def at_work(contender: Contender, bench: Bench) -> Iterator[Running]:
-    """Start a contender and wait until it carries frames.
-
-    Raises:
-        NotMeasuredError: it does not.
-    """
+    """Start a contender and wait until it carries frames. Raises NotMeasuredError if it does not."""
     reason = contender.why_not()
     if reason is not None:
         raise NotMeasuredError(reason)

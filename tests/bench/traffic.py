@@ -70,11 +70,7 @@ class Worker:
         self.answer()
 
     def ask(self, line: str) -> dict[str, Any]:
-        """The answer to a line.
-
-        Raises:
-            TrafficError: it has ended.
-        """
+        """The answer to a line. Raises TrafficError if it has ended."""
         assert self.process.stdin is not None
         try:
             self.process.stdin.write(line.encode() + b"\n")

@@ -288,11 +288,7 @@ async def check_frames(cluster: Cluster, count: int = 200) -> None:
 
 
 async def run(*command: str, environ: dict[str, str] | None = None, check: bool = True) -> str:
-    """Run a command to its end; what it printed.
-
-    Raises:
-        AssertionError: it failed.
-    """
+    """Run a command to its end; what it printed. Raises AssertionError if it failed."""
     process = await asyncio.create_subprocess_exec(
         *command,
         stdin=asyncio.subprocess.DEVNULL,

@@ -125,11 +125,7 @@ class Machine:
         return self.facts(unit)[key]
 
     def until(self, condition: Callable[[], bool]) -> float:
-        """Wait for a condition; how many seconds that took.
-
-        Raises:
-            TimeoutError: it does not hold in time.
-        """
+        """Wait for a condition; how many seconds that took. Raises TimeoutError if it does not hold in time."""
         began = time.monotonic()
         while not condition():
             if time.monotonic() >= began + PATIENCE_S:

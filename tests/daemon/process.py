@@ -168,11 +168,7 @@ class DaemonProcess:
     # What it says.
 
     async def ask(self, request: str) -> dict[str, Any]:
-        """The answer to a request at its control socket.
-
-        Raises:
-            OSError: there is no answer.
-        """
+        """The answer to a request at its control socket. Raises OSError if there is no answer."""
         reader, writer = await asyncio.open_unix_connection(self.folder / "control.sock", limit=1 << 24)
         try:
             writer.write(f"{request}\n".encode())
@@ -186,11 +182,7 @@ class DaemonProcess:
         return answer
 
     async def status(self) -> Status:
-        """Ask it how it is.
-
-        Raises:
-            OSError: there is no answer.
-        """
+        """Ask it how it is. Raises OSError if there is no answer."""
         return await self.ask("status")
 
     async def until(self, condition: Callable[[Status], bool], timeout_s: float = PATIENCE_S) -> Status:

@@ -72,11 +72,7 @@ class Client(asyncio.DatagramProtocol):
         self.received.clear()
 
     async def until(self, condition: Callable[[], bool], timeout_s: float = PATIENCE_S) -> None:
-        """Wait for a condition on what has come.
-
-        Raises:
-            TimeoutError: it does not hold in time.
-        """
+        """Wait for a condition on what has come. Raises TimeoutError if it does not hold in time."""
         await waiting.until(condition, timeout_s)
 
     async def until_received(self, data: bytes, timeout_s: float = PATIENCE_S) -> None:

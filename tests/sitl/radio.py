@@ -89,11 +89,7 @@ class Radio:
                 await asyncio.sleep(0.02)
 
     async def ask(self, request: str) -> dict[str, Any]:
-        """Send a request to the control socket.
-
-        Raises:
-            ControlError: there is no answer.
-        """
+        """Send a request to the control socket. Raises ControlError if there is no answer."""
         answer = await asyncio.to_thread(ask, self._socket, request)
         assert "refused" not in answer, answer
         return answer

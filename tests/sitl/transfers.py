@@ -47,11 +47,7 @@ class Log:
 
 
 async def list_logs(station: Station, system: int, timeout_s: float = 60.0) -> list[Log]:
-    """The logs on the vehicle, the oldest first.
-
-    Raises:
-        RequestError: no complete list arrived in time.
-    """
+    """The logs on the vehicle, the oldest first. Raises RequestError if no complete list arrived in time."""
     deadline = monotonic() + timeout_s
     with station.inbox(system, "LOG_ENTRY") as inbox:
         logs: dict[int, Log] = {}

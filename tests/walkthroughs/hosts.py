@@ -179,11 +179,7 @@ class Container:
 
 
 def until(condition: Callable[[], bool], describe: Callable[[], str]) -> None:
-    """Wait for a condition.
-
-    Raises:
-        AssertionError: it does not hold in time.
-    """
+    """Wait for a condition. Raises AssertionError if it does not hold in time."""
     deadline = time.monotonic() + PATIENCE_S
     while not condition():
         assert time.monotonic() < deadline, describe()

@@ -67,11 +67,7 @@ _kept: list[tempfile.TemporaryDirectory[str]] = []
 
 @cache
 def build(dialect: str, library: str) -> Path:
-    """The shared library of one dialect and version.
-
-    Raises:
-        BuildError: there is no compiler, or it fails.
-    """
+    """The shared library of one dialect and version. Raises BuildError if there is no compiler, or it fails."""
     cc = compiler()
     if cc is None:
         raise BuildError("a C compiler (cc) is missing")

@@ -212,11 +212,7 @@ class Attack(PassiveAttack, ABC):
         self.prepare()
 
     def prepare(self) -> None:
-        """Make the state of a subclass.
-
-        Raises:
-            AttackError: the peers do not allow this attack.
-        """
+        """Make the state of a subclass. Raises AttackError if the peers do not allow this attack."""
 
     @classmethod
     def summary(cls) -> str:

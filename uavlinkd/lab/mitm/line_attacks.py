@@ -205,11 +205,7 @@ def list_line_attacks() -> str:
 
 
 def parse_line_attack(text: str) -> LineAttack:
-    """Parse ``NAME,key=value,key=value``.
-
-    Raises:
-        AttackError: there is no such attack, or a parameter is wrong.
-    """
+    """Parse ``NAME,key=value,key=value``. Raises AttackError if there is no such attack, or a parameter is wrong."""
     name, *pairs = (part.strip() for part in text.split(","))
     if name not in LINE_ATTACKS:
         raise AttackError(f"there is no attack {name!r} on the line: choose one of {', '.join(LINE_ATTACKS)}")

@@ -133,11 +133,7 @@ class ProxySettings(RunSettings):
         return AttackContext(tuple(self.listeners), keys)
 
     def radio_of(self) -> dict[Direction, RadioSettings]:
-        """The radio of each direction that has one.
-
-        Raises:
-            AttackError: there is no such direction.
-        """
+        """The radio of each direction that has one. Raises AttackError if there is no such direction."""
         context = self.context
         return {direction: settings for text, settings in self.radios for direction in context.select(text)}
 

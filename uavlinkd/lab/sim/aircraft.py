@@ -151,11 +151,7 @@ class GroundPilot:
         await self._insist(mavlink.MAVLink_command_long_message(self.system_id, 1, number, 0, *seven))
 
     async def _insist(self, message: Message) -> None:
-        """Send a command again and again until it is accepted.
-
-        Raises:
-            PilotError: it was not accepted in time.
-        """
+        """Send a command again and again until it is accepted. Raises PilotError if it was not accepted in time."""
         command: int = message.command
         until = asyncio.get_running_loop().time() + READY_S
         while True:

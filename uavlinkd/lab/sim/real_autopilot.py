@@ -150,11 +150,7 @@ class RealAutopilot:
             await stop_child(self._process, number, STOP_S)
 
     def check(self) -> None:
-        """Raise if the process has ended.
-
-        Raises:
-            RealAutopilotError: with its last output.
-        """
+        """Raise RealAutopilotError with its last output if the process has ended."""
         if self._process is not None and self._process.returncode is not None:
             lines = "\n".join(self.log.read_text(errors="replace").splitlines()[-5:])
             output = f":\n{lines}" if lines else ", without output"
