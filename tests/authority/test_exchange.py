@@ -33,13 +33,14 @@ class Daemon:
         self.trust = Trust(AUTHORITY, OWN, certificate, data)
         for key, held in CERTIFICATES.items():
             self.trust.hold(key, held)
-        self.exchange = BulletinExchange(self.trust, lambda size: b"\xff" * size)
+        self.exchange = BulletinExchange(self.trust, lambda size: b"\xff" * size, lambda _: self.wait_s)
         self.order = 0
+        self.wait_s = WAIT_S
 
     def up(self, *keys: bytes, now: float = NOW) -> list[tuple[bytes, FleetRecord]]:
         """Sessions are made; what is sent at once."""
         for key in keys or (PEER,):
-            self.exchange.on_handshake(key, WAIT_S, now)
+            self.exchange.on_handshake(key, now)
         return self.due(now)
 
     def due(self, now: float) -> list[tuple[bytes, FleetRecord]]:
@@ -135,11 +136,10 @@ def test_peer_with_a_newer_bulletin() -> None:
 
 
 def test_wait_follows_the_round_trip() -> None:
-    """A slow handshake does not slow the bulletin down. Nothing is kept for a peer that is not there."""
+    """A slow handshake does not slow the bulletin down."""
     daemon = Daemon(NEW)
     daemon.up()
-    daemon.exchange.set_wait(OTHER, 9.0)
-    daemon.exchange.set_wait(PEER, 4 * WAIT_S)
+    daemon.wait_s = 4 * WAIT_S
     daemon.receive(have(OLD), NOW + 1)
     sent = [at for at, *_ in daemon.hour(NOW + 1)]
     assert sent[1] - sent[0] == 4 * WAIT_S

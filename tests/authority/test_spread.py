@@ -56,7 +56,7 @@ class Fleet:
         for one, other in links:
             for here, there in ((one, other), (other, one)):
                 self.members[here].up.add(there)
-                self.members[here].exchange.on_handshake(key_of(there), 4 * ONE_WAY_S, self.now)
+                self.members[here].exchange.on_handshake(key_of(there), self.now)
 
     def publish(self, number: int, data: bytes) -> None:
         """The operator gives a bulletin to one member."""

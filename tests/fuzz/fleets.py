@@ -65,7 +65,7 @@ class HostileMembers:
         self.authority = _CountingAuthority(AUTHORITY.public)
         self.trust = Trust(self.authority, OWN, CERTIFICATES[0][1], BULLETINS[0])
         self.trust.hold(*CERTIFICATES[3])
-        self.exchange = BulletinExchange(self.trust, SeededEntropy(1))
+        self.exchange = BulletinExchange(self.trust, SeededEntropy(1), lambda _: WAIT_S)
         self.authority.checks = 0
         self.persisted = 1
         self.newest = BULLETINS[0]
@@ -82,7 +82,7 @@ class HostileMembers:
         if key not in self.began:
             self.began[key] = self.now
             self.allowed_checks += 2
-        self.exchange.on_handshake(key, WAIT_S, self.now)
+        self.exchange.on_handshake(key, self.now)
 
     def step(self, script: Script) -> None:
         """One action of a script."""
@@ -178,7 +178,7 @@ class HostileMembers:
         newest = bulletin(20, *range(20, 45), least=12)
         self.exchange.publish(newest, self.now)
         assert self.trust.bulletin_bytes == newest
-        self.exchange.on_handshake(KEYS[2], WAIT_S, self.now)
+        self.exchange.on_handshake(KEYS[2], self.now)
         self.order += 1
         self.exchange.receive(KEYS[2], Have(1, b"1234"), self.order, self.now)
         self.now += 2 * WAIT_S

@@ -20,6 +20,7 @@ from uavlinkd.authority.constants import HAVE_INTERVAL_S
 from uavlinkd.core.certificates import MemberRole, digest_of
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.outputs import Dropped, RecordReceived
+from uavlinkd.core.path import SERIAL_HOST
 from uavlinkd.core.path import Path as NetPath
 from uavlinkd.core.relay_records import BulletinRecord, CertificateRecord, FleetRecord, Have
 from uavlinkd.link.fleet_members import EVENT_S, FleetMembers, FleetShell
@@ -45,7 +46,7 @@ class Member(Daemon):
         )
         self.parts.fleet = self.fleet
         self.key = self.link.key
-        self.fleet.exchange.on_handshake(self.key, 0.0, NOW)
+        self.fleet.exchange.on_handshake(self.key, NOW)
         self.orders = 0
 
     def record(self, record: FleetRecord) -> DropReason | None:
@@ -186,3 +187,15 @@ async def until_written(fleet: FleetMembers) -> None:
     """The thread has written the state, or could not."""
     tasks = asyncio.all_tasks() - {asyncio.current_task()}
     await asyncio.gather(*tasks)
+
+
+async def test_bulletin_is_repeated_when_a_slow_radio_had_the_time_for_an_answer(tmp_path: Path) -> None:
+    """Otherwise the same bulletin would take the time of heartbeats again, just before its answer comes."""
+    member, line = Member(tmp_path), NetPath(1, (SERIAL_HOST, 0))
+    member.node.facts.set_budgets({line.socket: 1_600})
+    member.node.set_paths(member.link.peer, [line], NOW)
+    member.link.peer.paths.best = member.link.peer.paths.find(line)
+    member.have(1, bulletin(1))
+    exchange = member.fleet.exchange
+    assert any(isinstance(record, BulletinRecord) for _, record in exchange.do_due(NOW))
+    assert exchange.next_at == NOW + member.node.facts.repeat_s(line, len(b64decode(bulletin(2)))) > NOW + 1.5

@@ -59,7 +59,7 @@ class CertifiedDrone(Drone):
     def start(self, clock: float | None = None) -> None:
         """With what is on the disk."""
         self.trust = Trust(AUTHORITY, self.public_key, self.certificate, self.disk)
-        self.exchange = BulletinExchange(self.trust, Random(self._world.rng.randbytes(16)).randbytes)
+        self.exchange = BulletinExchange(self.trust, Random(self._world.rng.randbytes(16)).randbytes, self._wait_s)
         for name in self._world.drones:
             for flow in self._world.flows_between(name, self.name):
                 flow.refused_before = self._world.now
@@ -99,9 +99,13 @@ class CertifiedDrone(Drone):
             case o.PeerExpired():
                 self.trust.held.pop(key, None)
             case o.SessionEstablished() | o.PeerUp() if peer.session_with(c.FEATURE_FLEET, now) is not None:
-                self.exchange.on_handshake(key, 2 * peer.answer_s, now)
+                self.exchange.on_handshake(key, now)
             case o.PeerLost() | o.PeerClosed():
                 self.exchange.on_down(key)
+
+    def _wait_s(self, key: bytes) -> float:
+        peer = None if self.node is None else self.node.find(key)
+        return 0.0 if peer is None else 2 * peer.answer_s
 
     def on_record(self, received: o.RecordReceived) -> None:
         assert isinstance(received.peer, Peer)
@@ -154,6 +158,10 @@ class Liar(CertifiedDrone):
         """Lie from now on."""
         super().start(clock)
         self._world.at(self._world.now, partial(self._lie, self.exchange))
+
+    def _wait_s(self, key: bytes) -> float:
+        peer = None if self.node is None else self.node.find(key)
+        return 0.0 if peer is None else 2 * peer.answer_s
 
     def on_record(self, received: o.RecordReceived) -> None:
         """Bulletins change nothing here."""

@@ -6,7 +6,7 @@ sends that until the peer states that it has it. The static public key of a peer
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from math import inf
 from typing import NamedTuple
@@ -36,7 +36,6 @@ class Reaction(NamedTuple):
 class _Peer:
     """What one peer stated, and when it gets what. Kept while it is down: it may come back with an older disk."""
 
-    wait_s: float = c.PUSH_AGAIN_S
     is_up: bool = False
     have: Have | None = None
     """What it stated last, on a session of the present link."""
@@ -68,11 +67,13 @@ class BulletinExchange:
 
     Args:
         trust: its bulletin and its own certificate are on the disk.
+        wait_s: how long the answer to what the peer with this key lacks may take, at least.
     """
 
-    def __init__(self, trust: Trust, entropy: Entropy) -> None:
+    def __init__(self, trust: Trust, entropy: Entropy, wait_s: Callable[[bytes], float] = lambda _: 0.0) -> None:
         self._trust = trust
         self._entropy = entropy
+        self._answer_s = wait_s
         self._persisted = (trust.bulletin.number, trust.digest)
         self._peers: dict[bytes, _Peer] = {}
         self.next_at = inf
@@ -80,24 +81,12 @@ class BulletinExchange:
 
     # Peers.
 
-    def on_handshake(self, key: bytes, wait_s: float, now: float) -> None:
-        """A session with a peer was made, or its link is up again.
-
-        Args:
-            key: its static public key.
-            wait_s: before a repetition: two round trips; with a budget, at least four airtimes.
-            now: monotonic seconds.
-        """
+    def on_handshake(self, key: bytes, now: float) -> None:
+        """A session with the peer that has this static public key was made, or its link is up again."""
         peer = self._peers.setdefault(key, _Peer())
-        peer.wait_s = max(wait_s, c.PUSH_AGAIN_S)
         peer.is_up, peer.have, peer.has, peer.tries = True, None, 0, 0
-        peer.owes_have, peer.push_at = True, now + peer.wait_s
+        peer.owes_have, peer.push_at = True, now + self._wait_s(key)
         self._note(peer)
-
-    def set_wait(self, key: bytes, wait_s: float) -> None:
-        """The round trip of a peer has changed: see :meth:`on_handshake`."""
-        if (peer := self._peers.get(key)) is not None:
-            peer.wait_s = max(wait_s, c.PUSH_AGAIN_S)
 
     def on_down(self, key: bytes) -> None:
         """The link of a peer is lost or closed."""
@@ -151,14 +140,15 @@ class BulletinExchange:
         peer.has = have.number if is_rolled_back else max(peer.has, have.number)
         if not is_repeated:
             peer.tries = 0
+        wait_s = self._wait_s(key)
         if self._lacks(key, peer):
-            peer.push_at = max(now, peer.pushed_at + peer.wait_s)
+            peer.push_at = max(now, peer.pushed_at + wait_s)
         elif self._asks(peer):
-            peer.push_at = min(peer.push_at, now + peer.wait_s)
+            peer.push_at = min(peer.push_at, now + wait_s)
         else:
             peer.push_at = inf
             # The peer may not know what this end has. The peer's answer to the answer comes too soon for a loop.
-            peer.owes_have |= is_repeated and now >= peer.have_sent_at + peer.wait_s
+            peer.owes_have |= is_repeated and now >= peer.have_sent_at + wait_s
         self._note(peer)
         if is_rolled_back:
             return Reaction(event=ROLLED_BACK)
@@ -240,11 +230,15 @@ class BulletinExchange:
 
     def _plan_all(self, now: float) -> None:
         """Send each peer what it lacks, a little later: it may come from others until then."""
-        for peer in self._peers.values():
+        for key, peer in self._peers.items():
             if peer.is_up:
                 soon = now + c.PUSH_JITTER_S * self._entropy(1)[0] / 255
-                peer.tries, peer.push_at = 0, max(soon, peer.pushed_at + peer.wait_s)
+                peer.tries, peer.push_at = 0, max(soon, peer.pushed_at + self._wait_s(key))
                 self._note(peer)
+
+    def _wait_s(self, key: bytes) -> float:
+        """How long to wait for an answer of a peer before a repetition."""
+        return max(self._answer_s(key), c.PUSH_AGAIN_S)
 
     def _note(self, peer: _Peer) -> None:
         self.next_at = min(self.next_at, peer.next_at)
@@ -263,8 +257,8 @@ class BulletinExchange:
                 peer.pushed_at = now if records else peer.pushed_at
                 peer.owes_have |= asks
                 peer.tries += 1
-                again_s = peer.wait_s if peer.tries < c.PUSH_TRIES else max(c.HAVE_INTERVAL_S, peer.wait_s)
-                peer.push_at = now + again_s if records or asks else inf
+                least_s = 0.0 if peer.tries < c.PUSH_TRIES else c.HAVE_INTERVAL_S
+                peer.push_at = now + max(least_s, self._wait_s(key)) if records or asks else inf
             if peer.owes_have and now >= peer.have_sent_at + c.HAVE_LEAST_S:
                 records.append(self._have(key))
                 peer.owes_have, peer.have_sent_at = False, now

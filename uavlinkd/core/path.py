@@ -128,8 +128,12 @@ class SocketFacts:
         return Pace(
             self._share_s(path, c.ECHO_BYTES, c.ECHO_BUDGET_SHARE, self._budgets),
             min(max(c.HOLD_S, c.HOLD_AIRTIMES * airtime_s), c.LATE_AFTER_S),
-            max(c.HOLD_ASK_S, c.ASK_AIRTIMES * airtime_s),
+            max(c.HOLD_ASK_S, self.repeat_s(path, 0)),
         )
+
+    def repeat_s(self, path: Path, more_bytes: int) -> float:
+        """Between repetitions of a message so much longer than an echo request, at least; 0 without a budget."""
+        return c.ASK_AIRTIMES * self._airtime_s(path, c.ECHO_BYTES + more_bytes, self._budgets)
 
     def _airtime_s(self, path: Path, size: int, rates: Mapping[int, float]) -> float:
         """How long a datagram and its answer, with so many bytes together, take; 0 on a network without a budget."""

@@ -90,7 +90,7 @@ class FleetMembers:
         self._evidence = daemon.evidence
         self.trust = Trust(fleet.authority, config.public_key, fleet.own.data, fleet.bulletin)
         self._unread = self._read(fleet)
-        self.exchange = BulletinExchange(self.trust, os.urandom)
+        self.exchange = BulletinExchange(self.trust, os.urandom, self._wait_s)
         self._events: dict[str, tuple[float, str]] = {}
         """When something about bulletins was noticed last that a person has to know, and the name of the cause."""
         self._questions = MemberQuestions()
@@ -243,16 +243,18 @@ class FleetMembers:
                 self.trust.held.pop(key, None)
             case o.SessionEstablished() | o.PeerUp() if peer.session_with(c.FEATURE_FLEET, now) is not None:
                 self._serve(key, now)  # a contact comes without an admission
-                self.exchange.on_handshake(key, self._wait_s(peer), now)
+                self.exchange.on_handshake(key, now)
                 if self._fleet.call and any(relay.peer is peer for relay in self._relays.by_name.values()):
                     self._questions.begin(key, now)
             case o.PeerLost() | o.PeerClosed():
                 self.exchange.on_down(key)
                 self._questions.end(key)
 
-    def _wait_s(self, peer: Peer) -> float:
-        """How long to wait for what a peer answers to a record, at least."""
-        return max(2 * peer.answer_s, 0.0 if peer.path is None else self._node.facts.pace(peer.path).ask_s)
+    def _wait_s(self, key: bytes) -> float:
+        """How long to wait for what a peer answers to a bulletin, at least."""
+        if (peer := self._node.find(key)) is None or peer.path is None:
+            return 0.0
+        return max(2 * peer.answer_s, self._node.facts.repeat_s(peer.path, len(self.trust.bulletin_bytes)))
 
     def _join(self, key: bytes, peer: Peer | None, now: float) -> None:
         """A member is here, or is introduced: make a link with it, and let it use the relay of this daemon."""
@@ -282,7 +284,6 @@ class FleetMembers:
             elif isinstance(record, Who):
                 return DropReason.UNEXPECTED_RECORD if self._relay is None else self._relay.on_record(received, now)
             elif isinstance(record, FleetRecord):
-                self.exchange.set_wait(key, self._wait_s(peer))
                 self._react(self.exchange.receive(key, record, received.order, now), now, peer.name)
                 if isinstance(record, CertificateRecord) and self._is_contact(key):
                     self._disk.write()

@@ -58,7 +58,8 @@ class Member:
         self.node = Node(Secret(private), os.urandom, now)
         certificate = signed(Certificate(FLEET, 2 + number, MemberRole.RELAY, (0, 0), f"member{number}"), self.key)
         self.node.set_certificate(certificate)
-        self.exchange = BulletinExchange(Trust(AUTHORITY, self.key, certificate, bulletin(1)), os.urandom)
+        trust = Trust(AUTHORITY, self.key, certificate, bulletin(1))
+        self.exchange = BulletinExchange(trust, os.urandom, lambda _: 2 * self.link.peer.answer_s)
         settings = PeerSettings(RELAY_HOST + "relay", relay.key, None, LINK, is_certified=relay.has_fleet)
         self.link = RelayLink(RelayConfig(settings, ()), self.node, RelayHandles(), lambda keys, now: None, now)
         self.path = Path(0, self.relay)
@@ -112,7 +113,7 @@ class Member:
             elif not isinstance(output, o.Deliver | o.Dropped):
                 self.link.on_event(output, now)
                 if isinstance(output, o.SessionEstablished) and peer.session_with(c.FEATURE_FLEET, now) is not None:
-                    self.exchange.on_handshake(peer.settings.public_key, 2 * peer.answer_s, now)
+                    self.exchange.on_handshake(peer.settings.public_key, now)
 
     def _receive_record(self, received: o.RecordReceived, now: float) -> None:
         if isinstance(received.record, FleetRecord):

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from uavlinkd.authority.constants import PUSH_AGAIN_S
 from uavlinkd.authority.exchange import BulletinExchange
 from uavlinkd.authority.trust import Trust
 from uavlinkd.core import constants as c
@@ -84,7 +83,7 @@ class HostileFleet:
             case o.PeerExpired():
                 self.trust.held.pop(key, None)
             case o.SessionEstablished() | o.PeerUp() if peer.session_with(c.FEATURE_FLEET, now) is not None:
-                self._exchange.on_handshake(key, PUSH_AGAIN_S, now)
+                self._exchange.on_handshake(key, now)
             case o.PeerLost() | o.PeerClosed():
                 self._exchange.on_down(key)
 
