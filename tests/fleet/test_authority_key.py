@@ -12,6 +12,7 @@ import pytest
 
 from tests.fleet.vehicles import create
 from tests.waiting import PATIENCE_S
+from uavlinkd.authority.enrolment import FleetError
 from uavlinkd.cli import main
 from uavlinkd.core.crypto import Secret
 from uavlinkd.fleet import operations
@@ -23,7 +24,7 @@ from uavlinkd.fleet.authority_key import (
     passphrase_from,
     read_paper,
 )
-from uavlinkd.fleet.manifest import FleetError, read_manifest
+from uavlinkd.fleet.manifest import read_manifest
 from uavlinkd.fleet.signing import Identity
 from uavlinkd.system.addresses import Address
 

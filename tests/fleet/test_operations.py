@@ -17,13 +17,13 @@ import pytest
 
 from tests.fleet.vehicles import NAMES, create, loaded, unasked
 from tests.waiting import PATIENCE_S
-from uavlinkd.authority.enrolment import Request, parse_reply
+from uavlinkd.authority.enrolment import FleetError, Request, parse_reply
 from uavlinkd.config import keys
 from uavlinkd.core.certificates import MemberRole
 from uavlinkd.fleet import operations, transaction
 from uavlinkd.fleet.authority_key import AUTHORITY_FILE, SUCCESSOR_FILE
 from uavlinkd.fleet.files import reply_for
-from uavlinkd.fleet.manifest import Fleet, FleetError, FleetSettings, check_settings, fill, read_manifest
+from uavlinkd.fleet.manifest import Fleet, FleetSettings, check_settings, fill, read_manifest
 from uavlinkd.fleet.signing import Identity
 from uavlinkd.fleet.transaction import lock
 from uavlinkd.lab.child_processes import end_with_parent

@@ -12,11 +12,12 @@ from pathlib import Path
 import pytest
 
 from tests.fleet.vehicles import create, loaded, unasked
+from uavlinkd.authority.enrolment import FleetError
 from uavlinkd.authority.trust import Trust
 from uavlinkd.cli import main
 from uavlinkd.core.certificates import parse_bulletin
 from uavlinkd.fleet import operations
-from uavlinkd.fleet.manifest import FleetError, read_manifest
+from uavlinkd.fleet.manifest import read_manifest
 from uavlinkd.ops.control import MAX_REQUEST_BYTES, Answer, ControlServer
 from uavlinkd.system.addresses import Address
 

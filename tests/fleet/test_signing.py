@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from uavlinkd.authority.enrolment import FleetError
 from uavlinkd.core.certificates import (
     GENERATION,
     LARGEST_OFFSET,
@@ -19,7 +20,7 @@ from uavlinkd.core.certificates import (
     is_published,
 )
 from uavlinkd.core.crypto import Secret, SigningKey, x25519_public_key
-from uavlinkd.fleet.manifest import Fleet, FleetError, FleetSettings
+from uavlinkd.fleet.manifest import Fleet, FleetSettings
 from uavlinkd.fleet.signing import Identity, certify, merge, new_fleet, revoke
 from uavlinkd.system.addresses import Address
 

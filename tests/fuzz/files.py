@@ -12,13 +12,14 @@ from typing import Final
 
 from tests.fuzz.engine import Run, Script
 from uavlinkd.authority import enrolment
+from uavlinkd.authority.enrolment import FleetError
 from uavlinkd.config.keys import KeyFileError, decode_key, encode_key, read_secret_file
 from uavlinkd.config.load import load_config
 from uavlinkd.config.model import Config, ConfigError
 from uavlinkd.core import wire
 from uavlinkd.core.crypto import sha256
 from uavlinkd.core.suites import SUITES
-from uavlinkd.fleet.manifest import FILE_NAME, FleetError, read_manifest, write_manifest
+from uavlinkd.fleet.manifest import FILE_NAME, read_manifest, write_manifest
 from uavlinkd.lab.mitm import anatomy
 from uavlinkd.lab.mitm.proxy_settings import ProxySettings, SettingsError, load_proxy_settings
 from uavlinkd.lab.sim.tlog import TlogError, parse_tlog
@@ -131,15 +132,15 @@ def make_key() -> Run:
 
 
 def make_enrolment() -> Run:
-    """The two lines of an enrolment, the reply also with a right checksum: one spelling, or an EnrolmentError."""
+    """The two lines of an enrolment, the reply also with a right checksum: one spelling, or a FleetError."""
 
     def run(data: bytes) -> None:
         text = data.decode("latin-1")
         whole = base64.b64encode(data + sha256(data)[: enrolment.CHECK_BYTES]).decode().rstrip("=")
-        with contextlib.suppress(enrolment.EnrolmentError):
+        with contextlib.suppress(enrolment.FleetError):
             assert enrolment.parse_request(text).line().split() == text.split(), "a request with two spellings"
         for line in (text.strip(), whole):
-            with contextlib.suppress(enrolment.EnrolmentError):
+            with contextlib.suppress(enrolment.FleetError):
                 reply = enrolment.parse_reply(line)
                 assert reply.line() == line, "a reply with two spellings"
                 enrolment.verify_reply(reply, decode_key(PUBLIC))

@@ -1,6 +1,6 @@
 """The two lines of an enrolment: a member's request, and the operator's reply. README.md, section Enrolment.
 
-Pure and total: any text is a line or an :class:`EnrolmentError`, whose message is for a person. Neither line has a
+Pure and total: any text is a line or a :class:`FleetError`, whose message is for a person. Neither line has a
 secret, but the reply decides whom the new member trusts: compare the fingerprint at both ends.
 """
 
@@ -28,6 +28,7 @@ from uavlinkd.core.suites import SUITES, Suite
 from uavlinkd.core.wire import CERTIFICATE_BYTES
 from uavlinkd.system.addresses import AddressError, parse_address
 from uavlinkd.system.base64_text import from_base64, to_base64
+from uavlinkd.system.terminal import UsageError
 
 WORD = "uavlink-enroll-1"
 VERSION = 1
@@ -37,11 +38,14 @@ LONGEST_LINE = 4096
 """More characters than three contacts need. A terminal accepts no longer line."""
 _HEAD = struct.Struct(f">BBBB{KEY_BYTES}s{KEY_BYTES}s{CERTIFICATE_BYTES}sH")
 _CONTACT = struct.Struct(f">{KEY_BYTES}s{CERTIFICATE_BYTES}sB")
-_CUT = "is not a whole line of `uavlinkd fleet sign`: it was cut or changed on its way; copy it again, or send a file"
+_CUT = "the line is not a whole line of `uavlinkd fleet sign`: it was cut or changed; copy it again, or send a file"
 
 
-class EnrolmentError(ValueError):
-    """A line cannot be used. The message says why, and what to do."""
+class FleetError(UsageError):
+    """A command line, a line of an enrolment or a file of a fleet is wrong. The command changed nothing.
+
+    Each message is for a person, says what to do, and contains no secret.
+    """
 
 
 def fingerprint_of(authority: bytes) -> str:
@@ -75,17 +79,17 @@ def parse_request(line: str) -> Request:
     """The request in a line.
 
     Raises:
-        EnrolmentError: with the reason.
+        FleetError: with the reason.
     """
     words = line.split()
     if words[:1] != [WORD] or len(words) != 4:
-        raise EnrolmentError("is not a whole line of `uavlinkd enroll NAME`: copy it again")
+        raise FleetError("the line is not a whole line of `uavlinkd enroll NAME`: copy it again")
     check_name(words[1])
-    request = Request(words[1], _decoded(words[2], "is not a line of `uavlinkd enroll NAME`: copy it again"))
+    request = Request(words[1], _decoded(words[2], "the line is not a line of `uavlinkd enroll NAME`: copy it again"))
     if len(request.public_key) != KEY_BYTES or request.line().split() != words:
-        raise EnrolmentError("was changed on its way: copy the line of `uavlinkd enroll NAME` again")
+        raise FleetError("the line was changed on its way: copy the line of `uavlinkd enroll NAME` again")
     if not is_usable_public_key(request.public_key):
-        raise EnrolmentError("has a public key of small order, with which no session is secret")
+        raise FleetError("the line has a public key of small order, with which no session is secret")
     return request
 
 
@@ -93,10 +97,10 @@ def check_name(name: str) -> None:
     """Check that a certificate can have this name.
 
     Raises:
-        EnrolmentError: it cannot.
+        FleetError: it cannot.
     """
     if not NAME.fullmatch(name):
-        raise EnrolmentError(f"{name!r:.80} is not a name: write 1 to 21 of a-z, 0-9 and -, first and last not -")
+        raise FleetError(f"{name!r:.80} is not a name: write 1 to 21 of a-z, 0-9 and -, first and last not -")
 
 
 class Contact(NamedTuple):
@@ -143,29 +147,28 @@ def parse_reply(line: str) -> Reply:
     """The reply in a line; its signatures are not verified.
 
     Raises:
-        EnrolmentError: with the reason.
+        FleetError: with the reason.
     """
     text = line.strip()
     if text.startswith(WORD):
-        raise EnrolmentError(
-            "is the request of `uavlinkd enroll`: give it to `uavlinkd fleet sign`, whose line is meant"
+        raise FleetError(
+            "the line is the request of `uavlinkd enroll`: give it to `uavlinkd fleet sign`, whose line is meant"
         )
     data = _decoded(text + "=" * (-len(text) % 4), _CUT)
     if len(data) < _HEAD.size + BULLETIN_BYTES or sha256(data[:-CHECK_BYTES])[:CHECK_BYTES] != data[-CHECK_BYTES:]:
-        raise EnrolmentError(_CUT)
+        raise FleetError(_CUT)
     if data[0] != VERSION:
-        raise EnrolmentError("is of another version of uavlinkd: install the same one at both ends")
+        raise FleetError("the line is of another version of uavlinkd: install the same one at both ends")
     try:
-        reply = _parsed(data[:-CHECK_BYTES])
-    except (ValueError, LookupError, struct.error):
-        raise EnrolmentError(
-            "has a field that this version does not know: install the same one at both ends"
-        ) from None
-    return reply
+        return _parsed(data[:-CHECK_BYTES])
+    except (ValueError, LookupError, struct.error, Drop):
+        text = "the line has a field that this version does not know: install the same one at both ends"
+        raise FleetError(text) from None
 
 
 def _parsed(data: bytes) -> Reply:
     _, suite, calls, relays, authority, successor, certificate, size = _HEAD.unpack_from(data)
+    parse_certificate(certificate)
     addresses, at = _addresses(data, _HEAD.size + size)
     count, at = data[at], at + 1
     contacts = []
@@ -194,7 +197,7 @@ def verify_reply(reply: Reply, own_key: bytes) -> Trust:
     """Verify each signature of a reply for this static public key. The result holds the contacts' certificates.
 
     Raises:
-        EnrolmentError: with the reason.
+        FleetError: with the reason.
     """
     try:
         authority = AuthorityKey(reply.authority)
@@ -204,20 +207,20 @@ def verify_reply(reply: Reply, own_key: bytes) -> Trust:
             for address in addresses:
                 parse_address(address, allow_names=True)
     except AddressError as error:
-        raise EnrolmentError(f"has an address that {error}") from None
-    except Drop:
-        raise EnrolmentError("has an invalid certificate: sign the request again") from None
+        raise FleetError(f"the line has an address that {error}") from None
     except ValueError as error:
-        raise EnrolmentError(f"has no valid authority or bulletin: the key or bulletin {error}") from None
+        raise FleetError(f"the line has no valid authority or bulletin: the key or bulletin {error}") from None
     if not trust.replace_own(reply.certificate):
-        raise EnrolmentError(f"has the certificate of another key, named {own.name}: use the line of this request")
+        raise FleetError(f"the line has the certificate of another key, named {own.name}: use the line for this one")
     if trust.bulletin.refuses(own.serial):
-        raise EnrolmentError(f"has a revoked certificate, serial {own.serial}: sign the request again")
+        raise FleetError(f"the line has a revoked certificate, serial {own.serial}: sign the request again")
     for contact in reply.contacts:
         try:
             trust.hold(contact.public_key, contact.certificate)
         except Drop as drop:
-            raise EnrolmentError(f"has a contact with an invalid certificate ({drop.reason}): sign again") from None
+            raise FleetError(
+                f"the line has a contact without a valid certificate ({drop.reason}): sign again"
+            ) from None
     return trust
 
 
@@ -225,4 +228,4 @@ def _decoded(text: str, reason: str) -> bytes:
     try:
         return from_base64(text)
     except ValueError:
-        raise EnrolmentError(reason) from None
+        raise FleetError(reason) from None

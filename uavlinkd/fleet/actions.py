@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import fields
 from pathlib import Path
 
-from uavlinkd.authority.enrolment import LONGEST_LINE, EnrolmentError, fingerprint_of, parse_request
+from uavlinkd.authority.enrolment import LONGEST_LINE, FleetError, fingerprint_of, parse_request
 from uavlinkd.core.certificates import MemberRole
 from uavlinkd.fleet import enrolling, operations
 from uavlinkd.fleet.authority_key import (
@@ -24,7 +24,7 @@ from uavlinkd.fleet.authority_key import (
     read_paper,
 )
 from uavlinkd.fleet.files import config_file
-from uavlinkd.fleet.manifest import Fleet, FleetError, FleetSettings, Member, parse_addresses, read_manifest
+from uavlinkd.fleet.manifest import Fleet, FleetSettings, Member, parse_addresses, read_manifest
 from uavlinkd.fleet.operations import Result
 from uavlinkd.fleet.signing import Identity
 from uavlinkd.mavlink.dialect import SYSTEM_ID
@@ -61,10 +61,7 @@ def _sign(options: argparse.Namespace) -> None:
     if options.name is not None:
         print(operations.line_of(options.out, options.name))
         return
-    try:
-        request = parse_request(_line())
-    except EnrolmentError as error:
-        raise FleetError(f"the line {error}") from None
+    request = parse_request(_line())
     replaces = options.replace is not None
     if replaces and options.replace != request.name:  # a captured machine could ask for the role of another
         raise FleetError(f"the line is of {request.name}, not of {options.replace}: nothing was signed")

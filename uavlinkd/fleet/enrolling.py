@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from uavlinkd.authority.enrolment import (
-    EnrolmentError,
+    FleetError,
     Reply,
     Request,
     check_name,
@@ -24,7 +24,7 @@ from uavlinkd.core.certificates import Certificate, parse_bulletin, parse_certif
 from uavlinkd.core.crypto import x25519_public_key
 from uavlinkd.core.drops import Drop
 from uavlinkd.fleet.files import config_file, key_file, listen_on, with_fleet, write_config
-from uavlinkd.fleet.manifest import FleetError, FleetFileError, FleetSettings
+from uavlinkd.fleet.manifest import FleetFileError, FleetSettings
 from uavlinkd.fleet.transaction import changing
 from uavlinkd.mavlink.dialect import SYSTEM_ID
 from uavlinkd.system.base64_text import from_base64
@@ -64,10 +64,7 @@ def request(name: str, place: MemberFiles) -> tuple[str, Path]:
 
     A member that has a certificate already asks for another key. Its present one stays until :func:`finish`.
     """
-    try:
-        check_name(name)
-    except EnrolmentError as error:
-        raise FleetError(str(error)) from None
+    check_name(name)
     table = place.table()
     own = str(table.get("private_key_file", key_file(name)))
     path = place.key(_other(own) if "fleet" in table else own)
@@ -88,13 +85,8 @@ def finish(line: str, config: Path | None, folder: Path | None, url: str | None,
     Nothing is written unless every signature verifies and a daemon would accept the file. The former key is deleted.
     Returns sentences for the person who ran the command.
     """
-    try:
-        reply = parse_reply(line)
-        certificate = parse_certificate(reply.certificate)
-    except EnrolmentError as error:
-        raise FleetError(f"the line {error}") from None
-    except Drop:
-        raise FleetError("the line has no valid certificate: sign the request again") from None
+    reply = parse_reply(line)
+    certificate = parse_certificate(reply.certificate)
     place = MemberFiles(config or Path(config_file(certificate.name)), folder)
     table = place.table()
     former_ids = _check_present(table.get("fleet"), reply, certificate, place.config)
@@ -170,8 +162,8 @@ def _verified(reply: Reply, name: str, paths: list[Path]) -> tuple[Path, list[st
         if path.exists():
             try:
                 trust = verify_reply(reply, x25519_public_key(keys.read_secret_file(path).reveal()))
-            except EnrolmentError as error:
-                reason = f"the line {error}"
+            except FleetError as error:
+                reason = str(error)
             else:
                 return path, [held.certificate.name for held in trust.held.values()]
     raise FleetError(reason)

@@ -12,10 +12,10 @@ import tomllib
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from uavlinkd.authority.enrolment import Contact, Reply, ids_of
+from uavlinkd.authority.enrolment import Contact, FleetError, Reply, ids_of
 from uavlinkd.core.certificates import MemberRole, parse_certificate
 from uavlinkd.core.suites import SUITES_BY_NAME
-from uavlinkd.fleet.manifest import Fleet, FleetError, FleetSettings, Member, fill, toml_lines
+from uavlinkd.fleet.manifest import Fleet, FleetSettings, Member, fill, toml_lines
 from uavlinkd.system.addresses import parse_address
 from uavlinkd.system.base64_text import to_base64
 

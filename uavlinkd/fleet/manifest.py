@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from uavlinkd.authority.enrolment import MOST_CONTACTS, ids_of
+from uavlinkd.authority.enrolment import MOST_CONTACTS, FleetError, ids_of
 from uavlinkd.core.certificates import (
     Bulletin,
     Certificate,
@@ -29,18 +29,11 @@ from uavlinkd.core.drops import Drop
 from uavlinkd.core.suites import SUITES_BY_NAME
 from uavlinkd.system.addresses import Address, AddressError, parse_address
 from uavlinkd.system.base64_text import from_base64, to_base64
-from uavlinkd.system.terminal import FAILED, UsageError, printable
+from uavlinkd.system.terminal import FAILED, printable
 
 FILE_NAME = "fleet.toml"
 _TEMPLATES = ("control_socket", "drone_url", "ground_station_url")
 _BRACES = re.compile(r"\{n\}|\{name\}|[{}]")
-
-
-class FleetError(UsageError):
-    """The command line, the manifest or a configuration is wrong. The command changed nothing.
-
-    Each message is for a person and contains no secret.
-    """
 
 
 class FleetFileError(FleetError):

@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from uavlinkd.authority.enrolment import Reply, Request
+from uavlinkd.authority.enrolment import FleetError, Reply, Request
 from uavlinkd.authority.trust import BulletinVerdict
 from uavlinkd.config import keys
 from uavlinkd.core.certificates import MemberRole
@@ -27,7 +27,6 @@ from uavlinkd.fleet.authority_key import AUTHORITY_FILE, SUCCESSOR_FILE, Passphr
 from uavlinkd.fleet.manifest import (
     FILE_NAME,
     Fleet,
-    FleetError,
     FleetFileError,
     FleetSettings,
     Member,

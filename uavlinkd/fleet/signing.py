@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
 
-from uavlinkd.authority.enrolment import EnrolmentError, check_name
+from uavlinkd.authority.enrolment import FleetError, check_name
 from uavlinkd.config.keys import is_canonical_public_key
 from uavlinkd.core.certificates import (
     GENERATION,
@@ -21,7 +21,7 @@ from uavlinkd.core.certificates import (
     verified_bulletin,
 )
 from uavlinkd.core.crypto import AuthorityKey, SigningKey, is_usable_public_key
-from uavlinkd.fleet.manifest import Fleet, FleetError, FleetSettings, Member
+from uavlinkd.fleet.manifest import Fleet, FleetSettings, Member
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.base64_text import from_base64
 
@@ -100,10 +100,7 @@ def certify(
 
 
 def _check(fleet: Fleet, others: list[Member], public_key: bytes, name: str, addresses: tuple[Address, ...]) -> None:
-    try:
-        check_name(name)
-    except EnrolmentError as error:
-        raise FleetError(str(error)) from None
+    check_name(name)
     if not is_usable_public_key(public_key) or not is_canonical_public_key(public_key):
         raise FleetError(f"the key of {name} is not a public key of X25519")
     if any(address.is_wildcard for address in addresses):

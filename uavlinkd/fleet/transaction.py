@@ -8,10 +8,11 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from uavlinkd.authority.enrolment import FleetError
 from uavlinkd.config import keys
 from uavlinkd.config.load import load_config
 from uavlinkd.config.model import ConfigError
-from uavlinkd.fleet.manifest import FleetError, FleetFileError, no_fleet
+from uavlinkd.fleet.manifest import FleetFileError, no_fleet
 from uavlinkd.system.folders import sync_folder
 from uavlinkd.system.terminal import printable
 
