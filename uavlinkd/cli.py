@@ -167,11 +167,7 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def fill_by_lab(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of a command of the laboratory.
-
-    Raises:
-        CommandError: it is not installed.
-    """
+    """Add the arguments of a command of the laboratory. Raises CommandError if it is not installed."""
     _need_lab(parser.prog)
     from uavlinkd.lab.commands import add_arguments
 

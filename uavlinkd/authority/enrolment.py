@@ -76,11 +76,7 @@ class Request(NamedTuple):
 
 
 def parse_request(line: str) -> Request:
-    """The request in a line.
-
-    Raises:
-        FleetError: with the reason.
-    """
+    """The request in a line. Raises FleetError with the reason."""
     words = line.split()
     if words[:1] != [WORD] or len(words) != 4:
         raise FleetError("the line is not a whole line of `uavlinkd enroll NAME`: copy it again")
@@ -94,11 +90,7 @@ def parse_request(line: str) -> Request:
 
 
 def check_name(name: str) -> None:
-    """Check that a certificate can have this name.
-
-    Raises:
-        FleetError: it cannot.
-    """
+    """Check that a certificate can have this name. Raises FleetError if it cannot."""
     if not NAME.fullmatch(name):
         raise FleetError(f"{name!r:.80} is not a name: write 1 to 21 of a-z, 0-9 and -, first and last not -")
 
@@ -144,11 +136,7 @@ class Reply(NamedTuple):
 
 
 def parse_reply(line: str) -> Reply:
-    """The reply in a line; its signatures are not verified.
-
-    Raises:
-        FleetError: with the reason.
-    """
+    """The reply in a line; its signatures are not verified. Raises FleetError with the reason."""
     text = line.strip()
     if text.startswith(WORD):
         raise FleetError(
@@ -196,8 +184,7 @@ def _addresses(data: bytes, at: int) -> tuple[tuple[str, ...], int]:
 def verify_reply(reply: Reply, own_key: bytes) -> Trust:
     """Verify each signature of a reply for this static public key. The result holds the contacts' certificates.
 
-    Raises:
-        FleetError: with the reason.
+    Raises FleetError with the reason.
     """
     try:
         authority = AuthorityKey(reply.authority)

@@ -66,8 +66,7 @@ def read(path: Path, trust: Trust, contacts: Mapping[bytes, bytes] = MappingProx
 def write(path: Path, state: FleetState) -> None:
     """Replace the file: after a power cut it has the old content or the new one, and when this returns, the new one.
 
-    Raises:
-        OSError: the file has the old content, or perhaps will have it after a power cut.
+    Raises OSError: then the file has the old content, or perhaps will have it after a power cut.
     """
     new = path.with_name(f".{path.name}.new")
     try:

@@ -107,10 +107,7 @@ class Trust:
     def judge(self, key: bytes, data: bytes) -> Certificate:
         """The certificate that counts for this static key now: the one in these bytes, or a newer one that is held.
 
-        Changes nothing.
-
-        Raises:
-            Drop: ``BAD_CERTIFICATE``, ``CERTIFICATE_REVOKED`` or ``MEMBER_CONFLICT``.
+        Changes nothing. Raises Drop with ``BAD_CERTIFICATE``, ``CERTIFICATE_REVOKED`` or ``MEMBER_CONFLICT``.
         """
         certificate = parse_certificate(data)
         if key == self.own_key or not self._is_signed(certificate, key, data):
@@ -131,9 +128,7 @@ class Trust:
         """Hold the certificate of another member from now on, unless a newer one for its key is held.
 
         Returns the keys whose peers end: one that the member had before, or its own if name, role or ids changed.
-
-        Raises:
-            Drop: as :meth:`judge`; then nothing was changed.
+        Raises Drop as :meth:`judge`; then nothing was changed.
         """
         return self.keep(key, self.judge(key, data), data)
 

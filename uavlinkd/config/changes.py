@@ -60,8 +60,7 @@ class ConfigChanges:
 def compare(old: Config, new: Config) -> ConfigChanges:
     """The changes that make a daemon that runs with ``old`` run with ``new``.
 
-    Raises:
-        ConfigError: every key whose change needs a restart.
+    Raises ConfigError with every key whose change needs a restart.
     """
     fixed = [key for field, key in _FIXED.items() if getattr(old, field) != getattr(new, field)]
     if (old.relay_server is None) != (new.relay_server is None):

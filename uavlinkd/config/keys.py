@@ -73,9 +73,7 @@ def decode_key(text: str) -> bytes:
     """The 32 bytes of a key in base64. A newline or spaces around it do not matter.
 
     Only the spelling that WireGuard writes is accepted: two spellings of a key would count as two keys.
-
-    Raises:
-        ValueError: with a message that does not repeat the text.
+    Raises ValueError with a message that does not repeat the text.
     """
     try:
         key = from_base64(text.strip())
@@ -97,8 +95,7 @@ def is_canonical_public_key(public: bytes) -> bool:
 def write_secret_file(path: Path, text: str) -> None:
     """Write a key to a new file that only its owner may read, and sync it to the disk.
 
-    Raises:
-        KeyFileError: the file exists (a key is never overwritten), or cannot be written.
+    Raises KeyFileError if the file exists (a key is never overwritten), or cannot be written.
     """
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | _CLOEXEC
     try:
@@ -141,11 +138,7 @@ def find_secret_file(name: str, folder: Path, environ: Mapping[str, str]) -> tup
 
 
 def read_secret_file(path: Path, *, credential: bool = False) -> Secret:
-    """The key in a file that :func:`read_private_file` accepts.
-
-    Raises:
-        KeyFileError: with the remedy.
-    """
+    """The key in a file that :func:`read_private_file` accepts. Raises KeyFileError with the remedy."""
     content = read_private_file(path, _READ_LIMIT, credential=credential)
     try:
         key = decode_key(content.decode("ascii", errors="replace"))
@@ -163,9 +156,7 @@ def read_private_file(path: Path, limit: int, *, credential: bool = False) -> by
 
     ``credential``: systemd grants a service its credentials through an access control list, whose mask appears as
     the group's right to read. The folder is the service's own, so this right is allowed there.
-
-    Raises:
-        KeyFileError: with the remedy.
+    Raises KeyFileError with the remedy.
     """
     try:
         # O_NONBLOCK: opening a pipe must not wait for its writer. The checks apply to the opened file.

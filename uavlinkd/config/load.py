@@ -42,8 +42,7 @@ _ONCE = "write a key once in its section, and for another peer or endpoint [[pee
 def load_config(path: Path, environ: Mapping[str, str]) -> Config:
     """The configuration in a file. Of ``environ``, only ``CREDENTIALS_DIRECTORY`` and ``STATE_DIRECTORY`` are used.
 
-    Raises:
-        ConfigError: with every problem of the file. An invalid value never becomes a default.
+    Raises ConfigError with every problem of the file. An invalid value never becomes a default.
     """
     table = _read_toml(path)
     problems = Problems(str(path))
@@ -79,9 +78,7 @@ async def load_in_thread(path: Path, environ: Mapping[str, str]) -> Config:
     """Run :func:`load_config` in a worker thread: a slow disk or a named pipe must not stop the event loop.
 
     If the task is cancelled, the thread ends later and its result is discarded.
-
-    Raises:
-        ConfigError: every problem of the file, or no thread can be started now.
+    Raises ConfigError with every problem of the file, or if no thread can be started now.
     """
     try:
         return await _THREAD.run(load_config, path, environ)
@@ -92,8 +89,7 @@ async def load_in_thread(path: Path, environ: Mapping[str, str]) -> Config:
 def load_control_socket(path: Path) -> Path | None:
     """The control socket of a configuration, if it has one. The other keys may be invalid or missing.
 
-    Raises:
-        ConfigError: the file cannot be read, or its value for the socket is invalid.
+    Raises ConfigError if the file cannot be read, or its value for the socket is invalid.
     """
     table = _read_toml(path)
     problems = Problems(str(path))
@@ -106,11 +102,7 @@ def load_control_socket(path: Path) -> Path | None:
 
 
 def _read_toml(path: Path) -> dict[str, Any]:
-    """The file's tables.
-
-    Raises:
-        ConfigError: the file cannot be read, or is not valid TOML.
-    """
+    """The file's tables. Raises ConfigError if the file cannot be read, or is not valid TOML."""
     try:
         with path.open("rb") as file:
             content = file.read(_MAX_FILE_BYTES + 1)

@@ -85,8 +85,7 @@ class Noise(StrEnum):
 def encode(datagram: bytes) -> bytes:
     """The bytes of a datagram on the line: 5 more than its own, up to 252, and 6 more up to 506.
 
-    Raises:
-        ValueError: it is longer than :data:`MAX_DATAGRAM`.
+    Raises ValueError if it is longer than :data:`MAX_DATAGRAM`.
     """
     if len(datagram) > MAX_DATAGRAM:
         raise ValueError(f"a datagram of {len(datagram)} bytes is too long for a line")

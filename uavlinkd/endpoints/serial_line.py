@@ -143,8 +143,7 @@ class SerialLine:
     def send(self, datagram: bytes) -> None:
         """Write a datagram, or let it wait for the radio. Drop and count it if too much waits already.
 
-        Raises:
-            OSError: the device is not open (ENODEV).
+        Raises OSError (ENODEV) if the device is not open.
         """
         if self._device is None:
             raise OSError(19, "the device is not open")

@@ -38,8 +38,7 @@ class BindError(CommandError):
 def new_socket(address: Address, kind: socket.SocketKind) -> Iterator[tuple[socket.socket, tuple[Any, ...]]]:
     """A socket of one address family that does not block, and the numeric address to bind it to.
 
-    Raises:
-        BindError: the address cannot be used, or the body fails; with the reason. The socket is closed.
+    Raises BindError with the reason if the address cannot be used, or the body fails. The socket is closed.
     """
     try:
         # This only turns a zone ("%wlan0") into its number. A host name is an error here.
@@ -63,11 +62,7 @@ def new_socket(address: Address, kind: socket.SocketKind) -> Iterator[tuple[sock
 
 
 def udp_socket(address: Address, *, may_come_later: bool = False) -> socket.socket:
-    """Make a UDP socket that is bound to a numeric address.
-
-    Raises:
-        BindError: the address cannot be used; with the reason.
-    """
+    """Make a UDP socket that is bound to a numeric address. Raises BindError if the address cannot be used."""
     with new_socket(address, socket.SOCK_DGRAM) as (sock, sockaddr):
         _enlarge(sock)
         bind(sock, sockaddr, may_come_later=may_come_later)
@@ -77,8 +72,7 @@ def udp_socket(address: Address, *, may_come_later: bool = False) -> socket.sock
 def send_from_new_port(sock: socket.socket, datagram: bytes, target: tuple[Any, ...]) -> None:
     """Send a datagram from the address and interface of a socket, but from an ephemeral port that is closed at once.
 
-    Raises:
-        OSError: the kernel's error.
+    Raises OSError: the kernel's error.
     """
     host, _, *rest = sock.getsockname()
     with socket.socket(sock.family, socket.SOCK_DGRAM) as other:
@@ -101,9 +95,7 @@ def network_socket(address: Address, interface: str | None, others: Iterable[soc
     ``others``: the daemon's own sockets, whose port it may share. The kernel permits that between two interfaces; a
     network with an address needs SO_REUSEADDR beside a network with an interface. The option is set on both only
     while this one is bound, so that another process cannot take the port later.
-
-    Raises:
-        BindError: the address or the interface cannot be used; with the reason.
+    Raises BindError with the reason if the address or the interface cannot be used.
     """
     with new_socket(address, socket.SOCK_DGRAM) as (sock, sockaddr):
         sharing = [sock, *others]
@@ -137,10 +129,7 @@ def bind(sock: socket.socket, sockaddr: tuple[Any, ...], *, may_come_later: bool
 
     ``may_come_later``: accept an address that this machine does not have yet. The socket works as soon as an
     interface has the address: the network of a drone may come up after the daemon, or not at all, and other networks
-    must not wait for it. The address may also be a mistake, so it is logged.
-
-    Raises:
-        OSError: the kernel's error.
+    must not wait for it. The address may also be a mistake, so it is logged. Raises OSError: the kernel's error.
     """
     try:
         sock.bind(sockaddr)

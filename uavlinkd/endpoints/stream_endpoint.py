@@ -43,15 +43,13 @@ class ByteChannel(Protocol):
     def read(self, size: int) -> bytes:
         """The received bytes, up to ``size``; no bytes at the end of the stream.
 
-        Raises:
-            BlockingIOError: no bytes are there now.
+        Raises BlockingIOError if no bytes are there.
         """
 
     def write(self, data: bytes) -> int:
         """Pass bytes to the kernel. Returns how many it accepted.
 
-        Raises:
-            BlockingIOError: it accepts no bytes now.
+        Raises BlockingIOError if it accepts no bytes now.
         """
 
     def capacity(self) -> int:
@@ -243,8 +241,7 @@ class Connection(LocalPort):
     def _write_committed(self, now: float) -> bool:
         """Pass committed bytes to the kernel. Returns whether it accepted all; if not, wait until it accepts more.
 
-        Raises:
-            OSError: the connection has ended.
+        Raises OSError if the connection has ended.
         """
         data = self.outgoing.committed
         try:
@@ -268,8 +265,7 @@ class Connection(LocalPort):
     def _await_room(self, now: float) -> None:
         """Look again when the next frame should fit. The kernel sends no event for room that was never used up.
 
-        Raises:
-            OSError: the connection has ended.
+        Raises OSError if the connection has ended.
         """
         self._blocked_since = self._blocked_since if self._blocked_since is not None else now
         size = self.outgoing.queue.next_bytes(now)

@@ -48,8 +48,7 @@ _BROWSER = (b"GET ", b"POST ", b"HEAD ", b"PUT ", b"OPTIONS ", b"PATCH ", b"DELE
 def tcp_listener(address: Address) -> socket.socket:
     """Make a TCP socket that listens on a numeric address, which an interface may get later.
 
-    Raises:
-        BindError: the address cannot be used; with the reason.
+    Raises BindError with the reason if the address cannot be used.
     """
     with new_socket(address, socket.SOCK_STREAM) as (sock, sockaddr):
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # earlier connections may still be closing
@@ -210,11 +209,7 @@ class TcpClient(StreamEndpoint):
 
 
 async def _connected(family: socket.AddressFamily, sockaddr: tuple[Any, ...]) -> socket.socket:
-    """A socket that is connected there.
-
-    Raises:
-        OSError: the kernel's error; TimeoutError if there is no answer.
-    """
+    """A socket that is connected there. Raises the kernel's OSError, or TimeoutError if there is no answer."""
     sock = socket.socket(family, socket.SOCK_STREAM)
     try:
         _prepare(sock)

@@ -88,11 +88,7 @@ _DEVICE = re.compile(r"/[\x21-\x7e]+")
 
 
 def parse_url(text: str) -> EndpointUrl:
-    """Parse a URL. ``str()`` of the result gives its usual form.
-
-    Raises:
-        UrlError: the text is not a URL; the message says what to write.
-    """
+    """Parse a URL. ``str()`` of the result gives its usual form. Raises UrlError, which says what to write."""
     if device := _BARE_DEVICE.fullmatch(text):
         raise UrlError(f"is only a device: write serial:{device[1]}:{device[2] or 57600}")
     if _BARE_ADDRESS.fullmatch(text):
@@ -111,8 +107,7 @@ def parse_url(text: str) -> EndpointUrl:
 def parse_line(text: str) -> SerialUrl:
     """Parse ``/dev/ttyUSB0:57600``: the device of a serial network with its baud rate.
 
-    Raises:
-        UrlError: the text is something else; the message says what to write.
+    Raises UrlError, which says what to write.
     """
     return _serial(text.removeprefix("serial:"), "")
 

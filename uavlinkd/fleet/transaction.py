@@ -28,9 +28,7 @@ class FileChanges:
         """Replace a file, or make it with its folder: a reader finds the old content or the new one, never a part.
 
         ``checked``: the file is a configuration, which a daemon with these environment variables must accept.
-
-        Raises:
-            FleetError: it would not.
+        Raises FleetError if it would not.
         """
         new = path.with_name(f".{path.name}.new")
         self._make_folder(path.parent)
@@ -95,11 +93,7 @@ class FileChanges:
 
 @contextmanager
 def changing() -> Iterator[FileChanges]:
-    """Change files, or leave every file as before.
-
-    Raises:
-        FleetFileError: a file cannot be read or written.
-    """
+    """Change files, or leave every file as before. Raises FleetFileError if a file cannot be read or written."""
     changes = FileChanges()
     try:
         yield changes
@@ -114,8 +108,7 @@ def changing() -> Iterator[FileChanges]:
 def check_config(file: Path, environ: Mapping[str, str], path: Path) -> None:
     """Load the configuration in a file, which is to be at ``path``, as its daemon will.
 
-    Raises:
-        FleetError: the daemon would refuse it; with every problem.
+    Raises FleetError with every problem.
     """
     try:
         load_config(file, environ)
@@ -130,11 +123,7 @@ def lock(folder: Path) -> Iterator[None]:
     overwrite the other's change.
 
     The lock is on the folder itself: no lock file remains, and the kernel releases it when the process ends,
-    however it ends.
-
-    Raises:
-        FleetError: the folder does not exist.
-        FleetFileError: it cannot be locked.
+    however it ends. Raises FleetError if the folder does not exist, FleetFileError if it cannot be locked.
     """
     import fcntl  # noqa: PLC0415  Windows has no such module
 

@@ -135,8 +135,7 @@ class Router(Generic[P]):
     def route(self, frame: Frame, source: P, now: float) -> tuple[P, ...]:
         """The ports to send this frame to. Learns its sender; counts the reason if there is no port.
 
-        Raises:
-            KeyError: the source is not a port that was added.
+        Raises KeyError if the source is not a port that was added.
         """
         received_at = self._received_at[source]
         if frame.raw in self._own:

@@ -66,8 +66,7 @@ def _add(
 def _control_sockets(options: argparse.Namespace) -> list[Path]:
     """The control socket of the daemon that the options name, or those of the service and its instances, by name.
 
-    Raises:
-        CommandError: no service runs, or the configuration names no socket or cannot be read.
+    Raises CommandError if no service runs, or the configuration names no socket or cannot be read.
     """
     from uavlinkd.config.load import load_control_socket
 
@@ -88,11 +87,7 @@ def _control_sockets(options: argparse.Namespace) -> list[Path]:
 
 
 def control_socket(options: argparse.Namespace) -> Path:
-    """The control socket of the only daemon.
-
-    Raises:
-        CommandError: as above, or several daemons run.
-    """
+    """The control socket of the only daemon. Raises CommandError as above, or if several daemons run."""
     socket, *others = _control_sockets(options)
     if others:
         listed = "\n".join(f"  --socket {path}" for path in (socket, *others))
@@ -114,8 +109,7 @@ def _answers(sockets: Sequence[Path], request: str) -> Iterator[dict[str, Any] |
 def _for_each(sockets: Sequence[Path], request: str, show: Callable[[dict[str, Any]], int]) -> int:
     """Show the answer of each daemon, also after one that does not answer. The worst exit status counts.
 
-    Raises:
-        CommandError: the only one does not answer.
+    Raises CommandError if the only one does not answer.
     """
     worst = OK
     for answer in _answers(sockets, request):

@@ -52,11 +52,7 @@ class ControlServer:
         self._connections = 0
 
     async def start(self) -> None:
-        """Listen on the socket.
-
-        Raises:
-            ControlError: the path cannot be used.
-        """
+        """Listen on the socket. Raises ControlError if the path cannot be used."""
         start = f"cannot listen on the control socket {self._path}"
         if _is_served(self._path):
             raise ControlError(f"{start}: another daemon answers there: choose another path")
@@ -136,9 +132,7 @@ def ask(
     """Send a request to the daemon that listens at ``path``, and return its answer.
 
     With ``on_waiting`` there is no time limit: it is called after each ``timeout_s`` without an answer.
-
-    Raises:
-        ControlError: no daemon listens, it refuses the client or the request, or it does not answer in time.
+    Raises ControlError if no daemon listens, it refuses the client or the request, or does not answer in time.
     """
     try:
         with _unix_socket() as sock:
@@ -167,11 +161,7 @@ def ask(
 
 
 def _read_answer(sock: socket.socket, on_waiting: Callable[[], None] | None) -> bytes:
-    """Read until the daemon closes the connection.
-
-    Raises:
-        OSError: no bytes arrived in time, and there is no ``on_waiting``.
-    """
+    """Read until the daemon closes the connection. Raises OSError if none arrives in time without ``on_waiting``."""
     answer = bytearray()
     while True:
         try:

@@ -48,11 +48,7 @@ class MetricsServer:
         return Address(*self._server.sockets[0].getsockname()[:2])
 
     async def start(self) -> None:
-        """Listen.
-
-        Raises:
-            BindError: the address cannot be used; the text has the address and the reason.
-        """
+        """Listen. Raises BindError with the address and the reason if it cannot be used."""
         try:
             sock = tcp_listener(self._address)
         except BindError as error:

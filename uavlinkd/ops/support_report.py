@@ -168,8 +168,7 @@ def _addresses_of_peers(configs: Sequence[Path], statuses: Sequence[dict[str, An
 def write_report(options: argparse.Namespace, configs: Sequence[Path], sockets: Sequence[Path]) -> None:
     """Make the report, show it and write it. On a terminal the user confirms it; elsewhere it needs ``--yes``.
 
-    Raises:
-        CommandError: the report was not written.
+    Raises CommandError if the report was not written.
     """
     if not options.yes and not _is_terminal():
         raise CommandError("a person has to read the report before it is written: run it on a terminal, or add --yes")

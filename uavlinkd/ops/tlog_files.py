@@ -58,9 +58,7 @@ class TlogFolder:
         """Write records, each a time and a frame, to the file of a peer. Returns the bytes written.
 
         A new ``epoch`` means that the clock was set. It begins a new file, so that time never jumps within a file.
-
-        Raises:
-            OSError: not all records were written. The file still ends with a whole record.
+        Raises OSError if not all were written. The file still ends with a whole record.
         """
         data = b"".join(records)
         try:
@@ -115,11 +113,7 @@ class TlogFolder:
         return file.epoch == epoch and file.size < MAX_FILE_BYTES and os.fstat(file.descriptor).st_nlink > 0
 
     def _make_room(self, size: int) -> None:
-        """Delete our oldest files until min_free_bytes stay free.
-
-        Raises:
-            OSError: no file of ours is left to delete.
-        """
+        """Delete our oldest files until min_free_bytes stay free. Raises OSError if no file of ours is left."""
         while True:
             state = os.fstatvfs(self._folder)
             if (state.f_bavail - 1) * state.f_frsize >= self._settings.min_free_bytes + size:

@@ -84,9 +84,7 @@ def parse_address(text: str, *, allow_names: bool) -> Address:
     """Parse ``HOST:PORT``.
 
     ``localhost`` is always 127.0.0.1: a resolver that maps it elsewhere must not open the port to other machines.
-
-    Raises:
-        AddressError: the text is not an address; the message says what to write.
+    Raises AddressError, which says what to write.
     """
     host, port = _split(text)
     if host in ("", "*"):

@@ -13,9 +13,7 @@ def from_base64(text: str) -> bytes:
     """The bytes in a text.
 
     Python's decoder also accepts unused bits at the end, and then two texts would stand for the same bytes.
-
-    Raises:
-        ValueError: it is not what :func:`to_base64` returns.
+    Raises ValueError if it is not what :func:`to_base64` returns.
     """
     data = b64decode(text, validate=True)
     if to_base64(data) != text:

@@ -61,9 +61,7 @@ class Threads:
     async def run(self, function: Callable[..., T], *arguments: Any) -> T:
         """Run ``function`` in a worker thread and return its result. Cancelling does not stop the thread.
 
-        Raises:
-            OSError: the system cannot start a thread now.
-            Exception: any exception of ``function``.
+        Raises OSError if the system cannot start a thread now, else any exception of ``function``.
         """
         future = Future[T]()
         call = future, partial(function, *arguments)

@@ -44,9 +44,7 @@ class Policy:
     """What one peer or endpoint may send (`incoming`) and receive (`outgoing`), by the keys of the configuration.
 
     `is_local`: for a local endpoint, where every key is optional and everything passes without data.
-
-    Raises:
-        PolicyError: with every problem in the data, each with its key and its remedy.
+    Raises PolicyError with every problem in the data, each with its key and its remedy.
     """
 
     __slots__ = ("_settings", "incoming", "outgoing", "warnings")

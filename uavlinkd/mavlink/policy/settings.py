@@ -112,8 +112,7 @@ class _Entry(NamedTuple):
 def read_settings(data: Mapping[str, object], *, is_local: bool) -> Settings:
     """Read a policy's plain data. ``is_local``: for an endpoint, where everything passes without a list.
 
-    Raises:
-        PolicyError: with every problem of the data.
+    Raises PolicyError with every problem of the data.
     """
     problems: list[PolicyProblem] = []
 
