@@ -59,10 +59,7 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
     for contact in file.contacts:
         if (held := contact.get("certificate")) is not None:
             contact.valid["name"] = held.certificate.name
-    for section, key in (
-        (file.top, "private_key_file"),
-        *((section, "psk_file") for section in file.others),
-    ):
+    for section, key in ((file.top, "private_key_file"), *((section, "psk_file") for section in file.others)):
         if (secret := _secret(problems, section, key, path, environ)) is not None:
             file.secrets[section.at(key)] = secret
     for place, message in checks.check(file):

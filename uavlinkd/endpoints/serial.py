@@ -60,10 +60,7 @@ class Opener:
         self._thread = Threads(1, name)
 
     async def keep_open(
-        self,
-        stall: StallWatch,
-        use: Callable[[BaseSerial, int], Awaitable[None]],
-        on_failure: Callable[[str], None],
+        self, stall: StallWatch, use: Callable[[BaseSerial, int], Awaitable[None]], on_failure: Callable[[str], None]
     ) -> None:
         """``use`` gets the device and the epoch in which opening it began, and returns when it is lost."""
         while True:

@@ -139,9 +139,7 @@ def bind(sock: socket.socket, sockaddr: tuple[Any, ...], *, may_come_later: bool
         sock.setsockopt(*_FREEBIND[sock.family], 1)
         sock.bind(sockaddr)
         structlog.get_logger().warning(
-            "address_not_here_yet",
-            address=str(Address.of(sockaddr)),
-            meaning=meaning_of(ADDRESS_NOT_HERE_YET),
+            "address_not_here_yet", address=str(Address.of(sockaddr)), meaning=meaning_of(ADDRESS_NOT_HERE_YET)
         )
 
 
@@ -223,11 +221,7 @@ class ErrorReports:
 
 
 def send_again(
-    sock: socket.socket,
-    datagram: bytes,
-    address: tuple[Any, ...],
-    error: OSError,
-    take_errors: Callable[[], bool],
+    sock: socket.socket, datagram: bytes, address: tuple[Any, ...], error: OSError, take_errors: Callable[[], bool]
 ) -> OSError | None:
     """Send a datagram after this error of the first attempt. Returns the last error, or None if it was sent.
 

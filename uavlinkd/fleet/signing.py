@@ -55,13 +55,7 @@ def new_fleet(signer: SigningKey, successor: bytes, settings: FleetSettings) -> 
 
 
 def certify(
-    fleet: Fleet,
-    signer: SigningKey,
-    public_key: bytes,
-    name: str,
-    identity: Identity,
-    *,
-    replaces: bool = False,
+    fleet: Fleet, signer: SigningKey, public_key: bytes, name: str, identity: Identity, *, replaces: bool = False
 ) -> Fleet:
     """Sign a certificate for a new member, or a new key of one: then its former serial is revoked too."""
     role, ids, addresses = identity

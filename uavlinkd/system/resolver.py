@@ -120,9 +120,7 @@ async def keep_resolving(
                         await wake.wait()
                 continue
             answered, queries = await asyncio.wait(
-                queries,
-                timeout=due_at - now if may_query else LONGEST_WAIT_S,
-                return_when=asyncio.FIRST_COMPLETED,
+                queries, timeout=due_at - now if may_query else LONGEST_WAIT_S, return_when=asyncio.FIRST_COMPLETED
             )
             if not answered:
                 continue

@@ -83,11 +83,7 @@ _EFFECTS: Final = (
         "DO_SET_PARAMETER PREFLIGHT_STORAGE",
         f"{_PARAMETERS} OSD_PARAM_CONFIG SET_MAG_OFFSETS {_FILES}",
     ),
-    (
-        "moving home or the origin",
-        _HOME,
-        f"{_HOME} SET_HOME_POSITION SET_GPS_GLOBAL_ORIGIN {_ITEMS} {_FILES}",
-    ),
+    ("moving home or the origin", _HOME, f"{_HOME} SET_HOME_POSITION SET_GPS_GLOBAL_ORIGIN {_ITEMS} {_FILES}"),
     (
         "opening the fence",
         "DO_FENCE_ENABLE",
@@ -99,11 +95,7 @@ _EFFECTS: Final = (
         "DO_PARACHUTE",
         f"DO_AUX_FUNCTION DO_FLIGHTTERMINATION {_REMOTE} {_OUTPUTS} {_PARAMETERS} {_FILES}",
     ),
-    (
-        "restarting the autopilot",
-        "PREFLIGHT_REBOOT_SHUTDOWN",
-        f"PREFLIGHT_REBOOT_SHUTDOWN SERIAL_CONTROL {_FILES}",
-    ),
+    ("restarting the autopilot", "PREFLIGHT_REBOOT_SHUTDOWN", f"PREFLIGHT_REBOOT_SHUTDOWN SERIAL_CONTROL {_FILES}"),
     (
         "driving servos, relays and motors",
         _OUTPUTS,
