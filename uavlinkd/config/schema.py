@@ -1,4 +1,4 @@
-"""The keys of a configuration file, with their ranges and defaults: one class for each section.
+"""The keys of a configuration file, with their ranges and defaults: one class for each section, by its name.
 
 README.md explains each key. The kinds of values come first, each with the check of a single value. Checks of several
 values are in :mod:`uavlinkd.config.checks`.
@@ -259,8 +259,6 @@ class LinkSection(Section):
 
 
 class NetworkSection(Section):
-    """``[[network]]``: an exit of this machine to the peers."""
-
     name: Name = Field(examples=['"lte"'])
     interface: Interface | None = Field(default=None, examples=['"wwan0"'])
     address: OwnAddress | None = Field(default=None, examples=['"10.0.0.5"'])
@@ -297,29 +295,21 @@ class KeySection(Section):
 
 
 class PeerSection(LinkSection, PolicySection, KeySection):
-    """``[[peer]]``: another daemon."""
-
     addresses: PeerAddresses = Field(default=[], examples=['["10.13.0.2:5790"]'])
     relays: list[Name] | None = Field(default=None, examples=["[]"])
 
 
 class RelaySection(KeySection):
-    """``[[relay]]``: a host that passes datagrams between this daemon and its peers, and cannot forge them."""
-
     addresses: PeerAddresses = Field(default=[], examples=['["relay.example.org:5790"]'])
 
 
 class MemberSection(KeySection):
-    """``[[member]]``: a daemon that may use this relay."""
-
     max_peers: int = Field(default=256, ge=1, le=4000)
     datagrams_s: int = Field(default=2000, ge=1, le=10**6)
     bits_s: int = Field(default=20_000_000, ge=LEAST_BUDGET, le=10**10, examples=["20_000_000"])
 
 
 class RelayServerSection(Section):
-    """``[relay_server]``: what a relay carries for all members together, and for each one by certificate."""
-
     datagrams_s: int = Field(default=10**6, ge=1, le=10**6, examples=["100_000"])
     bits_s: int = Field(default=10**10, ge=LEAST_BUDGET, le=10**10, examples=["100_000_000"])
     member_max_peers: int = Field(default=256, ge=1, le=4000)
@@ -328,8 +318,6 @@ class RelayServerSection(Section):
 
 
 class FleetSection(Section):
-    """``[fleet]``: this daemon is a member of a fleet with an authority."""
-
     authority: Authority = Field(examples=[_SIGNED])
     successor: KeyHash | None = Field(default=None, examples=[_SIGNED])
     certificate: SignedCertificate = Field(examples=[_SIGNED])
@@ -341,8 +329,6 @@ class FleetSection(Section):
 
 
 class ContactSection(Section):
-    """``[[contact]]``: a member whose certificate and address this daemon has from the start."""
-
     public_key: PublicKey = Field(examples=[_SIGNED])
     certificate: SignedCertificate = Field(examples=[_SIGNED])
     addresses: PeerAddresses = Field(default=[], examples=['["relay.example.org:5790"]'])
@@ -356,8 +342,6 @@ class FleetRoleSection(PolicySection):
 
 
 class EndpointSection(PolicySection):
-    """``[[endpoint]]``: a local MAVLink port."""
-
     name: Name = Field(examples=['"autopilot"'])
     url: Url = Field(examples=['"udpin:127.0.0.1:14550"'])
     radio_status: bool = False

@@ -34,13 +34,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
     init = add("init", "create a fleet: its authority, and folders for the members that are asked for")
     init.add_argument("--no-passphrase", action="store_true", help="for tests: each copy of authority.pem can sign")
-    init.add_argument(
-        "--relay",
-        action="append",
-        default=[],
-        metavar="HOST:PORT",
-        help="a relay with this public address (may be repeated, up to three times)",
-    )
+    _add_list(init, "--relay", "HOST:PORT", "a relay with this public address (may be repeated, up to three times)")
     counts = {
         "drones": "drone1 to droneN, with system ids from 1 up",
         "ground-stations": "system ids from 255 down",
@@ -48,13 +42,8 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     }
     for name, text in counts.items():
         init.add_argument(f"--{name}", type=int, default=0, metavar="N", help=f"{text} (default: 0)")
-    init.add_argument(
-        "--station-address",
-        action="append",
-        default=[],
-        metavar="HOST:PORT",
-        help="where vehicles reach a ground station (may be repeated); without a relay, the first one is one too",
-    )
+    text = "where vehicles reach a ground station (may be repeated); without a relay, the first one is one too"
+    _add_list(init, "--station-address", "HOST:PORT", text)
     init.add_argument("--swarm", action="store_true", help="vehicles connect to each other too")
     init.add_argument("--suite", default="x25519", metavar="NAME", help="key exchange (default: %(default)s)")
     templates = {
@@ -77,13 +66,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         ids = action.add_mutually_exclusive_group()
         ids.add_argument("--id", type=int, metavar="N", help="MAVLink system id (default: the next free one)")
         ids.add_argument("--ids", metavar="A-B", help="a range of them")
-        action.add_argument(
-            "--address",
-            action="append",
-            default=[],
-            metavar="HOST:PORT",
-            help="where members reach it from the start",
-        )
+        _add_list(action, "--address", "HOST:PORT", "where members reach it from the start")
     revoke = add("revoke", "sign a bulletin that refuses a member")
     remove = add("remove", "revoke a member, and publish the bulletin")
     for action in (new, revoke, remove, add("rotate", "make a new key for a member, and revoke the old one")):
@@ -102,6 +85,10 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     )
 
 
+def _add_list(parser: argparse.ArgumentParser, name: str, metavar: str, text: str) -> None:
+    parser.add_argument(name, action="append", default=[], metavar=metavar, help=text)
+
+
 def _add_enroll(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     enroll = commands.add_parser(
         "enroll",
@@ -115,9 +102,7 @@ def _add_enroll(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     enroll.add_argument("--config", metavar="FILE", type=Path, help="the configuration (default: NAME.toml)")
     enroll.add_argument("--keys", metavar="DIR", type=Path, help="for a service: the folder of its keys")
     enroll.add_argument("--url", metavar="URL", help="endpoint of a new configuration")
-    enroll.add_argument(
-        "--listen", action="append", default=[], metavar="IP:PORT", help="where members reach it (default: as signed)"
-    )
+    _add_list(enroll, "--listen", "IP:PORT", "where members reach it (default: as signed)")
 
 
 def _act(options: argparse.Namespace) -> int:

@@ -23,7 +23,7 @@ from uavlinkd.config import keys
 from uavlinkd.core.certificates import Certificate, parse_bulletin, parse_certificate
 from uavlinkd.core.crypto import x25519_public_key
 from uavlinkd.core.drops import Drop
-from uavlinkd.fleet.files import config_file, key_file, listen_on, with_fleet, write_config
+from uavlinkd.fleet.files import config_file, edited, key_file, listen_on, write_config
 from uavlinkd.fleet.manifest import FleetFileError, FleetSettings
 from uavlinkd.fleet.transaction import changing
 from uavlinkd.mavlink.dialect import SYSTEM_ID
@@ -100,7 +100,7 @@ def finish(line: str, config: Path | None, folder: Path | None, url: str | None,
             if url is not None and url not in _urls(table):
                 raise FleetError(f"{place.config} exists: write the url into its [[endpoint]], and leave --url out")
             top = {"private_key_file": name, **({"listen": listen} if listen else {})}
-            text = with_fleet(place.config.read_text(encoding="utf-8-sig"), reply, top, former_ids)
+            text = edited(place.config, reply, top, former_ids)
         else:
             settings = FleetSettings(
                 control_socket="{name}.sock" if folder is None else "/run/uavlinkd/{name}/control.sock"

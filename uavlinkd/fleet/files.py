@@ -10,12 +10,13 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 from uavlinkd.authority.enrolment import Contact, FleetError, Reply, ids_of
 from uavlinkd.core.certificates import MemberRole, parse_certificate
 from uavlinkd.core.suites import SUITES_BY_NAME
-from uavlinkd.fleet.manifest import Fleet, FleetSettings, Member, fill, toml_lines
+from uavlinkd.fleet.manifest import Fleet, FleetFileError, FleetSettings, Member, fill, toml_lines
 from uavlinkd.system.addresses import parse_address
 from uavlinkd.system.base64_text import to_base64
 
@@ -92,6 +93,16 @@ def write_config(reply: Reply, settings: FleetSettings, private_key_file: str, l
         *([] if role is MemberRole.RELAY else ["", "[[endpoint]]", *toml_lines(endpoint)]),
     ]
     return with_fleet("\n".join(lines) + "\n", reply)
+
+
+def edited(path: Path, reply: Reply, top: Table | None = None, former_ids: tuple[int, int] | None = None) -> str:
+    """A member's configuration as :func:`with_fleet` changes it."""
+    try:
+        return with_fleet(path.read_text(encoding="utf-8-sig"), reply, top, former_ids)
+    except ValueError:
+        raise FleetFileError(f"{path} cannot be read: it is not text") from None
+    except FleetError as error:
+        raise FleetError(f"{path}: {error}") from None
 
 
 def with_fleet(text: str, reply: Reply, top: Table | None = None, former_ids: tuple[int, int] | None = None) -> str:

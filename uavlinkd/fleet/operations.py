@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from uavlinkd.authority.enrolment import FleetError, Reply, Request
+from uavlinkd.authority.enrolment import FleetError, Request
 from uavlinkd.authority.trust import BulletinVerdict
 from uavlinkd.config import keys
 from uavlinkd.core.certificates import MemberRole
@@ -243,7 +243,7 @@ def _write_member(changes: FileChanges, folder: Path, fleet: Fleet, member: Memb
     reply = files.reply_for(fleet, member)
     if path.exists():
         changes.delete(key)
-        text = _edited(path, reply, {"private_key_file": key.name})
+        text = files.edited(path, reply, {"private_key_file": key.name})
     else:
         text = files.write_config(reply, fleet.settings, key.name, files.listen_on(reply))
     changes.write_secret(key, private)
@@ -265,20 +265,10 @@ def _save(
     for member in (member for member in fleet.current if is_new and member.name != but):
         path = folder / member.name / files.config_file(member.name)
         if path.exists():
-            changes.write(path, _edited(path, files.reply_for(fleet, member)))
+            changes.write(path, files.edited(path, files.reply_for(fleet, member)))
         if path.parent.exists():
             changed += (member.name,)
         else:
             elsewhere += (member.name,)
     changes.write(folder / FILE_NAME, write_manifest(fleet))
     return Result(fleet, changed, elsewhere)
-
-
-def _edited(path: Path, reply: Reply, top: dict[str, object] | None = None) -> str:
-    """A member's configuration with its present facts."""
-    try:
-        return files.with_fleet(path.read_text(encoding="utf-8"), reply, top)
-    except ValueError:
-        raise FleetFileError(f"{path} cannot be read: it is not text") from None
-    except FleetError as error:
-        raise FleetError(f"{path}: {error}") from None

@@ -37,8 +37,12 @@ class FileChanges:
             file.write(text.encode())
             file.flush()
             os.fsync(file.fileno())
-        if checked is not None:
-            check_config(new, checked, path)
+        try:
+            if checked is not None:
+                load_config(new, checked)
+        except ConfigError as error:
+            problems = "\n".join(f"{problem.key}: {problem.message}" for problem in error.problems)
+            raise FleetError(f"the new {path.name} is not valid, so nothing was changed:\n{problems}") from None
         self._keep(path)
         new.rename(path)
         sync_folder(path.parent)
@@ -103,18 +107,6 @@ def changing() -> Iterator[FileChanges]:
             raise FleetFileError(f"{error.filename}: {error.strerror}") from None
         raise
     changes.finish()
-
-
-def check_config(file: Path, environ: Mapping[str, str], path: Path) -> None:
-    """Load the configuration in a file, which is to be at ``path``, as its daemon will.
-
-    Raises FleetError with every problem.
-    """
-    try:
-        load_config(file, environ)
-    except ConfigError as error:
-        problems = "\n".join(f"{problem.key}: {problem.message}" for problem in error.problems)
-        raise FleetError(f"the new {path.name} is not valid, so nothing was changed:\n{problems}") from None
 
 
 @contextmanager

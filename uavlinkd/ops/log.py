@@ -55,18 +55,17 @@ def is_journal(stream: TextIO, environ: Mapping[str, str]) -> bool:
     return environ.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"
 
 
-class _Prefixed:
+def _prefixed(render: Sequence[Processor]) -> Processor:
     """Renders a line behind its priority, which the journal removes and stores."""
 
-    def __init__(self, render: Sequence[Processor]) -> None:
-        self._render = render
-
-    def __call__(self, logger: object, method: str, event: EventDict) -> str:
+    def process(logger: object, method: str, event: EventDict) -> str:
         prefix = f"<{PRIORITIES.get(str(event.get('level')), PRIORITIES['info'])}>"
         line: object = event
-        for processor in self._render:
+        for processor in render:
             line = processor(logger, method, cast(EventDict, line))
         return f"{prefix}{line}".replace("\n", f"\n{prefix}")
+
+    return process
 
 
 class LogFile:
@@ -125,7 +124,7 @@ def set_up_logging(level: str, fmt: str, stream: TextIO = sys.stderr) -> None:
     else:
         render = [structlog.processors.format_exc_info, order_fields, structlog.processors.JSONRenderer()]
     if in_journal:
-        render = [_Prefixed(render)]
+        render = [_prefixed(render)]
     structlog.configure(
         processors=[*stamp, *render],
         wrapper_class=structlog.make_filtering_bound_logger(getattr(logging, level.upper())),
