@@ -338,12 +338,14 @@ def test_system_of_another(daemon: Daemon) -> None:
     settings = daemon.link.config.settings
     daemon.link.config = replace(daemon.link.config, settings=replace(settings, is_certified=True))
     assert "`uavlinkd fleet sign --replace drone1 --id 7`" in daemon.findings()["other_system"].remedy
-    daemon.link.config = replace(daemon.link.config, settings=settings)
     client = object()
     daemon.local.append(SimpleNamespace(name="autopilot", ports=[client], policy=daemon.link.policy, failures={}))
     daemon.router.add_port(client)
     daemon.router.route(split_payload(heartbeat(7), daemon.link.counters)[0], client, daemon.now)
     assert "7 (endpoint autopilot)" in daemon.findings()["impersonation"].text
+    assert "`uavlinkd fleet remove drone1`" in daemon.findings()["impersonation"].remedy
+    daemon.link.config = replace(daemon.link.config, settings=settings)
+    assert "delete its [[peer]]" in daemon.findings()["impersonation"].remedy
     assert "7 is endpoint autopilot's" in daemon.findings()["other_system"].remedy
     assert "write it into system_ids" not in daemon.findings()["other_system"].remedy
     assert next(iter(daemon.findings())) == "impersonation"

@@ -61,11 +61,14 @@ def peer_problems(peer: PeerFacts) -> Iterator[Found]:
     is_mixed = len(mixed) == mixed.maxlen and peer.now - mixed[0] <= SECURITY_S
     if is_mixed and (owned := _owned(peer, peer.history.incoming.systems.within(SECURITY_S, peer.now))):
         whose = listed(f"{system} ({owner})" for system, owner in owned.items())
+        cut_off = "delete its [[peer]] and run `uavlinkd reload`"
+        if peer.link.config.settings.is_certified:
+            cut_off = f"run `uavlinkd fleet remove {peer.name}`"
         yield security(
             "impersonation",
             f"beside its own frames it sends as system {whose}: it may be captured, relay without leave, or have the"
             " same id by mistake",
-            f"inspect {peer.name}; if it is captured, delete its [[peer]] and run `uavlinkd reload`",
+            f"inspect {peer.name}; if it is captured, {cut_off}",
         )
     claims = [claim for claim in peer.link.peer.refusal_claims.recent() if peer.now - claim.changed_at <= CLAIMS_S]
     if claims:
@@ -157,7 +160,9 @@ def _about_systems(part: PartFacts, systems: Mapping[int, int], which: str) -> t
     remedy = "write it into its system_ids"
     if is_certified:
         command = f"uavlinkd fleet sign --replace {part.name} --id {min(systems)}"
-        remedy = f"pass the line of `uavlinkd enroll {part.name}` there to `{command}`, then finish and publish"
+        remedy = (
+            f"sign it again: `uavlinkd enroll {part.name}` there | `{command}` | `uavlinkd enroll --finish` there"
+        )
     return text, f"{own}; or, only if you know that {part.owner} has this id, {remedy}"
 
 
