@@ -16,7 +16,7 @@ from tests.config.fleets import OTHER_SIGNER, bulletin, certificate, contact, fl
 from tests.link.test_diagnosis import NOW, STRANGER, Daemon
 from tests.link.test_evidence import THERE
 from uavlinkd.authority import state_file
-from uavlinkd.authority.constants import HAVE_INTERVAL_S
+from uavlinkd.authority.constants import CONTACTS_FIRST_S, HAVE_INTERVAL_S
 from uavlinkd.core.certificates import MemberRole, digest_of
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.outputs import Dropped, RecordReceived
@@ -32,14 +32,16 @@ C, D = (b64decode(KEY[name]) for name in ("c", "d"))
 class Member(Daemon):
     """Vehicle 7, which has the pinned peer drone1 and the contact gs. Its bulletin has the number 2."""
 
-    def __init__(self, folder: Path, *, news: str = "", more: str = "", contacts: str = "") -> None:
+    def __init__(
+        self, folder: Path, *, news: str = "", more: str = "", contacts: str = "", relay: Any = None
+    ) -> None:
         super().__init__()
         self.set_up(role="all", system_ids="all")
         self.config = load_member(folder, member_file(fleet(more=more, news=news or bulletin(2)) + contacts))
         assert self.config.fleet is not None
         self.relays: dict[str, Any] = {}
         shell = SimpleNamespace(by_name=self.relays)
-        known = self.node, self.links, cast(Any, shell), None, self.evidence
+        known = self.node, self.links, cast(Any, shell), relay, self.evidence
         self.membership: Any = SimpleNamespace()
         self.fleet = FleetMembers(
             self.config, self.config.fleet, FleetShell(*known, self.membership, lambda outputs: None)
@@ -88,6 +90,18 @@ async def test_members_that_are_refused_are_named(tmp_path: Path) -> None:
     assert texts["member_conflict"].endswith(f"v8 (serial 11) and this daemon's own certificate {at}")
     assert texts["role_not_accepted"].endswith(f": gs (role operator) {at}")
     assert member.findings(NOW + 31) == {}
+
+
+async def test_first_second_of_a_start(tmp_path: Path) -> None:
+    """Only contacts are accepted; at a relay also members that carry no frames to it."""
+    member = Member(tmp_path, more='operator = "pinned"', contacts=contact(), relay=SimpleNamespace())
+    now, vehicle = monotonic(), b64decode(certificate(name="v9", ids=(9, 9), key=KEY["c"], serial=9))
+    with pytest.raises(Drop) as drop:
+        member.fleet.admit(C, vehicle, now)
+    assert drop.value.reason is DropReason.BULLETIN_AWAITED
+    operator = certificate(MemberRole.OPERATOR, "tablet", (250, 250), key=KEY["d"], serial=12)
+    assert member.fleet.admit(D, b64decode(operator), now).name.endswith("tablet")
+    assert member.fleet.admit(C, vehicle, now + CONTACTS_FIRST_S).name == "v9"
 
 
 async def test_own_key_with_a_certificate_elsewhere(tmp_path: Path) -> None:

@@ -205,10 +205,12 @@ class FleetMembers:
     def _hold(self, key: bytes, data: bytes, now: float, *, needs_policy: bool) -> Certificate:
         """Hold a certificate that is valid and wanted, and not too early or one too many. Raises Drop."""
         certificate = self.trust.judge(key, data)
-        if needs_policy and certificate.role not in self._fleet.policies:
+        has_policy = certificate.role in self._fleet.policies
+        if needs_policy and not has_policy:
             role = certificate.role.name.lower()
             raise Drop(DropReason.ROLE_NOT_ACCEPTED, f"{certificate.name} (role {role})")
-        if not self._has_required or (now < self._settled_at and not self._is_contact(key)):
+        is_early = has_policy and now < self._settled_at and not self._is_contact(key)
+        if is_early or not self._has_required:
             raise Drop(DropReason.BULLETIN_AWAITED)
         if key not in self.trust.held:
             self._make_room(now)
