@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from uavlinkd.core.constants import Rate
 
-CERTIFIED_PEERS = 256
-"""Peers by certificate, provisional ones included: one for each system id."""
+CERTIFIED_PEERS = 256  # peers by certificate, provisional ones included: one for each system id
 CONTACTS_FIRST_S = 1.0
 HAVE_INTERVAL_S = 10.0
 HAVE_LEAST_S = 0.1

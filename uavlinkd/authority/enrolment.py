@@ -34,8 +34,7 @@ WORD = "uavlink-enroll-1"
 VERSION = 1
 CHECK_BYTES = 4
 MOST_CONTACTS = 3
-LONGEST_LINE = 4096
-"""More characters than three contacts need. A terminal accepts no longer line."""
+LONGEST_LINE = 4096  # More characters than three contacts need. A terminal accepts no longer line.
 _HEAD = struct.Struct(f">BBBB{KEY_BYTES}s{KEY_BYTES}s{CERTIFICATE_BYTES}sH")
 _CONTACT = struct.Struct(f">{KEY_BYTES}s{CERTIFICATE_BYTES}sB")
 _CUT = "the line is not a whole line of `uavlinkd fleet sign`: it was cut or changed; copy it again, or send a file"
@@ -115,15 +114,11 @@ class Reply(NamedTuple):
     """All that a member needs beside its private key."""
 
     suite: Suite
-    calls: frozenset[MemberRole]
-    """Members of these roles it connects to."""
-    relays: bool
-    """Whether it passes datagrams between members."""
-    addresses: tuple[str, ...]
-    """Where others reach it. Without one it need not listen."""
+    calls: frozenset[MemberRole]  # members of these roles it connects to
+    relays: bool  # whether it passes datagrams between members
+    addresses: tuple[str, ...]  # Where others reach it. Without one it need not listen.
     authority: bytes
-    successor: bytes
-    """SHA-256 of the key that may follow the authority's."""
+    successor: bytes  # SHA-256 of the key that may follow the authority's
     certificate: bytes
     bulletin: bytes
     contacts: tuple[Contact, ...]

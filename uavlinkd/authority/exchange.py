@@ -37,19 +37,14 @@ class _Peer:
     """What one peer stated, and when it gets what. Kept while it is down: it may come back with an older disk."""
 
     is_up: bool = False
-    have: Have | None = None
-    """What it stated last, on a session of the present link."""
-    has: int = 0
-    """The newest bulletin that it stated or sent since then."""
-    stated: int | None = None
-    """The number that it stated last, ever."""
-    order: int = -1
-    """Of the record that stated it."""
+    have: Have | None = None  # what it stated last, on a session of the present link
+    has: int = 0  # the newest bulletin that it stated or sent since then
+    stated: int | None = None  # the number that it stated last, ever
+    order: int = -1  # of the record that stated it
     push_at: float = inf
     pushed_at: float = -inf
     tries: int = 0
-    owes_have: bool = False
-    """Whether this end has to state what it has."""
+    owes_have: bool = False  # whether this end has to state what it has
     have_sent_at: float = -inf
     bulletin_verified_at: float = -inf
     certificate_verified_at: float = -inf

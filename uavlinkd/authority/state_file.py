@@ -22,16 +22,14 @@ from uavlinkd.core.drops import Drop
 from uavlinkd.system.folders import sync_folder
 
 _TITLE = b"uavlinkd fleet state 1"
-_MOST_BYTES = 2048
-"""Of the file. The longest one has 1,150."""
+_MOST_BYTES = 2048  # of the file. The longest one has 1,150.
 
 
 class FleetState(NamedTuple):
     """The content of a file."""
 
     bulletin: bytes
-    certificate: bytes
-    """Empty for a daemon that has none."""
+    certificate: bytes  # empty for a daemon that has none
     contacts: tuple[tuple[bytes, bytes], ...] = ()
     """The key and the newest certificate of each. That of the configuration may be below the least serial by now."""
 

@@ -35,23 +35,17 @@ class Pinned(NamedTuple):
 
     keys: Collection[bytes] = ()
     names: Collection[str] = ()
-    system_ids: Mapping[int, str] = {}
-    """Each with the name of the pinned peer that has it."""
-    denied: Collection[str] = ()
-    """Names of members that this daemon refuses."""
+    system_ids: Mapping[int, str] = {}  # each with the name of the pinned peer that has it
+    denied: Collection[str] = ()  # names of members that this daemon refuses
 
 
 class BulletinVerdict(Enum):
     """About a bulletin that arrived."""
 
-    NEWER = "newer"
-    """It is the own one now."""
-    KNOWN = "known"
-    """Equal or older."""
-    INVALID = "invalid"
-    """Another fleet's or another generation's, malformed, or not signed."""
-    UNVERIFIED = "unverified"
-    """It may be newer, and the signature was not to be verified."""
+    NEWER = "newer"  # it is the own one now
+    KNOWN = "known"  # equal or older
+    INVALID = "invalid"  # another fleet's or another generation's, malformed, or not signed
+    UNVERIFIED = "unverified"  # it may be newer, and the signature was not to be verified
     SHRINKS = "bulletin_shrinks"
     CONFLICT = "bulletin_conflict"
 
@@ -78,8 +72,7 @@ class Trust:
             raise ValueError("is not a bulletin of this fleet")
         self.bulletin, self.bulletin_bytes = parsed, bulletin
         self.own: HeldCertificate | None = None
-        self.held: dict[bytes, HeldCertificate] = {}
-        """By static public key, without the own one."""
+        self.held: dict[bytes, HeldCertificate] = {}  # by static public key, without the own one
         self._claims: dict[str | int, bytes] = {}
         """Who was held last with a name or a system id: a relay holds thousands, and must not compare all of them."""
         self.pinned = Pinned()

@@ -15,10 +15,8 @@ from uavlinkd.mavlink.policy.settings import read_settings
 from uavlinkd.system.addresses import IPV4_UDP_BYTES, Address
 
 # UDP payloads that pass in one piece.
-IPV6_LEAST_PAYLOAD = 1280 - 40 - 8
-"""Every IPv6 path carries it (RFC 8200, section 5)."""
-ETHERNET_PAYLOAD = 1500 - 40 - 8
-"""Over IPv6; IPv4 has 20 bytes more."""
+IPV6_LEAST_PAYLOAD = 1280 - 40 - 8  # every IPv6 path carries it (RFC 8200, section 5)
+ETHERNET_PAYLOAD = 1500 - 40 - 8  # over IPv6; IPv4 has 20 bytes more
 _SHORT_TAG_BYTES = 8
 _READABLE = (
     "a link through a relay is not confidential: its owner cannot alter the frames, but can read them; write"

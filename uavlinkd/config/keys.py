@@ -22,8 +22,7 @@ from uavlinkd.system.terminal import CommandError
 KEY_TEXT_LENGTH = 44
 CREDENTIALS = "CREDENTIALS_DIRECTORY"
 """The environment variable in which systemd names the folder with a service's keys."""
-_READ_LIMIT = 256
-"""Bytes read of a key file: enough to detect that it contains more than a key."""
+_READ_LIMIT = 256  # bytes read of a key file: enough to detect that it contains more than a key
 _HAS_OWNERS = hasattr(os, "geteuid")
 """Files have owners and modes, and folders can be synced. Windows has none of this, and no flags for these files."""
 _NONBLOCK, _CLOEXEC = getattr(os, "O_NONBLOCK", 0), getattr(os, "O_CLOEXEC", 0)

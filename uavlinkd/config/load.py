@@ -31,8 +31,7 @@ _MAX_FILE_BYTES = 1 << 20
 _THREAD = Threads(1, "configuration")
 _AT = re.compile(r"(.*) \(at (?:line (\d+), column (\d+)|end of document)\)", re.DOTALL)
 _KEY = re.compile(r"""\s*["']?([A-Za-z0-9_-]{1,32})["']?(?![A-Za-z0-9_.'"+/-])""")
-_NEXT = re.compile(r"\s*(?:$|\[|[A-Za-z0-9_-]+\s*=)")
-"""The end of the file, a section, or a key."""
+_NEXT = re.compile(r"\s*(?:$|\[|[A-Za-z0-9_-]+\s*=)")  # the end of the file, a section, or a key
 _MOST_LINES = 20
 """A longer value without an end is reported where the parser notices it. Each line costs a parse."""
 _HINT = 'text is in straight quotation marks ("…"), true and false are in small letters, a comment begins with #'

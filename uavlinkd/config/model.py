@@ -20,8 +20,7 @@ from uavlinkd.relay.forwarding import MemberSettings, RelayLimits
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.terminal import UsageError
 
-SERIAL = Address(SERIAL_HOST, 0)
-"""The other end of a serial network."""
+SERIAL = Address(SERIAL_HOST, 0)  # the other end of a serial network
 PolicyData = Mapping[str, object]
 """A policy as immutable plain data. :mod:`uavlinkd.mavlink.policy.compilation` documents its keys."""
 

@@ -12,16 +12,14 @@ from uavlinkd.config.schema import NetworkSection
 from uavlinkd.endpoints.url import SerialUrl
 from uavlinkd.system.addresses import Address
 
-USUAL_BAUD: Final = 57600
-"""The baud rate of SiK modems as they are sold."""
+USUAL_BAUD: Final = 57600  # the baud rate of SiK modems as they are sold
 USUAL_AIR_BITS_S: Final = 24_000
 """What such a modem carries by radio, in both directions together, beside its own overhead and turn-around times."""
 SLOW_LINE_SHARE: Final = 0.4
 """Of the baud rate of a slower line: what is assumed that its radio carries."""
 SENDING_SHARE: Final = 0.4
 """The part of the radio's rate that each end uses. The rest is for collisions, turn-around times and noise."""
-_BITS_PER_BYTE: Final = 10
-"""On a wire, with start and stop bit."""
+_BITS_PER_BYTE: Final = 10  # on a wire, with start and stop bit
 _FAMILIES = {socket.AF_INET: "IPv4", socket.AF_INET6: "IPv6"}
 
 

@@ -27,8 +27,7 @@ from uavlinkd.core.crypto import Secret, x25519_public_key
 class Values(NamedTuple):
     """The valid values of one section by key, and the keys whose values are invalid."""
 
-    section: str
-    """``peer[1]``; empty for the top of the file."""
+    section: str  # `peer[1]`; empty for the top of the file
     valid: dict[str, Any]
     invalid: frozenset[str]
 
@@ -73,8 +72,7 @@ class Sections:
     peers: list[Values]
     members: list[Values]
     relays: list[Values]
-    contacts: list[Values]
-    """Each has the name in its certificate."""
+    contacts: list[Values]  # each has the name in its certificate
     fleet_roles: list[Values]
     secrets: dict[str, Secret] = field(default_factory=dict)
 

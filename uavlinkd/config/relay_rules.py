@@ -8,10 +8,8 @@ from typing import Final
 from uavlinkd.config.model import PeerAddress
 from uavlinkd.config.problems import Found, Sections, Values, unique
 
-MOST_MEMBERS: Final = 4000
-"""Each has up to three sessions, of 65,535 indices."""
-MOST: Final = 3
-"""Relays of one daemon. A peer has room for the paths along so many."""
+MOST_MEMBERS: Final = 4000  # each has up to three sessions, of 65,535 indices
+MOST: Final = 3  # Relays of one daemon. A peer has room for the paths along so many.
 
 
 def members(file: Sections) -> Found:

@@ -22,12 +22,10 @@ from uavlinkd.fleet.manifest import FleetFileError
 AUTHORITY_FILE = "authority.pem"
 SUCCESSOR_FILE = "successor.pem"
 _LIMIT = 4096
-_CHECK_BYTES = 3
-"""Of a paper copy, which so has 56 characters without padding."""
+_CHECK_BYTES = 3  # of a paper copy, which so has 56 characters without padding
 _GROUP = 4
 
-Passphrase = Callable[[str], Secret]
-"""Returns the passphrase, given what it is for."""
+Passphrase = Callable[[str], Secret]  # returns the passphrase, given what it is for
 
 
 def passphrase_from(file: Path | None, *, is_new: bool = False) -> Passphrase:

@@ -29,8 +29,7 @@ from uavlinkd.fleet.transaction import changing
 from uavlinkd.mavlink.dialect import SYSTEM_ID
 from uavlinkd.system.base64_text import from_base64
 
-_NEXT = ".next.key"
-"""No name of a member has a dot."""
+_NEXT = ".next.key"  # no name of a member has a dot
 
 
 @dataclass(frozen=True, slots=True)

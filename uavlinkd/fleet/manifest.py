@@ -75,12 +75,10 @@ class Member:
 
     public_key: bytes
     certificate: Certificate
-    signed: bytes
-    """The bytes of the certificate."""
+    signed: bytes  # the bytes of the certificate
     addresses: tuple[Address, ...] = ()
     """Where others reach it from the start. Without one it only initiates."""
-    relays: bool = False
-    """Whether it passes datagrams between members."""
+    relays: bool = False  # whether it passes datagrams between members
 
     @property
     def name(self) -> str:
@@ -100,8 +98,7 @@ class FleetSettings:
     """The settings of all members. In templates, ``{n}`` is the first system id and ``{name}`` the member's name."""
 
     suite: str = "x25519"
-    swarm: bool = False
-    """Whether vehicles connect to vehicles."""
+    swarm: bool = False  # whether vehicles connect to vehicles
     control_socket: str = "{name}.sock"
     drone_url: str = "udpin:127.0.0.1:14550"
     ground_station_url: str = "udpout:127.0.0.1:14550"
@@ -118,11 +115,9 @@ class Fleet:
     """A fleet. ``members`` is in the order of their first certificates, and includes revoked ones."""
 
     authority: AuthorityKey
-    successor: bytes
-    """SHA-256 of the public key that may follow the authority's."""
+    successor: bytes  # SHA-256 of the public key that may follow the authority's
     bulletin: Bulletin
-    published: bytes
-    """The bytes of the bulletin."""
+    published: bytes  # the bytes of the bulletin
     next_serial: int = 1
     settings: FleetSettings = field(default_factory=FleetSettings)
     members: tuple[Member, ...] = ()

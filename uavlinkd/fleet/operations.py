@@ -40,10 +40,8 @@ from uavlinkd.ops.control import ask as ask_daemon
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.base64_text import to_base64
 
-_AT_ONCE = 30
-"""Certificates in a request, which has at most 8,192 bytes."""
-SETTLE_S = 5.0
-"""Members that are linked hand new certificates to each other within this time."""
+_AT_ONCE = 30  # certificates in a request, which has at most 8,192 bytes
+SETTLE_S = 5.0  # members that are linked hand new certificates to each other within this time
 
 
 @dataclass(frozen=True, slots=True)

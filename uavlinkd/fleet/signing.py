@@ -25,8 +25,7 @@ from uavlinkd.fleet.manifest import Fleet, FleetSettings, Member
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.base64_text import from_base64
 
-_ALIKE = str.maketrans({"0": "o", "1": "l", "i": "l", "-": None})
-"""Characters that persons confuse."""
+_ALIKE = str.maketrans({"0": "o", "1": "l", "i": "l", "-": None})  # characters that persons confuse
 
 
 class Identity(NamedTuple):

@@ -285,12 +285,9 @@ class MessageKind(NamedTuple):
     may_be_old: bool
     """Whether it may be delivered while freshness is unverified. A ground station's HEARTBEAT may not."""
     lane: Lane
-    is_state: bool
-    """Whether a newer one replaces it."""
-    instance_at: int = 0
-    """Where the payload tells one reported thing from another, in bytes."""
-    instance_bytes: int = 0
-    """The length of that place; 0: the message reports one thing only."""
+    is_state: bool  # whether a newer one replaces it
+    instance_at: int = 0  # where the payload tells one reported thing from another, in bytes
+    instance_bytes: int = 0  # the length of that place; 0: the message reports one thing only
 
 
 def _names_in(groups: Iterable[str]) -> frozenset[str]:

@@ -19,8 +19,7 @@ from uavlinkd.mavlink.frames import MAVLINK2, Frame
 
 FlowKey = tuple[int | bytes, ...]
 
-COMMANDS: Final = -1
-"""In place of the message id in the flow of commands and answers."""
+COMMANDS: Final = -1  # in place of the message id in the flow of commands and answers
 
 MAX_FLOWS: Final = 1024
 """Flows that are remembered at least, of those used last; at most twice as many. A peer that invents more flows

@@ -67,8 +67,7 @@ class FrameFault(Reason):
 
 @final
 class Frame(NamedTuple):
-    raw: bytes
-    """Its bytes as received, with the signature."""
+    raw: bytes  # its bytes as received, with the signature
     header: Header
 
 
@@ -86,8 +85,7 @@ class SplitCounters:
     """The result for one source's bytes: each byte is in a frame, or garbage, or held by a stream's splitter."""
 
     frames: int = 0
-    unknown: int = 0
-    """Of these, frames of messages or definitions that the dialect does not have."""
+    unknown: int = 0  # of these, frames of messages or definitions that the dialect does not have
     garbage_bytes: int = 0
     faults: Counter[FrameFault] = field(default_factory=Counter)
     """Runs of garbage, by the reason of their first byte."""

@@ -11,8 +11,7 @@ from typing import Final, NamedTuple, final
 
 from uavlinkd.mavlink.dialect import KINDS, MESSAGES, UNKNOWN, MessageKind, Row
 
-MAX_SENDER_MESSAGES: Final = 2048
-"""Messages of one sender each whose headers are kept."""
+MAX_SENDER_MESSAGES: Final = 2048  # messages of one sender each whose headers are kept
 MAX_TARGETED_HEADERS: Final = 8192
 """Headers with a target or command that are kept, of all senders: 2 MB. A ground station that sends thirty different
 commands to each of 250 systems stays below."""
@@ -30,8 +29,7 @@ class Header:
     msgid: int
     system: int
     component: int
-    target_system: int = 0
-    """0 in both targets: all, or the message has no target."""
+    target_system: int = 0  # 0 in both targets: all, or the message has no target
     target_component: int = 0
     command: int | None = None
     """The MAV_CMD that the frame requests or that a mission item carries; None for a message without one."""
@@ -50,12 +48,10 @@ class SenderMessage(NamedTuple):
 
     definition: Row | None
     """The row of :data:`.dialect.MESSAGES`; None if the dialect does not define the message."""
-    longest: int
-    """The longest payload by this definition, in bytes; 255 without one."""
+    longest: int  # the longest payload by this definition, in bytes; 255 without one
     known: Header | None
     """The header of a frame by this definition; None if its payload holds a target or a command."""
-    unknown: Header
-    """The header of a frame by another definition."""
+    unknown: Header  # the header of a frame by another definition
 
 
 OTHER_DEFINITION: Final = b"?"

@@ -82,8 +82,7 @@ LEVELS: Final = (
     Level(50, demand=1.00, queueing_s=0.50, loss_out=0.15),  # enough: neither changes its rate
     Level(30, demand=1.25, queueing_s=1.00, loss_out=0.30),  # a bit too much: both slow down a little
 )
-TXBUF_FULL: Final = 10
-"""Beyond the last level: both slow down by their greatest step."""
+TXBUF_FULL: Final = 10  # beyond the last level: both slow down by their greatest step
 TXBUF_LOST: Final = 50
 _BASE_CREEP: Final = 0.01
 
@@ -177,8 +176,7 @@ class Note(NamedTuple):
 
     severity: TextSeverity
     text: str
-    system: int
-    """Of the vehicle."""
+    system: int  # of the vehicle
 
 
 class StatusTextSource:

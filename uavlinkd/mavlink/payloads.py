@@ -17,17 +17,14 @@ from uavlinkd.mavlink.frames import Frame, SplitCounters, payload_bytes, split_p
 HEARTBEAT: Final = 0
 _TYPE_IN_HEARTBEAT: Final = 4  # offsets in the payload
 _GROUND_STATION: Final = b"\x06"  # MAV_TYPE_GCS
-ANSWERED_S: Final = 2.0
-"""A PARAM_VALUE answers a request that arrived at most so long before."""
-MAX_REQUESTS: Final = 256
-"""Requests that are remembered. The oldest is forgotten first."""
+ANSWERED_S: Final = 2.0  # a PARAM_VALUE answers a request that arrived at most so long before
+MAX_REQUESTS: Final = 256  # Requests that are remembered. The oldest is forgotten first.
 
 PARAM_VALUE: Final = IDS["PARAM_VALUE"]
 PARAM_REQUEST_READ: Final = IDS["PARAM_REQUEST_READ"]
 PARAM_SET: Final = IDS["PARAM_SET"]
 
-VALUE_KIND: Final = KINDS[PARAM_VALUE]
-"""The facts about a PARAM_VALUE, except its class."""
+VALUE_KIND: Final = KINDS[PARAM_VALUE]  # the facts about a PARAM_VALUE, except its class
 REQUESTS: Final = frozenset({PARAM_REQUEST_READ, PARAM_SET})
 """The messages that :meth:`ParameterAnswers.note` reads."""
 
@@ -39,8 +36,7 @@ _NAME_IN_SET: Final = 6
 _ALL_SYSTEMS: Final = 0
 _BY_NAME: Final = 0xFFFF  # the index -1
 
-_Parameter = tuple[int, bytes | int]
-"""A system, and its parameter's name or index."""
+_Parameter = tuple[int, bytes | int]  # a system, and its parameter's name or index
 
 
 def claims_to_be_ground_station(frame: Frame) -> bool:

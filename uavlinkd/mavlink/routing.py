@@ -42,18 +42,15 @@ DUPLICATE_WINDOW_S: Final = 1.0
 the same bytes again behind another port."""
 
 MAX_ADDRESSES_PER_PORT: Final = 512
-MAX_FRAMES_REMEMBERED: Final = 4096
-"""In each half of the window."""
+MAX_FRAMES_REMEMBERED: Final = 4096  # in each half of the window
 MAX_DECISIONS: Final = 4096
 MAX_OWN_FRAMES: Final = 64
 
-SystemComponent = tuple[int, int]
-"""A MAVLink address: system id and component id."""
+SystemComponent = tuple[int, int]  # a MAVLink address: system id and component id
 P = TypeVar("P", bound=Hashable)
 
 
-_OWN: Final = object()
-"""The source of the daemon's own frames."""
+_OWN: Final = object()  # the source of the daemon's own frames
 
 
 class Unrouted(StrEnum):
@@ -70,18 +67,15 @@ class Router(Generic[P]):
     def __init__(self, *, relays: bool = False) -> None:
         self.unrouted: Counter[Unrouted] = Counter()
         self._relays = relays
-        self._is_peer: dict[P, bool] = {}
-        """Every port, in the order in which they were added."""
+        self._is_peer: dict[P, bool] = {}  # every port, in the order in which they were added
         self._silent: set[P] = set()
         self._received_at: dict[P, dict[SystemComponent, float]] = {}
         """By port: when each address was received last. The least recently received is first."""
-        self._ports_of: dict[int, dict[int, set[P]]] = {}
-        """The reverse: by system and component."""
+        self._ports_of: dict[int, dict[int, set[P]]] = {}  # the reverse: by system and component
         self._decisions: dict[tuple[P, int, int], tuple[P, ...] | Unrouted] = {}
         self._seen: dict[bytes, Hashable] = {}
         """The port that each frame came from, in the current half of the window."""
-        self._seen_before: dict[bytes, Hashable] = {}
-        """The same for the previous half."""
+        self._seen_before: dict[bytes, Hashable] = {}  # the same for the previous half
         self._own: dict[bytes, None] = {}
         """The daemon's own frames, the oldest first: a client that was stopped returns them late."""
         self._window_ends_at = float("-inf")

@@ -17,8 +17,7 @@ from typing import Any, Final
 
 from uavlinkd.system.terminal import FAILED, OK, CommandError, UsageError, printable
 
-RUNTIME_FOLDER: Final = Path("/run/uavlinkd")
-"""Where the systemd units put the control sockets."""
+RUNTIME_FOLDER: Final = Path("/run/uavlinkd")  # where the systemd units put the control sockets
 SOCKET_NAME: Final = "control.sock"
 WATCH_INTERVAL_S = 1.0
 

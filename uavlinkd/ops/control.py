@@ -17,8 +17,7 @@ from typing import Any
 
 from uavlinkd.system.terminal import CommandError
 
-MAX_REQUEST_BYTES = 8192
-"""Enough for the attacks of a man in the middle with all their parameters."""
+MAX_REQUEST_BYTES = 8192  # enough for the attacks of a man in the middle with all their parameters
 UNKNOWN = "unknown request"
 FAILED_INSIDE = (
     "it failed because of a fault in the daemon ({}), which its log has: restart the daemon, and send what"

@@ -14,12 +14,9 @@ IS_REACHABLE: Final = "`nc -zvw3 {} 22` shows whether the host is reachable by T
 class Severity(IntEnum):
     """How much a finding matters. The smallest is shown first."""
 
-    SECURITY = 0
-    """An attack, or a key in two places."""
-    FAULT = 1
-    """Frames do not pass."""
-    WARNING = 2
-    """Frames pass, or none is there to pass."""
+    SECURITY = 0  # an attack, or a key in two places
+    FAULT = 1  # frames do not pass
+    WARNING = 2  # frames pass, or none is there to pass
 
 
 class Subject(IntEnum):
@@ -31,16 +28,12 @@ class Subject(IntEnum):
 class Finding(NamedTuple):
     """One cause with its remedy, as ``status`` shows it in one line."""
 
-    cause: str
-    """Its code, such as ``wrong_psk``: a word of a closed list, for scripts."""
+    cause: str  # its code, such as `wrong_psk`: a word of a closed list, for scripts
     severity: Severity
     subject: Subject
-    name: str
-    """The peer's or endpoint's name; empty for the daemon."""
-    text: str
-    """What is wrong, with the facts: one sentence without a full stop."""
-    remedy: str
-    """What the operator does: one sentence without a full stop."""
+    name: str  # the peer's or endpoint's name; empty for the daemon
+    text: str  # what is wrong, with the facts: one sentence without a full stop
+    remedy: str  # what the operator does: one sentence without a full stop
 
     def as_json(self) -> dict[str, str]:
         """Plain values for ``status --json``."""

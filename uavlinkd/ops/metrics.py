@@ -39,8 +39,7 @@ from uavlinkd.relay.forwarding import RelayReason
 CONTENT_TYPE = CONTENT_TYPE_PLAIN_0_0_4
 LEARNED: Final = "learned"
 """The label of an address that is not configured: an attacker can cause learned paths with any address."""
-UNKNOWN: Final = 255
-"""A modem's figure that it does not know."""
+UNKNOWN: Final = 255  # a modem's figure that it does not know
 
 Status = dict[str, Any]
 Part = tuple[tuple[str, ...], Status]
@@ -191,8 +190,7 @@ def _refusals(part: Status) -> dict[tuple[str, str], int]:
 
 _FINDING = ("cause", "severity", "subject", "name")
 _SESSION = ("suite", "mode", "tag_bits")
-_STATES = ("bound", "waiting", "unanswered")
-"""Of a peer at a relay."""
+_STATES = ("bound", "waiting", "unanswered")  # of a peer at a relay
 _BUILD = {"version": __version__, "python": platform.python_version()}
 _SCHEMAS = {"status": str(STATUS_SCHEMA), "log": str(LOG_SCHEMA), "metrics": str(METRICS_SCHEMA)}
 

@@ -18,8 +18,7 @@ from uavlinkd.ops.findings import IS_REACHABLE
 from uavlinkd.ops.status_screen import addresses
 from uavlinkd.system.terminal import printable
 
-INTERVAL_S: Final = 1.0
-"""Between the questions of ``ping``."""
+INTERVAL_S: Final = 1.0  # between the questions of `ping`
 
 Answer = Mapping[str, Any]
 

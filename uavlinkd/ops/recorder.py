@@ -26,14 +26,11 @@ from uavlinkd.ops.tlog_files import STAMP_BYTES, FolderInUseError, TlogFolder
 from uavlinkd.system.error_meanings import meaning_of
 from uavlinkd.system.tasks import Threads, keep_running
 
-MAX_BUFFERED_BYTES = 4 << 20
-"""Limit of the buffer of all peers. Frames beyond it are not recorded."""
+MAX_BUFFERED_BYTES = 4 << 20  # Limit of the buffer of all peers. Frames beyond it are not recorded.
 RETRY_S = 0.5
 """Pause after a failed write. The housekeeping after it tries again: a disk with free space is used within 2 s."""
-CLOCK_STEP_S = 2.0
-"""A jump of the clock by this much means that it was set; less is drift."""
-STOP_WAIT_S = 2.0
-"""Limit of the wait for the disk when the daemon stops."""
+CLOCK_STEP_S = 2.0  # a jump of the clock by this much means that it was set; less is drift
+STOP_WAIT_S = 2.0  # limit of the wait for the disk when the daemon stops
 
 FROM_PEER, TO_PEER = 0, 1
 _LINK_BITS = 3
@@ -50,8 +47,7 @@ class Recorder:
     ) -> None:
         self.frames = 0
         self.bytes = 0
-        self.frames_lost = 0
-        """Frames that a full, failing or slow disk did not record."""
+        self.frames_lost = 0  # frames that a full, failing or slow disk did not record
         self.failures: Counter[str] = Counter()
         """Failed writes by the name of the error, or ``folder_in_use``."""
         self._log = log

@@ -23,8 +23,7 @@ from uavlinkd.relay.forwarding import RelayReason
 from uavlinkd.system.error_meanings import meaning_of
 
 Status = dict[str, Any]
-_Count = tuple[str, int]
-"""A reason in plain words, and how often."""
+_Count = tuple[str, int]  # a reason in plain words, and how often
 
 ENDPOINT_FAILURES: Final[Mapping[str, str]] = {
     "unsent": "unsent frames",
@@ -60,8 +59,7 @@ _SHOWN_REASONS: Final = 3
 _SHOWN_FINDINGS: Final = 20
 _SHOWN_NAMES: Final = 8
 _SHOWN_MEMBERS: Final = 30
-_WIDE: Final = 100
-"""From so many columns on, the table of paths has lag and bytes too."""
+_WIDE: Final = 100  # from so many columns on, the table of paths has lag and bytes too
 _COPIES: Final = frozenset[str]({DropReason.DUPLICATE, DropReason.LATE_COPY})
 """What several paths cause all the time."""
 

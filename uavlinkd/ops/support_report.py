@@ -23,8 +23,7 @@ from uavlinkd.system.terminal import CommandError, printable
 
 COMMAND_TIMEOUT_S: Final = 60.0
 LOG_LINES: Final = 300
-MAX_SECTION: Final = 200_000
-"""Characters of a section; of a longer one the end is kept."""
+MAX_SECTION: Final = 200_000  # characters of a section; of a longer one the end is kept
 SERVICE_FILES: Final = Path("/etc/uavlinkd")
 _PACKAGES: Final = (
     *("cryptography", "fastcrc", "prometheus_client", "pydantic"),

@@ -26,20 +26,17 @@ from uavlinkd.endpoints.url import NetworkUrl, SerialUrl
 from uavlinkd.system.addresses import Address, numeric_host
 from uavlinkd.system.interfaces import find_interface, interface_of
 
-RESOLVE_S = 3.0
-"""Limit for the look-ups of all names together."""
+RESOLVE_S = 3.0  # limit for the look-ups of all names together
 _MAX_SOCKET_PATH = 107
 _SERIAL_DEVICES = ("serial/by-id/*", "ttyACM*", "ttyUSB*", "serial0")
-_IP_S = 3.0
-"""Limit for one call of ``ip``."""
+_IP_S = 3.0  # limit for one call of `ip`
 _IP = shutil.which("ip", path=f"{os.environ.get('PATH', os.defpath)}:/usr/sbin:/sbin")
 """Not in the path of every user."""
 _CONF = Path("/proc/sys/net/ipv4/conf")
 _STRICT = 1
 """The value of rp_filter with which the kernel drops what another interface would answer (RFC 3704)."""
 
-Answers = dict[str, list[str]]
-"""The numeric hosts of each name; none if it does not resolve."""
+Answers = dict[str, list[str]]  # the numeric hosts of each name; none if it does not resolve
 
 
 class Reach(NamedTuple):

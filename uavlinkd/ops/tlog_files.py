@@ -21,10 +21,8 @@ from dataclasses import dataclass
 
 from uavlinkd.config.model import Recording
 
-MAX_FILE_BYTES = 64_000_000
-"""The records after this size are in another file."""
-SYNC_INTERVAL_S = 5.0
-"""A power cut loses at most this much."""
+MAX_FILE_BYTES = 64_000_000  # the records after this size are in another file
+SYNC_INTERVAL_S = 5.0  # a power cut loses at most this much
 STAMP_BYTES = 8
 
 _NAME = re.compile(r"(\d{8,12})-\d{8}T\d{6}Z-.+\.tlog")

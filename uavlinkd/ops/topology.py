@@ -25,8 +25,7 @@ from uavlinkd.mavlink.policy.roles import ROLES
 from uavlinkd.ops.surroundings import Surroundings
 from uavlinkd.relay.forwarding import MemberSettings
 
-_MOST_COLUMNS: Final = 100_000
-"""More than any line has."""
+_MOST_COLUMNS: Final = 100_000  # more than any line has
 _NEVER_BROKEN: Final = frozenset({"name", "public key", "address", "URL"})
 
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-_CAN_SYNC = hasattr(os, "geteuid")
-"""Windows cannot open a folder."""
+_CAN_SYNC = hasattr(os, "geteuid")  # Windows cannot open a folder
 
 
 def sync_folder(folder: Path) -> None:

@@ -30,8 +30,7 @@ class Bucket:
 
     def __init__(self, budget_bits_s: float, now: float, least_burst: float = 0.0) -> None:
         self.rate = budget_bits_s / 8
-        self.burst = 0.0
-        """The most bytes that it holds."""
+        self.burst = 0.0  # the most bytes that it holds
         self.set_least_burst(least_burst)
         self._bytes = self.burst
         self._offered = 0.0  # bytes sent and dropped, fading over the window

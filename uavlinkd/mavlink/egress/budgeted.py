@@ -45,8 +45,7 @@ SHARING_OF_AGE: Final = 0.5
 MIN_LANE_BYTES: Final = 8 * 1024
 MAX_LANE_BYTES: Final = 80 * 1024
 """Bounds of each of the three lanes. Between them, a lane holds as much as the budget carries in ``max_age_s``."""
-MAX_FLOWS: Final = 4096
-"""Flows that are remembered while none of their frames waits."""
+MAX_FLOWS: Final = 4096  # flows that are remembered while none of their frames waits
 _SLACK_BYTES: Final = 0.5  # a deadline computed in floating point must not come a hair early, over and over
 
 
@@ -77,8 +76,7 @@ class EnvelopeShape:
     payload_limit: int = 1200
     seal_bytes: int = 23
     carrier_bytes: int = 28
-    overhead: int = field(init=False)
-    """The bytes of an envelope on the wire besides its frames."""
+    overhead: int = field(init=False)  # the bytes of an envelope on the wire besides its frames
 
     def __post_init__(self) -> None:
         self.overhead = self.seal_bytes + self.carrier_bytes
@@ -115,8 +113,7 @@ class Egress:
         lane_bytes = min(max(supply.rate * settings.max_age_s, MIN_LANE_BYTES), MAX_LANE_BYTES)
         self.lanes = Lanes(lane_bytes, MAX_FLOWS, self._is_superseded, self._on_drop)
         self._waiting_since = now  # a newer state in place of an older one changes nothing
-        self.shape = shape
-        """The payload and the cost of an envelope to this peer."""
+        self.shape = shape  # the payload and the cost of an envelope to this peer
 
     @property
     def queued_frames(self) -> int:
@@ -239,8 +236,7 @@ class Coalescer:
     to 14 µs of CPU time there, and 0.6 to 1.9 µs here (Python 3.11).
     """
 
-    is_blocked = False
-    """Frames never wait for a budget here."""
+    is_blocked = False  # frames never wait for a budget here
 
     def __init__(self, settings: EgressSettings, shape: EnvelopeShape, totals: Counter[EgressDrop]) -> None:
         self.settings = settings

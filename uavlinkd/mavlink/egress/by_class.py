@@ -46,8 +46,7 @@ class PeerEgress:
     def __init__(self, settings: EgressSettings, now: float, class_of: ClassOf) -> None:
         self.settings = settings
         self.totals: Counter[EgressDrop] = Counter()
-        self.is_split = False
-        """Whether frames wait by class."""
+        self.is_split = False  # whether frames wait by class
         self._class_of = class_of
         self._shape = EnvelopeShape()
         self._own: Bucket | None = None

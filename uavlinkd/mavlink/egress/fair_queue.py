@@ -29,16 +29,12 @@ from uavlinkd.mavlink.egress.lanes import EgressDrop, Lanes, OnDrop, Waiting
 from uavlinkd.mavlink.frames import MAX_FRAME_BYTES, Frame
 from uavlinkd.mavlink.policy.delivery import Source
 
-SUPERSEDED_S: Final = 0.1
-"""A state that waited so long is replaced by a newer one of its flow."""
-MAX_AGE_S: Final = 1.0
-"""A frame that waited longer is dropped."""
+SUPERSEDED_S: Final = 0.1  # a state that waited so long is replaced by a newer one of its flow
+MAX_AGE_S: Final = 1.0  # a frame that waited longer is dropped
 LANE_BYTES: Final = 64 * 1024
 """Bounds what waits in each of the three lanes of one source: a second of the fastest telemetry."""
-QUEUE_BYTES: Final = 256 * 1024
-"""Bounds what waits for the client."""
-MAX_FLOWS: Final = 256
-"""Flows of one source that are remembered while none of their frames waits."""
+QUEUE_BYTES: Final = 256 * 1024  # bounds what waits for the client
+MAX_FLOWS: Final = 256  # flows of one source that are remembered while none of their frames waits
 MAX_SOURCES: Final = 64
 """Sources that are remembered while none of their frames waits. One that is forgotten owes a frame at most."""
 MOST_AHEAD: Final = MAX_FRAME_BYTES
@@ -50,8 +46,7 @@ class _Place:
     """The frames of one class of one source."""
 
     frames: _SourceFrames
-    next_frame: Callable[[], Waiting | None]
-    """The source's next frame of this class."""
+    next_frame: Callable[[], Waiting | None]  # the source's next frame of this class
     is_in_line: bool = False
 
 

@@ -123,8 +123,7 @@ class Queue:
 
 IsSuperseded = Callable[[Waiting, Frame, float], bool]
 """Whether a newer frame of the same state replaces the one that waits: (waiting, newer, now)."""
-by_number: Final = attrgetter("number")
-"""For sorting in the order of arrival."""
+by_number: Final = attrgetter("number")  # for sorting in the order of arrival
 OnDrop = Callable[[Waiting, EgressDrop], None]
 
 
@@ -132,8 +131,7 @@ class Lanes:
     """Frames that wait, by lane and flow. Within a flow the order is never reversed."""
 
     def __init__(self, lane_bytes: float, max_flows: int, is_superseded: IsSuperseded, on_drop: OnDrop) -> None:
-        self.queues = (Queue(), Queue(), Queue())
-        """By lane."""
+        self.queues = (Queue(), Queue(), Queue())  # by lane
         self._lane_bytes = lane_bytes
         self._flow_bytes = lane_bytes / FLOWS_PER_LANE
         self._max_flows = max_flows

@@ -56,10 +56,8 @@ class Source:
     __slots__ = ("_forget", "_report", "gate", "name")
 
     def __init__(self, name: str, gate: Gate, report: Report | None = None, forget: Forget | None = None) -> None:
-        self.name = name
-        """The peer or endpoint, as the configuration names it."""
-        self.gate = gate
-        """The incoming rules that its frames passed."""
+        self.name = name  # the peer or endpoint, as the configuration names it
+        self.gate = gate  # the incoming rules that its frames passed
         self._report = report
         self._forget = forget
 
@@ -83,8 +81,7 @@ class DeliveredStream:
     def __init__(self, outgoing: Gate | None = None) -> None:
         self.outgoing = outgoing
         """The rules for what goes to this client; None where nothing is withheld."""
-        self.separators = 0
-        """How often bytes had to be put between frames of different sources."""
+        self.separators = 0  # how often bytes had to be put between frames of different sources
         self._tail = b""  # the stream from the first start that is still open
         self._starts: list[hidden.Start] = []  # where in it frames may have begun that are not complete
         self._has_mavlink2 = self._has_rare = False  # whether the tail has such frames: some receivers reject them

@@ -129,8 +129,7 @@ CODES: Final[Mapping[Refusal, int]] = {refusal: code for code, refusal in enumer
 reasons follow the others."""
 REFUSALS: Final[Mapping[int, Refusal]] = {code: refusal for refusal, code in CODES.items()}
 
-_Buckets = dict[FlowKey, tuple[float, float]]
-"""Tokens, and when that was, by what shares them."""
+_Buckets = dict[FlowKey, tuple[float, float]]  # tokens, and when that was, by what shares them
 
 
 @dataclass(frozen=True, slots=True)

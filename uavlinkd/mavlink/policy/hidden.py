@@ -37,11 +37,9 @@ from uavlinkd.mavlink.frames import (
     parse_frame,
 )
 
-PAST: Final = -1
-"""Of a start: no frame can begin there."""
+PAST: Final = -1  # of a start: no frame can begin there
 
-Start = tuple[int, bool]
-"""Where a frame may begin, and whether it is read in MAVLink 1."""
+Start = tuple[int, bool]  # where a frame may begin, and whether it is read in MAVLink 1
 
 _PLAUSIBLE = re.compile(rb"\xfe|\xfd(?=.?\Z|.[\x00\x01])", re.DOTALL)
 """A start byte whose flags, as far as the bytes go, are ones that parsers accept."""
