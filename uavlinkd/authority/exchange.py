@@ -60,9 +60,8 @@ class BulletinExchange:
 
     Look at :attr:`next_at` after each call: :meth:`do_due` alone returns records to send.
 
-    Args:
-        trust: its bulletin and its own certificate are on the disk.
-        wait_s: how long the answer to what the peer with this key lacks may take, at least.
+    ``trust``: its bulletin and own certificate are on the disk. ``wait_s``: how long the answer to what the peer with
+    this key lacks may take, at least.
     """
 
     def __init__(self, trust: Trust, entropy: Entropy, wait_s: Callable[[bytes], float] = lambda _: 0.0) -> None:
@@ -107,14 +106,7 @@ class BulletinExchange:
     def receive(self, key: bytes, record: FleetRecord, order: int, now: float) -> Reaction:
         """A peer sent *have*, a bulletin, or a certificate for its own key or this daemon's.
 
-        Args:
-            key: the peer's.
-            record: what it sent.
-            order: that of :class:`~uavlinkd.core.outputs.RecordReceived`.
-            now: monotonic seconds.
-
-        Raises:
-            Drop: the record has no effect.
+        ``order``: that of :class:`~uavlinkd.core.outputs.RecordReceived`. Raises Drop if the record has no effect.
         """
         peer = self._peers.get(key)
         if peer is None or not peer.is_up:

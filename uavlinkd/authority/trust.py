@@ -51,16 +51,9 @@ class BulletinVerdict(Enum):
 
 
 class Trust:
-    """The certificates and the bulletin of one daemon.
+    """The certificates and the bulletin of one daemon. ``certificate``: its own one; empty if it has none.
 
-    Args:
-        authority: the key that signs.
-        own_key: this daemon's static public key.
-        certificate: its certificate; empty for a daemon that has none.
-        bulletin: the newest one at hand.
-
-    Raises:
-        ValueError: the certificate or the bulletin is not valid. The message says which.
+    Raises ValueError if the certificate or the bulletin is not valid. The message says which.
     """
 
     def __init__(self, authority: AuthorityKey, own_key: bytes, certificate: bytes, bulletin: bytes) -> None:
