@@ -43,7 +43,7 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
 
     Raises ConfigError with every problem of the file. An invalid value never becomes a default.
     """
-    table = _read_toml(path)
+    table = read_toml(path)
     problems = Problems(str(path))
     keys = {key: table[key] for key in table if key not in schema.SINGLE and key not in schema.REPEATED}
     sections: dict[str, Any] = {"top": problems.read(schema.FileSection, keys, "")}
@@ -87,7 +87,7 @@ def load_control_socket(path: Path) -> Path | None:
 
     Raises ConfigError if the file cannot be read, or its value for the socket is invalid.
     """
-    table = _read_toml(path)
+    table = read_toml(path)
     problems = Problems(str(path))
     sections = (*schema.SINGLE, *schema.REPEATED)
     top = problems.read(schema.FileSection, {key: table[key] for key in table if key not in sections}, "")
@@ -97,7 +97,7 @@ def load_control_socket(path: Path) -> Path | None:
     return path.absolute().parent / name if name else None
 
 
-def _read_toml(path: Path) -> dict[str, Any]:
+def read_toml(path: Path) -> dict[str, Any]:
     """The file's tables. Raises ConfigError if the file cannot be read, or is not valid TOML."""
     try:
         with path.open("rb") as file:

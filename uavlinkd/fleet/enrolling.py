@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,11 +19,12 @@ from uavlinkd.authority.enrolment import (
     verify_reply,
 )
 from uavlinkd.config import keys
+from uavlinkd.config.load import read_toml
 from uavlinkd.core.certificates import Certificate, parse_bulletin, parse_certificate
 from uavlinkd.core.crypto import x25519_public_key
 from uavlinkd.core.drops import Drop
 from uavlinkd.fleet.files import config_file, edited, key_file, listen_on, write_config
-from uavlinkd.fleet.manifest import FleetFileError, FleetSettings
+from uavlinkd.fleet.manifest import FleetSettings
 from uavlinkd.fleet.transaction import changing
 from uavlinkd.mavlink.dialect import SYSTEM_ID
 from uavlinkd.system.base64_text import from_base64
@@ -48,14 +48,7 @@ class MemberFiles:
 
     def table(self) -> dict[str, Any]:
         """The present configuration; empty without one."""
-        try:
-            return tomllib.loads(self.config.read_text(encoding="utf-8-sig"))
-        except FileNotFoundError:
-            return {}
-        except OSError as error:
-            raise FleetFileError(f"{self.config} cannot be read: {error.strerror}") from None
-        except ValueError:
-            raise FleetError(f"{self.config} is not valid TOML: `uavlinkd check` names the line") from None
+        return read_toml(self.config) if os.path.lexists(self.config) else {}
 
 
 def request(name: str, place: MemberFiles) -> tuple[str, Path]:

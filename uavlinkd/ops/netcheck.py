@@ -7,15 +7,14 @@ another port; what they cannot show is reported as unknown.
 from __future__ import annotations
 
 import time
-from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import StrEnum
 from itertools import combinations
 from textwrap import fill
 from typing import Any, Final
 
 from uavlinkd.ops.findings import IS_REACHABLE
-from uavlinkd.ops.status_screen import addresses
 from uavlinkd.system.terminal import printable
 
 INTERVAL_S: Final = 1.0  # between the questions of `ping`
@@ -55,6 +54,20 @@ def ping(ask: Callable[[], Answer], count: int) -> bool:
                 flush=True,
             )
     return answered
+
+
+def addresses(paths: Sequence[Answer]) -> list[str]:
+    """The address of each path. Relayed paths that look alike have the relay's address too, or else their number.
+
+    Two paths along one port of a relay lead to two addresses of the peer, which only the relay knows.
+    """
+    names = [path["address"] for path in paths]
+    for fact, word in (("relay_address", "at"), ("number", "path")):
+        times = Counter((path["network"], name) for path, name in zip(paths, names, strict=True))
+        for at, path in enumerate(paths):
+            if path["relay"] is not None and times[path["network"], names[at]] > 1 and path.get(fact) is not None:
+                names[at] += f" {word} {path[fact]}"
+    return names
 
 
 class Mapped(StrEnum):

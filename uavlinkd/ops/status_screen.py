@@ -19,6 +19,7 @@ from uavlinkd.mavlink.egress.lanes import EgressDrop
 from uavlinkd.mavlink.frames import FrameFault
 from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.ops.findings import LinkProblem
+from uavlinkd.ops.netcheck import addresses
 from uavlinkd.relay.forwarding import RelayReason
 from uavlinkd.system.error_meanings import meaning_of
 
@@ -186,7 +187,6 @@ def _peers(status: Status, width: int) -> list[RenderableType]:
 
 
 def _by_state(status: Status) -> list[tuple[str, Status]]:
-    """The peers by name, the broken ones first."""
     return sorted(status["peers"].items(), key=lambda item: (item[1]["state"] == "up", item[0]))
 
 
@@ -214,15 +214,12 @@ def _endpoints(status: Status) -> Table:
 def _networks(status: Status) -> Table:
     table = _table("network", "exit", "metered", "addresses")
     for name, network in status["networks"].items():
-        here = Text(", ".join(network["addresses"]))
-        if not network["is_present"]:
-            here = Text(f"absent: {network['absent_because']}", style="bold yellow")
-        metered = "yes" if network["is_metered"] else "no"
         line = network["serial"]
         leads_out = network["interface"] or network["address"] or f"{line['device']} at {line['baud']} baud"
-        if line is not None and network["is_present"]:
-            here = Text(_line(line))
-        table.add_row(Text(name, style="bold"), Text(leads_out), metered, here)
+        here = Text(", ".join(network["addresses"]) if line is None else _line(line))
+        if not network["is_present"]:
+            here = Text(f"absent: {network['absent_because']}", style="bold yellow")
+        table.add_row(Text(name, style="bold"), Text(leads_out), "yes" if network["is_metered"] else "no", here)
     return table
 
 
@@ -250,7 +247,6 @@ def _drops(peer: Status) -> list[_Count]:
 
 
 def _refused(part: Status) -> dict[str, int]:
-    """Refused frames of a policy, summed by reason."""
     sums = Counter[str]()
     for messages in part["refused"].values():
         for reasons in messages.values():
@@ -316,20 +312,6 @@ def _rate(bytes_s: float) -> str:
 # Paths.
 
 
-def addresses(paths: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The address of each path. Relayed paths that look alike have the relay's address too, or else their number.
-
-    Two paths along one port of a relay lead to two addresses of the peer, which only the relay knows.
-    """
-    names = [path["address"] for path in paths]
-    for fact, word in (("relay_address", "at"), ("number", "path")):
-        times = Counter((path["network"], name) for path, name in zip(paths, names, strict=True))
-        for at, path in enumerate(paths):
-            if path["relay"] is not None and times[path["network"], names[at]] > 1 and path.get(fact) is not None:
-                names[at] += f" {word} {path[fact]}"
-    return names
-
-
 def _paths(peers: Sequence[tuple[str, list[Status]]], width: int) -> Table:
     """The paths of these peers, with as many columns as have room. Pairs of numbers are in/out."""
     more = ("lag ms", "MB") if width >= _WIDE else ()
@@ -343,14 +325,17 @@ def _paths(peers: Sequence[tuple[str, list[Status]]], width: int) -> Table:
 
 def _cells(path: Status, address: str) -> list[Text]:
     where = f"{path['network']} {address}" if path["network"] else address
+    rtt = "-"
+    if path["round_trip_s"] is not None:
+        rtt = f"{_short(1000 * path['round_trip_s'])}±{_short(1000 * path['jitter_s'])}"
     return [
         Text(f" {where}", style="bold" if path["role"] == "best" else ""),
         Text(_state(path), style=_STYLES[path["state"]]),
         Text("all" if len(path["carries"]) == 3 else "+".join(path["carries"]) or "-"),
-        Text("-" if path["round_trip_s"] is None else f"{_ms(path['round_trip_s'])}±{_ms(path['jitter_s'])}"),
+        Text(rtt),
         Text(f"{100 * path['loss_in']:.0f}/{100 * path['loss_out']:.0f}"),
         Text(f"{_short(path['bytes_in_s'] / 1e3)}/{_short(path['bytes_out_s'] / 1e3)}"),
-        Text("-" if path["lag_s"] is None else _ms(path["lag_s"])),
+        Text("-" if path["lag_s"] is None else _short(1000 * path["lag_s"])),
         Text(f"{_short(path['bytes_received'] / 1e6)}/{_short(path['bytes_sent'] / 1e6)}"),
     ]
 
@@ -361,10 +346,6 @@ def _state(path: Status) -> str:
         return str(path["role"])
     reason = _NOT_USABLE.get(path["reason"])
     return f"{path['state']}: {reason}" if reason else str(path["state"])
-
-
-def _ms(seconds: float) -> str:
-    return _short(1000 * seconds)
 
 
 def _short(number: float) -> str:
@@ -384,7 +365,6 @@ def _fleet(fleet: Status) -> Text:
 
 
 def _members(relay: dict[str, Any]) -> Table:
-    """A line per member, those that are down first."""
     table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=0)
     for title in ("member", "state", "address", "bound", "waiting", "forwarded", "over\nlimit"):
         is_text = title in ("member", "state", "address")
