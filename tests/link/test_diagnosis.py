@@ -13,7 +13,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from tests.core.harness import PLAIN
-from tests.daemon.frames import command_long, heartbeat
+from tests.daemon.frames import command_long, ground_heartbeat, heartbeat
 from tests.link.test_evidence import HOST, OWN_KEY, THERE, Scene
 from tests.test_readmes import ROOT
 from uavlinkd.config.keys import encode_key
@@ -29,7 +29,7 @@ from uavlinkd.core.settings import PeerSettings
 from uavlinkd.endpoints.url import parse_url
 from uavlinkd.link import diagnosis, down_problems
 from uavlinkd.link.evidence import EVIDENCE_S, OWN_FRAMES_S, History
-from uavlinkd.link.facts import ICMP_S, Moment
+from uavlinkd.link.facts import ICMP_S
 from uavlinkd.link.own_problems import PROBLEMS, own_codes
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.traffic_problems import SECURITY_S, has_no_client, is_contested
@@ -316,11 +316,6 @@ def test_senders_without_a_member_here_have_their_own_addresses(daemon: Daemon) 
         daemon.dropped(DropReason.UNKNOWN_PEER, address, key)
     shown = ", ".join(f"{encode_key(key)} at {host}:{port}" for key, (host, port) in keys.items())
     assert daemon.findings()["not_a_member"].text.endswith(shown)
-    daemon.parts.fleet = SimpleNamespace()
-    finding = next(one for one in diagnosis.member_problems(Moment(daemon.parts, NOW)) if one.cause == "not_a_member")
-    assert finding.text.endswith(shown)
-    assert "fleet list" in finding.remedy
-    assert "[[member]]" not in finding.remedy
 
 
 # A peer that is up.
@@ -394,6 +389,16 @@ def test_policy_that_refuses_everything(daemon: Daemon, received: list[bytes], s
     daemon.cross(received, sent)
     text = daemon.findings()["all_refused"].text
     assert text.startswith(f"its policy refuses every frame {which} it: the role, or the lists")
+
+
+def test_role_of_a_member_is_signed_again(daemon: Daemon) -> None:
+    """No file has it."""
+    daemon.set_up(role="vehicle", system_ids="all")
+    daemon.cross([ground_heartbeat()])
+    assert 'write role = "operator"' in daemon.findings()["roles_exchanged"].remedy
+    settings = replace(daemon.link.config.settings, is_certified=True)
+    daemon.link.config = replace(daemon.link.config, settings=settings)
+    assert "`uavlinkd fleet sign --replace drone1 --role operator`" in daemon.findings()["roles_exchanged"].remedy
 
 
 def test_hidden_frame_is_the_first_line(daemon: Daemon) -> None:

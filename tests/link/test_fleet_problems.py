@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from base64 import b64decode, b64encode
+from dataclasses import replace
 from pathlib import Path
 from time import monotonic
 from types import SimpleNamespace
@@ -17,6 +18,7 @@ from tests.link.test_diagnosis import NOW, STRANGER, Daemon
 from tests.link.test_evidence import THERE
 from uavlinkd.authority import state_file
 from uavlinkd.authority.constants import CONTACTS_FIRST_S, HAVE_INTERVAL_S
+from uavlinkd.config.keys import encode_key
 from uavlinkd.core.certificates import MemberRole, digest_of
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.outputs import Dropped, RecordReceived
@@ -90,6 +92,25 @@ async def test_members_that_are_refused_are_named(tmp_path: Path) -> None:
     assert texts["member_conflict"].endswith(f"v8 (serial 11) and this daemon's own certificate {at}")
     assert texts["role_not_accepted"].endswith(f": gs (role operator) {at}")
     assert member.findings(NOW + 31) == {}
+
+
+async def test_unknown_key_is_not_of_the_member_at_its_address(tmp_path: Path) -> None:
+    """One NAT may have both. A sender that another finding names, and a member that restarted, are not repeated."""
+    member, tablet = Member(tmp_path, news=bulletin(2, 9)), bytes([9]) * 32
+    member.link.config = replace(member.link.config, settings=replace(member.link.config.settings, is_certified=True))
+    member.shows(C, certificate(name="v9", ids=(9, 9), key=KEY["c"], serial=9))
+    member.fleet.admit(D, b64decode(certificate(name="v8", ids=(8, 8), key=KEY["d"], serial=8)), member.now + 99)
+    member.dropped(DropReason.UNKNOWN_PEER, STRANGER, C)
+    assert set(member.findings()) == {"certificate_revoked"}
+    member.now, member.link.peer.is_up = NOW + 1, False
+    for key in (D, tablet):
+        member.dropped(DropReason.UNKNOWN_PEER, THERE, key)
+    member.dropped(DropReason.BAD_MAC1, THERE)
+    findings = member.findings()
+    assert set(findings) == {"certificate_revoked", "not_a_member", "wrong_key_there"}
+    assert findings["not_a_member"].text.endswith(f"no member here: {encode_key(tablet)} at 192.0.2.2:5790")
+    assert "`uavlinkd enroll`" in findings["not_a_member"].remedy
+    assert "`uavlinkd fleet sign drone1`" in findings["wrong_key_there"].remedy
 
 
 async def test_first_second_of_a_start(tmp_path: Path) -> None:

@@ -111,17 +111,10 @@ def member_problems(moment: Moment) -> Iterator[Found]:
         facts = (f"{one.settings.name}, from {traffic.places(one.peer)}" for one in twins)
         yield traffic.two_machines(f"the private key of a member: {listed(facts)}")
     unknown = daemon.evidence.seen_at(DropReason.UNKNOWN_PEER, ELSEWHERE, now)
-    if unknown is not None and daemon.fleet is not None:
+    if unknown is not None and daemon.fleet is None:
         yield warning(
             "not_a_member",
-            f"a sender without a valid certificate has a key of no member here: {details_at(unknown)}",
-            "`uavlinkd fleet list` shows whose key it is. Leave a revoked member out; let another one of yours run"
-            " `uavlinkd enroll` again",
-        )
-    elif unknown is not None:
-        yield warning(
-            "not_a_member",
-            f"a sender has a key of no [[member]] here: {details_at(unknown)}",
+            f"a sender has a key of no [[member]] here: {details_at(unknown.details)}",
             "if it is yours, run `uavlinkd pubkey` there, write into its [[member]] what that prints, and run"
             " `uavlinkd reload` here: a key that arrives proves nothing",
         )

@@ -215,7 +215,8 @@ def relay_warnings(moment: Moment) -> Iterator[Found]:
 
 
 def _hints(peer: PeerFacts) -> Iterator[Found]:
-    if (sighting := peer.handshake_seen(DropReason.UNKNOWN_PEER)) is not None:
+    is_certified = peer.link.config.settings.is_certified  # no file has its key
+    if not is_certified and (sighting := peer.handshake_seen(DropReason.UNKNOWN_PEER)) is not None:
         yield from _unknown_keys(peer, sighting)
     config = peer.daemon.config
     if (sighting := peer.handshake_seen(DropReason.OTHER_VERSION)) is not None:
@@ -229,8 +230,10 @@ def _hints(peer: PeerFacts) -> Iterator[Found]:
                 "wrong_key_there",
                 f"a sender at {at(sighting)} does not know this daemon's public key: that end may have another key"
                 " for it",
-                f'at {peer.name}, write public_key = "{encode_key(config.public_key)}" for {config.name}; if its key'
-                " file was replaced, restart this daemon",
+                f"`uavlinkd fleet sign {peer.name}` prints a line for `uavlinkd enroll --finish` there"
+                if is_certified
+                else f'at {peer.name}, write public_key = "{encode_key(config.public_key)}" for {config.name}; if its'
+                " key file was replaced, restart this daemon",
             )
 
 
@@ -257,7 +260,7 @@ def _unknown_keys(peer: PeerFacts, sighting: Sighting) -> Iterator[Found]:
         which = "the key" if count == 1 else f"{count} keys, so at least one is not {peer.name}:"
         yield fault(
             "wrong_key_here",
-            f"a sender uses {which} {details_at(sighting)}, which this file does not have",
+            f"a sender uses {which} {details_at(sighting.details)}, which this file does not have",
             f"run `uavlinkd pubkey` at {peer.name}, and write into this file what that prints: a key that arrives"
             " proves nothing. After a change of keys, restart it with its new files; if the former key was stolen,"
             " this may be the thief",

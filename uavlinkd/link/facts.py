@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 
 from uavlinkd.config.keys import encode_key
 from uavlinkd.config.model import EndpointConfig
-from uavlinkd.core.drops import DropReason
+from uavlinkd.core.drops import Detail, DropReason
 from uavlinkd.core.path import Path, SocketAddress, relay_name
 from uavlinkd.endpoints.ports import Endpoint
 from uavlinkd.link.direct_search import is_private
@@ -249,10 +249,10 @@ def place(address: SocketAddress | None) -> str:
     return "its address" if address is None else shown(address)
 
 
-def details_at(sighting: Sighting) -> str:
+def details_at(details: Mapping[Detail, SocketAddress | None]) -> str:
     """The public keys or certificates of senders, each with the address where it was seen last."""
-    details = ((encode_key(one) if isinstance(one, bytes) else one, at) for one, at in sighting.details.items())
-    return ", ".join(f"{detail} at {place(address)}" for detail, address in details)
+    shown_at = ((encode_key(one) if isinstance(one, bytes) else one, at) for one, at in details.items())
+    return ", ".join(f"{detail} at {place(address)}" for detail, address in shown_at)
 
 
 def listed(names: Iterable[str], most: int = 4) -> str:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 
 from uavlinkd.authority.exchange import ROLLED_BACK
 from uavlinkd.authority.trust import BulletinVerdict
-from uavlinkd.core.drops import DropReason
+from uavlinkd.core.drops import Detail, DropReason
+from uavlinkd.core.path import SocketAddress
 from uavlinkd.link.facts import Found, Moment, PeerFacts, details_at, fault, security, warning
 
 
@@ -43,7 +44,7 @@ def fleet_problems(moment: Moment) -> Iterator[Found]:
             "let the daemon's user write there, and make room on the disk; then restart the daemon",
         )
     yield from _bulletins(fleet.noticed(moment.now))
-    yield from _refused(moment)
+    yield from _refused(moment, trust.held)
 
 
 def _bulletins(noticed: dict[str, str]) -> Iterator[Found]:
@@ -71,12 +72,13 @@ def _bulletins(noticed: dict[str, str]) -> Iterator[Found]:
         )
 
 
-def _refused(moment: Moment) -> Iterator[Found]:
-    evidence, now = moment.daemon.evidence, moment.now
+def _refused(moment: Moment, held: Container[Detail]) -> Iterator[Found]:
+    named: set[SocketAddress | None] = set()
 
     def who(reason: DropReason) -> str:
-        sighting = evidence.seen_anywhere(reason, now)
-        return "" if sighting is None else details_at(sighting)
+        details = _seen(moment, reason)
+        named.update(details.values())
+        return details_at(details)
 
     if senders := who(DropReason.BAD_CERTIFICATE):
         yield warning(
@@ -103,6 +105,19 @@ def _refused(moment: Moment) -> Iterator[Found]:
             f"this file has no policy for members of its role: {senders}",
             'none if that is meant, as with operator = "pinned"; else write a [[fleet_role]]',
         )
+    unknown = _seen(moment, DropReason.UNKNOWN_PEER)
+    if strangers := {key: at for key, at in unknown.items() if key not in held and at not in named}:
+        yield warning(
+            "not_a_member",
+            f"a sender without a valid certificate has a key of no member here: {details_at(strangers)}",
+            "`uavlinkd fleet list` shows whose key it is. Leave a revoked member out; let another one of yours run"
+            " `uavlinkd enroll` again",
+        )
+
+
+def _seen(moment: Moment, reason: DropReason) -> dict[Detail, SocketAddress | None]:
+    sighting = moment.daemon.evidence.seen_anywhere(reason, moment.now)
+    return {} if sighting is None else sighting.details
 
 
 def pinned_problems(peer: PeerFacts) -> Iterator[Found]:

@@ -159,10 +159,7 @@ def _about_systems(part: PartFacts, systems: Mapping[int, int], which: str) -> t
         return text, f"{own}: {whose}"
     remedy = "write it into its system_ids"
     if is_certified:
-        command = f"uavlinkd fleet sign --replace {part.name} --id {min(systems)}"
-        remedy = (
-            f"sign it again: `uavlinkd enroll {part.name}` there | `{command}` | `uavlinkd enroll --finish` there"
-        )
+        remedy = _sign_again(part.name, f"--id {min(systems)}")
     return text, f"{own}; or, only if you know that {part.owner} has this id, {remedy}"
 
 
@@ -241,10 +238,17 @@ def _roles_exchanged(peer: PeerFacts, *, is_blocked: bool) -> Iterator[Found]:
         elif is_withheld and _has(gates.outgoing, _only("operator", "vehicle")):
             sign = "the client here sends an operator's requests"
         remedy = 'write role = "vehicle" if it is a vehicle: a role says what the peer is, not what this end is'
+    if peer.link.config.settings.is_certified:
+        remedy = _sign_again(peer.name, "--role operator" if role == "vehicle" else "--role vehicle")
     if sign:
         text = f'role = "{role}" says that it is {is_one}, but {sign}: the roles may be exchanged'
         fault_if_blocked = fault if is_blocked else warning
         yield fault_if_blocked("roles_exchanged", text, remedy)
+
+
+def _sign_again(name: str, option: str) -> str:
+    command = f"uavlinkd fleet sign --replace {name} {option}"
+    return f"sign it again: `uavlinkd enroll {name}` there | `{command}` | `uavlinkd enroll --finish` there"
 
 
 def _has(gate: Gate, messages: frozenset[int]) -> bool:
