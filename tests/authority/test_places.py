@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from tests.core.harness import seeded
-from uavlinkd.authority.places import longest_down
+from uavlinkd.authority.trust import longest_down
 from uavlinkd.core.crypto import Secret
 from uavlinkd.core.node import Node
 from uavlinkd.core.settings import PeerSettings

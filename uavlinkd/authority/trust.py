@@ -5,7 +5,7 @@ Pure: no I/O, no clock, no randomness. Whether a certificate may be accepted dep
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Container, Iterable, Iterator, Mapping
 from enum import Enum
 from typing import NamedTuple
 
@@ -23,6 +23,7 @@ from uavlinkd.core.certificates import (
 )
 from uavlinkd.core.crypto import AuthorityKey
 from uavlinkd.core.drops import Drop, DropReason
+from uavlinkd.core.peer import Peer
 
 
 class HeldCertificate(NamedTuple):
@@ -216,3 +217,14 @@ def _label(certificate: Certificate) -> str:
 
 def is_same_member(one: Certificate, other: Certificate) -> bool:
     return one._replace(serial=0) == other._replace(serial=0)
+
+
+def longest_down(peers: Iterable[Peer], kept: Container[bytes] = ()) -> Peer | None:
+    """The peer by certificate that gives way to a new one: of those that are down, the one last seen first.
+
+    None if all are up or ``kept``. A peer that was never up was seen when it was added.
+    """
+    down = [
+        one for one in peers if one.settings.is_certified and not one.is_up and one.settings.public_key not in kept
+    ]
+    return min(down, key=lambda one: one.sent_at if one.received_at is None else one.received_at, default=None)

@@ -16,9 +16,8 @@ from uavlinkd.authority import state_file
 from uavlinkd.authority.constants import CERTIFICATES, CONTACTS_FIRST_S
 from uavlinkd.authority.enrolment import fingerprint_of
 from uavlinkd.authority.exchange import BulletinExchange, Reaction
-from uavlinkd.authority.places import longest_down
 from uavlinkd.authority.state_file import FleetState
-from uavlinkd.authority.trust import BulletinVerdict, Pinned, Trust
+from uavlinkd.authority.trust import BulletinVerdict, Pinned, Trust, longest_down
 from uavlinkd.config.members import member_peer, most_members, relay_member
 from uavlinkd.config.model import Config, FleetConfig, PeerConfig
 from uavlinkd.core import constants as c
