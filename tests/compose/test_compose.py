@@ -48,12 +48,8 @@ async def test_containers_are_healthy_confined_and_unprivileged(cluster: Contain
     assert int(capabilities.split()[1], 16) == 0
 
 
-ATTACKS = (
-    *("bit-flip,share=0.2", "truncate,share=0.2", "extend,share=0.2", "splice,share=0.2", "tamper-tag,share=0.2"),
-    *("alter-frame,share=0.2", "counter-jump,share=0.2", "replay-data", "duplicate", "reflect", "raw-mavlink"),
-    *("forge-data", "reorder", "stranger-scan"),
-)
-"""On the data of a link that is up: some lose genuine frames, none may add one."""
+ATTACKS = ("bit-flip,share=0.2", "replay-data")
+"""On the data of a link that is up. `evaluate tampering` makes all attacks."""
 
 
 async def test_man_in_the_middle_gets_nothing_accepted(image: str, tmp_path: Path) -> None:

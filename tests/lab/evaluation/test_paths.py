@@ -10,8 +10,8 @@ import pytest
 
 from tests.lab.evaluation.quick_runs import run_quickly
 from uavlinkd.core.settings import Class
-from uavlinkd.lab.evaluation.paths_findings import GAP_LIMIT_S, PathsFindings, paths_problems, paths_summary
 from uavlinkd.lab.evaluation.paths_plan import QUICK_MEANS, STATION, VEHICLE, Means, Scenario
+from uavlinkd.lab.evaluation.paths_report import GAP_LIMIT_S, PathsFindings, paths_problems, paths_summary
 from uavlinkd.lab.evaluation.paths_run import PATHS
 from uavlinkd.lab.evaluation.paths_traffic import TrafficLog, flows_of
 from uavlinkd.lab.evaluation.records import Record, Value

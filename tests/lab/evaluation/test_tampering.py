@@ -10,9 +10,16 @@ import pytest
 
 from tests.lab.evaluation.quick_runs import run_quickly
 from uavlinkd.lab.evaluation import tampering_plan as plans
-from uavlinkd.lab.evaluation.fleet_plan import FLEET_PLANS, FLEET_RELAY_PLANS
 from uavlinkd.lab.evaluation.paper_attacks import CHANGES
-from uavlinkd.lab.evaluation.tampering_plan import LINE_PLANS, PATH_PLANS, RELAYED_PLANS, SPOILED_PLANS, TrialPlan
+from uavlinkd.lab.evaluation.tampering_plan import (
+    FLEET_PLANS,
+    FLEET_RELAY_PLANS,
+    LINE_PLANS,
+    PATH_PLANS,
+    RELAYED_PLANS,
+    SPOILED_PLANS,
+    TrialPlan,
+)
 from uavlinkd.lab.evaluation.tampering_records import NOT_IN_TIME, OURS, PAPER, RECOVERY_LIMIT_S, RELAY, Verdict
 from uavlinkd.lab.evaluation.tampering_run import TAMPERING
 from uavlinkd.lab.hostile.all_attacks import RELAY_ATTACKS

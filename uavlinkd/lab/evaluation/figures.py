@@ -16,8 +16,8 @@ from matplotlib.patches import Patch
 from uavlinkd.core.settings import Class
 from uavlinkd.lab.evaluation.flight_plan import ATTACKS, LINK_NAMES, PAIR, AttackPhase, LinkKind
 from uavlinkd.lab.evaluation.flight_report import FlightFindings
-from uavlinkd.lab.evaluation.paths_findings import PathsFindings, TrialView
 from uavlinkd.lab.evaluation.paths_plan import STALE_S, Scenario
+from uavlinkd.lab.evaluation.paths_report import PathsFindings, TrialView
 from uavlinkd.lab.evaluation.records import Record, Value
 from uavlinkd.lab.evaluation.timing_report import TimingFindings
 

@@ -6,14 +6,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 from statistics import median
 
-from uavlinkd.lab.evaluation.flight_plan import (
-    ATTACKS,
-    LINK_NAMES,
-    AttackPhase,
-    FlightSettings,
-    LinkKind,
-    Provenance,
-)
+from uavlinkd.lab.evaluation.flight_plan import ATTACKS, LINK_NAMES, AttackPhase, FlightSettings, LinkKind, Provenance
 from uavlinkd.lab.evaluation.frame import NOTHING, ReportSection, Table, duration
 from uavlinkd.lab.evaluation.records import RunRecords, Value
 

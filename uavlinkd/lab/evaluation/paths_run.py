@@ -12,7 +12,6 @@ from typing import Any, Final
 
 from uavlinkd.core.settings import Class
 from uavlinkd.lab.evaluation.frame import Evaluation, Work
-from uavlinkd.lab.evaluation.paths_findings import PathsFindings, paths_problems, paths_summary
 from uavlinkd.lab.evaluation.paths_plan import (
     DEAD_S,
     RADIOS,
@@ -24,7 +23,7 @@ from uavlinkd.lab.evaluation.paths_plan import (
     PathsSettings,
     RadioChange,
 )
-from uavlinkd.lab.evaluation.paths_report import sections
+from uavlinkd.lab.evaluation.paths_report import PathsFindings, paths_problems, paths_summary, sections
 from uavlinkd.lab.evaluation.paths_traffic import DaemonsLink, PathLink, PathRadio, TrafficLog, flows_of
 from uavlinkd.lab.evaluation.records import Record, Value
 from uavlinkd.lab.evaluation.stage import until

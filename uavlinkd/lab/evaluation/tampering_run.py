@@ -16,7 +16,6 @@ from typing import Any, Final
 from uavlinkd.core.drops import DropReason
 from uavlinkd.lab.evaluation import tampering_plan as plans
 from uavlinkd.lab.evaluation.commands import STAGES
-from uavlinkd.lab.evaluation.fleet_plan import FLEET_PLANS, FLEET_RELAY_PLANS
 from uavlinkd.lab.evaluation.fleet_stages import FleetRelayStage, FleetStage, member_attacks
 from uavlinkd.lab.evaluation.frame import Evaluation, Work, duration
 from uavlinkd.lab.evaluation.impostors import key_attacks, run_key_attack, run_paper_relay, run_sealed_cookies
@@ -89,8 +88,8 @@ _LANES: Final = {
     # The radio carries more than ten frames per second, so a lost frame was lost by the attack.
     "line": _Lane(PAIR, _rekeying(10.0, 60.0), 10.0, plans.LINE_PLANS, LineStage, MiddleLine),
     "relay": _Lane(TRIO, _rekeying(2.0, 10.0), 0.25, plans.RELAYED_PLANS, RelayStage, MiddleRelay),
-    "fleet": _Lane(PAIR, _FLEET_LINK, 50.0, FLEET_PLANS, FleetStage),
-    "fleet-relay": _Lane(TRIO, _FLEET_LINK, 50.0, FLEET_RELAY_PLANS, FleetRelayStage, MiddleRelay),
+    "fleet": _Lane(PAIR, _FLEET_LINK, 50.0, plans.FLEET_PLANS, FleetStage),
+    "fleet-relay": _Lane(TRIO, _FLEET_LINK, 50.0, plans.FLEET_RELAY_PLANS, FleetRelayStage, MiddleRelay),
 }
 
 
