@@ -22,7 +22,7 @@ from uavlinkd.lab.evaluation.tampering_plan import (
 )
 from uavlinkd.lab.evaluation.tampering_records import NOT_IN_TIME, OURS, PAPER, RECOVERY_LIMIT_S, RELAY, Verdict
 from uavlinkd.lab.evaluation.tampering_run import TAMPERING
-from uavlinkd.lab.hostile.all_attacks import RELAY_ATTACKS
+from uavlinkd.lab.hostile.relay_attacks import RELAY_ATTACKS
 from uavlinkd.lab.mitm.attack import AttackContext
 from uavlinkd.lab.mitm.attacks import ATTACKS, parse_attack
 from uavlinkd.lab.mitm.line_attacks import LINE_ATTACKS, parse_line_attack

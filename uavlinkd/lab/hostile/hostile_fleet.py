@@ -1,6 +1,6 @@
 """The part of a hostile relay that belongs to a fleet with an authority: it follows the rules, so that members stay.
 
-Its attacks falsify, hide or add records: see :mod:`.fleet_attacks`. It has no key of the authority.
+Its attacks falsify, hide or add records: see :mod:`.relay_attacks`. It has no key of the authority.
 """
 
 from __future__ import annotations

@@ -35,10 +35,8 @@ from uavlinkd.core.relay_records import (
 )
 from uavlinkd.endpoints.reader import RECEIVE_BYTES
 from uavlinkd.endpoints.sockets import send_from_new_port, udp_socket
-from uavlinkd.lab.hostile.all_attacks import ALL_ATTACKS
-from uavlinkd.lab.hostile.fleet_attacks import Withhold
 from uavlinkd.lab.hostile.hostile_fleet import HostileFleet, HostileMembership
-from uavlinkd.lab.hostile.relay_attacks import Lie, LieAboutFilters, RelayAttack, RelayContext
+from uavlinkd.lab.hostile.relay_attacks import ALL_ATTACKS, Lie, LieAboutFilters, RelayAttack, RelayContext, Withhold
 from uavlinkd.lab.mitm.attack import Action, AttackContext, AttackObject, Direction, Intervention
 from uavlinkd.lab.mitm.attack_service import ChannelService, RunSettings
 from uavlinkd.lab.mitm.attacks import AttackSpec

@@ -14,9 +14,9 @@ from uavlinkd.config.load import load_config, load_control_socket
 from uavlinkd.config.model import ConfigError, FleetConfig
 from uavlinkd.core.constants import FEATURE_FLEET, FEATURE_RECORDS
 from uavlinkd.endpoints.sockets import BindError
-from uavlinkd.lab.hostile.all_attacks import ALL_ATTACKS
 from uavlinkd.lab.hostile.hostile_fleet import HostileMembership
 from uavlinkd.lab.hostile.hostile_relay import HostileRelay, HostileRelaySettings
+from uavlinkd.lab.hostile.relay_attacks import ALL_ATTACKS
 from uavlinkd.lab.mitm.attack import AttackError
 from uavlinkd.lab.mitm.attack_service import REQUESTS
 from uavlinkd.lab.mitm.attacks import list_attacks, parse_attack
