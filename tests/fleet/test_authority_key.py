@@ -14,6 +14,7 @@ from tests.fleet.vehicles import create
 from tests.waiting import PATIENCE_S
 from uavlinkd.authority.enrolment import FleetError
 from uavlinkd.cli import main
+from uavlinkd.config.keys import KeyFileError
 from uavlinkd.core.crypto import Secret
 from uavlinkd.fleet import operations
 from uavlinkd.fleet.authority_key import (
@@ -48,11 +49,14 @@ def test_passphrase_from_a_file(file: Path, capsys: pytest.CaptureFixture[str]) 
     ask = passphrase_from(file)
     private, successor = (load_key(Path("fleet", name), ask) for name in (AUTHORITY_FILE, SUCCESSOR_FILE))
     assert private != successor
-    capsys.readouterr()
+    assert "for a later version. After a theft, create a new fleet." in capsys.readouterr().out
     assert main(["fleet", "paper", "--passphrase-file", str(file)]) == 0
     assert read_paper(capsys.readouterr().out) == private
     assert main(["fleet", "add", "v7", "--passphrase-file", str(file)]) == 0
     assert PASSPHRASE not in "".join(capsys.readouterr())
+    file.write_text("")
+    assert main(["fleet", "add", "v8", "--passphrase-file", str(file)]) == 2
+    assert capsys.readouterr().err == f"{file} is empty: it must be that of fleet/authority.pem\n"
     file.write_text("wrong\n")
     assert main(["fleet", "add", "v8", "--passphrase-file", str(file)]) == 1
     error = capsys.readouterr().err
@@ -110,6 +114,9 @@ def test_passphrase_typed_twice_on_a_terminal(tmp_path: Path) -> None:
         assert PASSPHRASE not in said
     groups = [line for line in said.splitlines() if len(line) == 34 and set(map(len, line.split())) == {4}]
     private = read_paper("\n".join(groups))
+    with pytest.raises(KeyFileError, match=r"authority.pem: exists, and keys are never overwritten: move it away"):
+        operations.restore(tmp_path / "fleet", private, None)
+    (tmp_path / "fleet" / AUTHORITY_FILE).unlink()
     operations.restore(tmp_path / "fleet", private, None)
     operations.add(tmp_path / "fleet", "v7", Identity(), passphrase_from(None))
     assert read_manifest(tmp_path / "fleet").member("v7").ids == "1"

@@ -131,6 +131,28 @@ def test_new_key_replaces_the_former_one_at_the_end(place: Path, say: Say) -> No
     assert read_manifest(place / "fleet").bulletin.revoked == (2, 3)
 
 
+def test_what_is_to_be_done_is_on_standard_error(
+    place: Path, say: Say, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """After a new key; and a command that waits for a line on a terminal says for which one."""
+    enrolled(say, "v7")
+    monkeypatch.setattr("sys.stdin", Terminal(say("enroll v7")))
+    assert main(["fleet", "sign", "--replace", "v7"]) == 0
+    error = capsys.readouterr().err
+    assert error.startswith("paste the line of `uavlinkd enroll NAME`, then press Enter\n")
+    assert "serial 2 is revoked: `enroll --finish`, then `uavlinkd fleet publish`, then restart v7\n" in error
+    monkeypatch.setattr("sys.stdin", Terminal("a"))
+    assert main(["fleet", "restore"]) == 2
+    assert capsys.readouterr().err.startswith("type both lines of the paper copy, then press Ctrl-D\n")
+
+
+class Terminal(io.StringIO):
+    """Standard input on which a person types."""
+
+    def isatty(self) -> bool:
+        return True
+
+
 def test_former_key_that_cannot_be_deleted_is_an_error(
     place: Path, say: Say, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -195,13 +217,16 @@ def test_lines_that_cannot_be_used_are_refused(
     say("enroll --finish", line)
     before = {path: path.read_bytes() for path in place.glob("*.*")}
     assert "was cut or changed" in say("enroll --finish", line[:300])
-    assert "was cut or changed" in say("enroll --finish")
+    assert say("enroll --finish") == "refused: no line arrived: see the message of `uavlinkd fleet sign`\n"
     assert "has the certificate of another key, named v8" in say("enroll --finish --config v7.toml", of_v8)
     assert "the line is of fleet" in say("enroll --finish", foreign)
     assert "is the request" in say("enroll --finish", say("enroll v7"))
     (place / "v7.next.key").unlink()
     assert "copy it again" in say("fleet sign", "uavlink-enroll-1 v7")
     assert "`uavlinkd enroll NAME`" in say("enroll")
+    assert "options of `uavlinkd enroll --finish`" in say("enroll v9 --url udpin:127.0.0.1:14999")
+    for change in ("--id 8", "--role operator", "--address 192.0.2.1:5790", "--replace v7"):
+        assert "to change it, sign the line of `uavlinkd enroll` with --replace v7" in say(f"fleet sign v7 {change}")
     assert "is not a name" in say("enroll V7")
     monkeypatch.chdir(other)
     assert "the line is for v7, and there is no v7.key: run `uavlinkd enroll NAME` here" in say(

@@ -94,11 +94,11 @@ def test_removal_without_a_daemon_says_what_is_left_to_do(tmp_path: Path, capsys
     """The member is revoked in the folder already."""
     create(tmp_path / "fleet", drones=1, relays=RELAYS)
     assert (
-        main(["fleet", "remove", "drone1", "--out", str(tmp_path / "fleet"), "--socket", str(tmp_path / "no")]) == 2
+        main(["fleet", "remove", "drone1", "--out", str(tmp_path / "fleet"), "--socket", str(tmp_path / "no")]) == 1
     )
     error = capsys.readouterr().err
     assert "drone1 is revoked in" in error
-    assert "Then run `uavlinkd fleet publish`" in error
+    assert f"Then run `uavlinkd fleet publish --socket {tmp_path / 'no'}`" in error
     assert read_manifest(tmp_path / "fleet").bulletin.revoked == (2,)
 
 

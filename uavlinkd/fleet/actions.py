@@ -47,7 +47,7 @@ def _init(options: argparse.Namespace) -> None:
     _print_result(options, result)
     _say(f"\n{options.out / AUTHORITY_FILE} signs members: back it up. Its paper copy, for a safe:")
     _say(paper_copy(private) if sys.stdout.isatty() else "(`uavlinkd fleet paper` prints it on a terminal)")
-    _say(f"Carry {options.out / SUCCESSOR_FILE} to another place: it can follow the authority's key after a theft.")
+    _say(f"Carry {options.out / SUCCESSOR_FILE} away: it is for a later version. After a theft, create a new fleet.")
 
 
 def _new_passphrase(options: argparse.Namespace) -> Passphrase | None:
@@ -59,9 +59,14 @@ def _new_passphrase(options: argparse.Namespace) -> Passphrase | None:
 
 def _sign(options: argparse.Namespace) -> None:
     if options.name is not None:
+        if options.replace or _identity(options) != Identity():
+            reason = f"this prints the line of {options.name} as it was signed"
+            raise FleetError(
+                f"{reason}: to change it, sign the line of `uavlinkd enroll` with --replace {options.name}"
+            )
         print(operations.line_of(options.out, options.name))
         return
-    request = parse_request(_line())
+    request = parse_request(_line("uavlinkd enroll NAME"))
     replaces = options.replace is not None
     if replaces and options.replace != request.name:  # a captured machine could ask for the role of another
         raise FleetError(f"the line is of {request.name}, not of {options.replace}: nothing was signed")
@@ -73,6 +78,10 @@ def _sign(options: argparse.Namespace) -> None:
     _note(
         f"fleet {fingerprint_of(result.fleet.authority.public)}: `enroll --finish` prints the same on {member.name}"
     )
+    former = [each.certificate.serial for each in result.fleet.members if each.name == member.name][:-1]
+    if replaces and former:
+        after = f"`enroll --finish`, then `uavlinkd fleet publish`, then restart {member.name}"
+        _note(f"serial {former[-1]} is revoked: {after}")
     for note in _to_carry(options, result):
         _note(note)
 
@@ -103,7 +112,8 @@ def _change(options: argparse.Namespace) -> None:
                 _say_published(operations.publish(options.out, socket, ask))
         except CommandError as error:
             reason = f"{options.name} is revoked in {options.out}, but no daemon has the bulletin: {error}"
-            raise FleetError(f"{reason}\nThen run `uavlinkd fleet publish`") from None
+            given = "".join(f" --{key} {value}" for key in ("config", "socket") if (value := getattr(options, key)))
+            raise CommandError(f"{reason}\nThen run `uavlinkd fleet publish{given}`") from None
     _print_result(options, result)
     if options.action in ("revoke", "rotate"):
         _say("Now publish the bulletin with `uavlinkd fleet publish`: until then members accept the old certificate.")
@@ -123,6 +133,7 @@ def _paper(options: argparse.Namespace) -> None:
 
 
 def _restore(options: argparse.Namespace) -> None:
+    _prompt("type both lines of the paper copy, then press Ctrl-D")
     text = sys.stdin.read(LONGEST_LINE)
     operations.restore(options.out, read_paper(text), _new_passphrase(options))
     _say(f"{options.out / AUTHORITY_FILE} is the fleet's authority.")
@@ -132,21 +143,33 @@ def _enroll(options: argparse.Namespace) -> None:
     if options.finish is None:
         if options.name is None:
             raise FleetError("name the new member: `uavlinkd enroll NAME`")
+        if options.url or options.listen:
+            raise FleetError("--url and --listen are options of `uavlinkd enroll --finish`")
         place = enrolling.MemberFiles(options.config or Path(config_file(options.name)), options.keys)
         line, key = enrolling.request(options.name, place)
         _note(f"the private key is {key}. `fleet sign` reads this line, and `enroll --finish` what that prints")
         print(line)
         return
-    finish = options.finish or _line()
+    finish = options.finish or _line("uavlinkd fleet sign")
     for text in enrolling.finish(finish, options.config, options.keys, options.url, options.listen):
         _say(text)
 
 
-def _line() -> str:
+def _line(source: str) -> str:
+    """The line that a command printed."""
+    _prompt(f"paste the line of `{source}`, then press Enter")
     try:
-        return sys.stdin.readline(LONGEST_LINE)
+        line = sys.stdin.readline(LONGEST_LINE)
     except UnicodeDecodeError:
-        return ""
+        return "?"
+    if not line.strip():
+        raise FleetError(f"no line arrived: see the message of `{source}`")
+    return line
+
+
+def _prompt(text: str) -> None:
+    if sys.stdin.isatty():
+        _note(text)
 
 
 def _print_result(options: argparse.Namespace, result: Result) -> None:

@@ -38,9 +38,8 @@ def passphrase_from(file: Path | None, *, is_new: bool = False) -> Passphrase:
             typed = _typed(f"passphrase of {what}: ")
         if not typed:
             place = f"{file} is empty" if file is not None else "the passphrase is empty"
-            raise FleetError(
-                f"{place}: choose four words or more, at random; without one, each copy of the file signs"
-            )
+            advice = "choose four words or more, at random; without one, each copy of the file signs"
+            raise FleetError(f"{place}: {advice if is_new else f'it must be that of {what}'}")
         if is_new and file is None and _typed("once more: ") != typed:
             raise FleetError("the two passphrases differ: run the command again")
         return Secret(typed)
@@ -70,7 +69,7 @@ def load_key(file: Path, ask: Passphrase) -> Secret:
         else:
             reason = "it is not a private key of Ed25519"
     raise FleetFileError(
-        f"{file} cannot be used: {reason}, or write the file from its paper copy with `uavlinkd fleet restore`"
+        f"{file} cannot be used: {reason}, or move it away and write it from its paper copy: `uavlinkd fleet restore`"
     )
 
 

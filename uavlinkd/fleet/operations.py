@@ -172,12 +172,11 @@ def revoke(folder: Path, name: str, ask: Passphrase, *, resign: bool = False) ->
 
 
 def restore(folder: Path, private: Secret, ask: Passphrase | None) -> None:
-    """Write the authority's key from its paper copy, with a new passphrase. The old file is replaced."""
+    """Write the authority's key from its paper copy, with a new passphrase, unless the file exists."""
     with _changing(folder) as (fleet, changes):
         if SigningKey(private).public != fleet.authority.public:
             raise FleetError("this paper copy is of another authority than this fleet's")
         passphrase = None if ask is None else ask(AUTHORITY_FILE)
-        changes.delete(folder / AUTHORITY_FILE)
         changes.write_secret(folder / AUTHORITY_FILE, signing_key_pem(private, passphrase, os.urandom))
 
 
