@@ -7,7 +7,7 @@ import random
 import pytest
 
 from uavlinkd.authority.constants import CERTIFICATES_PER_ANSWER, CERTIFIED_PEERS, WHO, WHO_INTERVAL_S
-from uavlinkd.link.member_questions import MemberQuestions
+from uavlinkd.link.member_questions import WHO_ROUNDS, WHO_TRIES, MemberQuestions
 
 RELAY = bytes(32)
 
@@ -24,7 +24,7 @@ def asked(questions: MemberQuestions, until: float, members: int, loss: float = 
                 continue
             for serial in range(who.after + 1, min(who.after + CERTIFICATES_PER_ANSWER, members) + 1):
                 if rng.random() >= loss:
-                    questions.note(relay, serial, now)
+                    questions.note(relay, serial, now, is_new=serial not in known)
                     known.add(serial)
     return at, known
 
@@ -39,9 +39,11 @@ def test_all_members_are_soon_known(members: int, loss: float, within_s: float) 
     at, known = asked(questions, within_s, members, loss)
     assert len(known) == members
     assert loss or len(at) <= WHO.burst
-    later, _ = asked(questions, 10 * WHO_INTERVAL_S, members)
-    pages = members // CERTIFICATES_PER_ANSWER + 2
-    assert len([moment for moment in later if moment > 2 * WHO_INTERVAL_S]) <= 12 * pages
+    asked(questions, WHO_INTERVAL_S, members)
+    assert questions.next_at > WHO_INTERVAL_S
+    questions.note(RELAY, members + 1, WHO_INTERVAL_S, is_new=True)  # an introduction
+    later, _ = asked(questions, 3 * WHO_INTERVAL_S, members)
+    assert len(later) <= 2 * WHO_ROUNDS * (members // CERTIFICATES_PER_ANSWER + WHO_TRIES + 1)
     questions.begin(RELAY, 10 * WHO_INTERVAL_S)  # a new session with it
     assert questions.next_at > 10 * WHO_INTERVAL_S
     questions.end(RELAY)

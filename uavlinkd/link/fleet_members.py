@@ -303,7 +303,8 @@ class FleetMembers:
         if not limit.take(now):
             raise Drop(DropReason.RECORD_OVER_LIMIT)
         # One that is refused counts too: otherwise those with higher serials would never be asked for.
-        self._questions.note(sender, parse_certificate(record.certificate).serial, now)
+        serial = parse_certificate(record.certificate).serial
+        self._questions.note(sender, serial, now, is_new=record.key not in self.trust.held)
         if not is_usable_public_key(record.key):  # a stolen authority's key can sign it; an initiation would raise
             raise Drop(DropReason.BAD_CERTIFICATE)
         self._hold(record.key, record.certificate, now, needs_policy=True)

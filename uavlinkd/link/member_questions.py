@@ -11,16 +11,20 @@ from uavlinkd.core.constants import NEVER
 from uavlinkd.core.relay_records import Who
 
 WHO_SOON_S: Final = 0.5
-"""Between questions, and between the first two rounds; then between rounds each time twice as long."""
+"""Between two questions of a round, and between rounds while they find members."""
 
 WHO_TRIES: Final = 2
 """A round ends after so many questions without an answer: one may be lost."""
+
+WHO_ROUNDS: Final = 3
+"""After so many that found no other member, the next one follows after `WHO_INTERVAL_S`."""
 
 
 @dataclass(slots=True)
 class _Asking:
     due_at: float
     rounds: int = 0
+    """That ended since one found a member."""
     tries: int = 0
     """Of the last question."""
     after: int = 0
@@ -62,13 +66,20 @@ class MemberQuestions:
                     asking.rounds += 1
                 yield relay, Who(roles, asking.after)
                 asking.tries, asking.received = asking.tries + 1, 0
-                doubled = 0 if asking.tries < WHO_TRIES else min(asking.rounds, 8)
-                asking.due_at = now + min(WHO_INTERVAL_S, WHO_SOON_S * 2.0**doubled)
+                is_rest = asking.tries == WHO_TRIES and asking.rounds >= WHO_ROUNDS
+                asking.due_at = now + (WHO_INTERVAL_S if is_rest else WHO_SOON_S)
 
-    def note(self, relay: bytes, serial: int, now: float) -> None:
-        """A relay sent the certificate with this serial. Ask for the others: at once if the answer was full."""
-        if (asking := self._askings.get(relay)) is not None:
-            asking.received += 1
-            asking.after = max(asking.after, serial)
-            soon = 0.0 if asking.received == CERTIFICATES_PER_ANSWER else WHO_SOON_S
-            asking.due_at = min(asking.due_at, now + soon)
+    def note(self, relay: bytes, serial: int, now: float, *, is_new: bool) -> None:
+        """A relay sent the certificate with this serial. Ask for the others: at once if the answer was full.
+
+        Without a question it is an introduction, which has no effect here.
+        """
+        asking = self._askings.get(relay)
+        if asking is None or asking.due_at > now + WHO_SOON_S:
+            return
+        asking.received += 1
+        asking.after = max(asking.after, serial)
+        if is_new:
+            asking.rounds = 0
+        soon = 0.0 if asking.received == CERTIFICATES_PER_ANSWER else WHO_SOON_S
+        asking.due_at = min(asking.due_at, now + soon)
