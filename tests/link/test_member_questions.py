@@ -24,7 +24,9 @@ def asked(questions: MemberQuestions, until: float, members: int, loss: float = 
                 continue
             for serial in range(who.after + 1, min(who.after + CERTIFICATES_PER_ANSWER, members) + 1):
                 if rng.random() >= loss:
-                    questions.note(relay, serial, now, is_new=serial not in known)
+                    questions.note(relay, serial, now)
+                    if serial not in known:
+                        questions.found(relay)
                     known.add(serial)
     return at, known
 
@@ -41,10 +43,10 @@ def test_all_members_are_soon_known(members: int, loss: float, within_s: float) 
     assert loss or len(at) <= WHO.burst
     asked(questions, WHO_INTERVAL_S, members)
     assert questions.next_at > WHO_INTERVAL_S
-    questions.note(RELAY, members + 1, WHO_INTERVAL_S, is_new=True)  # an introduction
+    questions.note(RELAY, members + 1, WHO_INTERVAL_S)  # an introduction
     later, _ = asked(questions, 3 * WHO_INTERVAL_S, members)
     assert len(later) <= 2 * WHO_ROUNDS * (members // CERTIFICATES_PER_ANSWER + WHO_TRIES + 1)
-    questions.begin(RELAY, 10 * WHO_INTERVAL_S)  # a new session with it
-    assert questions.next_at > 10 * WHO_INTERVAL_S
+    questions.begin(RELAY, 3 * WHO_INTERVAL_S)  # a new session with it
+    assert questions.next_at > 3 * WHO_INTERVAL_S
     questions.end(RELAY)
     assert asked(questions, 9e9, members) == ([], set())

@@ -7,7 +7,7 @@ sends that until the peer states that it has it. The static public key of a peer
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import inf
 from typing import NamedTuple
 
@@ -47,7 +47,8 @@ class _Peer:
     owes_have: bool = False  # whether this end has to state what it has
     have_sent_at: float = -inf
     bulletin_verified_at: float = -inf
-    certificate_verified_at: float = -inf
+    certificate_verified_at: dict[bytes, float] = field(default_factory=dict)
+    """By the key that it certifies: the peer's or the own one."""
 
     @property
     def next_at(self) -> float:
@@ -185,11 +186,13 @@ class BulletinExchange:
         self._note(peer)
         if record.certificate == held.data:
             return Reaction()
-        if now < peer.certificate_verified_at + c.BULLETIN_LEAST_S:
+        if now < peer.certificate_verified_at.get(record.key, -inf) + c.BULLETIN_LEAST_S:
             raise Drop(DropReason.RECORD_OVER_LIMIT)
-        peer.certificate_verified_at = now
+        peer.certificate_verified_at[record.key] = now
         if not is_own:
             ended = trust.hold(key, record.certificate)
+            if key in ended:  # it has another name, role or ids now: it has to show that in a handshake
+                del trust.held[key]
             for other in ended:
                 self.forget(other)
             return Reaction(tuple(ended))
@@ -264,13 +267,14 @@ class BulletinExchange:
         if have is None:
             return []
         records: list[FleetRecord] = []
-        if peer.has < trust.bulletin.number:
-            records.append(BulletinRecord(trust.bulletin_bytes))
         held, own = trust.held.get(key), trust.own
         if held is not None and have.serial < held.certificate.serial:
             records.append(CertificateRecord(key, held.data))
         if own is not None and 0 < have.known < own.certificate.serial:
             records.append(CertificateRecord(trust.own_key, own.data))
+        # The bulletin may refuse the certificates that these replace. Then the peer could not get them afterwards.
+        if peer.has < trust.bulletin.number and (not records or peer.tries >= c.PUSH_TRIES):
+            records.append(BulletinRecord(trust.bulletin_bytes))
         return records
 
     def _asks(self, peer: _Peer) -> bool:

@@ -83,7 +83,8 @@ class Trust:
             certificate = parse_certificate(data)
         except Drop:
             return False
-        is_newer = self.own is None or certificate.serial > self.own.certificate.serial
+        serial = certificate.serial
+        is_newer = self.own is None or (serial > self.own.certificate.serial and not self.bulletin.refuses(serial))
         if not is_newer or not self._is_signed(certificate, self.own_key, data):
             return False
         self.own = HeldCertificate(certificate, data)
@@ -146,7 +147,7 @@ class Trust:
         return ended
 
     def _conflict(self, key: bytes, certificate: Certificate) -> str | None:
-        """Which other member has the name or a system id of this one. Of one name the highest serial counts."""
+        """Which other member has the name or a system id of this one. The highest serial counts."""
         pinned, ids = self.pinned, certificate.systems
         if certificate.name in pinned.names:
             return f"the peer {certificate.name} of the configuration"
@@ -156,7 +157,7 @@ class Trust:
         if self.own is not None and self._overlap(self.own.certificate, certificate):
             return "this daemon's own certificate"
         for _, held in self._rivals(key, certificate):
-            if held.serial >= certificate.serial or held.name != certificate.name:
+            if held.serial >= certificate.serial:
                 return _label(held)
         return None
 

@@ -303,13 +303,13 @@ class FleetMembers:
         if not limit.take(now):
             raise Drop(DropReason.RECORD_OVER_LIMIT)
         # One that is refused counts too: otherwise those with higher serials would never be asked for.
-        serial = parse_certificate(record.certificate).serial
-        self._questions.note(sender, serial, now, is_new=record.key not in self.trust.held)
+        self._questions.note(sender, parse_certificate(record.certificate).serial, now)
         if not is_usable_public_key(record.key):  # a stolen authority's key can sign it; an initiation would raise
             raise Drop(DropReason.BAD_CERTIFICATE)
         self._hold(record.key, record.certificate, now, needs_policy=True)
         peer = self._node.find(record.key)
         if peer is None or peer.provisional_until != c.NEVER:
+            self._questions.found(sender)
             self._join(record.key, peer, now)
 
     def publish(self, signed: str, now: float) -> dict[str, object]:
@@ -406,9 +406,7 @@ class FleetMembers:
 
     def _end(self, key: bytes, now: float) -> None:
         """Nothing of this key is accepted any more. It gets no close: it is not a peer."""
-        self.exchange.forget(key)
-        self._questions.end(key)
-        self._limits.pop(key, None)
+        self.forget(key)
         if self._relay is not None:
             self._relay.end(key, now)
         for name, relay in list(self._relays.by_name.items()):
@@ -418,6 +416,12 @@ class FleetMembers:
             self._membership.remove_member(name)
         if (peer := self._node.find(key)) is not None:
             self._node.remove_peer(peer, now, closes=False)
+
+    def forget(self, key: bytes) -> None:
+        """A peer or relay with this key is gone."""
+        self.exchange.forget(key)
+        self._questions.end(key)
+        self._limits.pop(key, None)
 
     # The disk.
 

@@ -69,7 +69,7 @@ class MemberQuestions:
                 is_rest = asking.tries == WHO_TRIES and asking.rounds >= WHO_ROUNDS
                 asking.due_at = now + (WHO_INTERVAL_S if is_rest else WHO_SOON_S)
 
-    def note(self, relay: bytes, serial: int, now: float, *, is_new: bool) -> None:
+    def note(self, relay: bytes, serial: int, now: float) -> None:
         """A relay sent the certificate with this serial. Ask for the others: at once if the answer was full.
 
         Without a question it is an introduction, which has no effect here.
@@ -79,7 +79,10 @@ class MemberQuestions:
             return
         asking.received += 1
         asking.after = max(asking.after, serial)
-        if is_new:
-            asking.rounds = 0
         soon = 0.0 if asking.received == CERTIFICATES_PER_ANSWER else WHO_SOON_S
         asking.due_at = min(asking.due_at, now + soon)
+
+    def found(self, relay: bytes) -> None:
+        """That certificate is accepted, and of a member that was not here."""
+        if (asking := self._askings.get(relay)) is not None:
+            asking.rounds = 0

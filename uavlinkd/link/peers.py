@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from uavlinkd.config.changes import ConfigChanges
-from uavlinkd.config.model import Config, PeerConfig, RelayConfig
+from uavlinkd.config.model import Config, PeerConfig
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.settings import PeerSettings
 from uavlinkd.link.fleet_members import FleetMembers, FleetShell
@@ -33,7 +31,7 @@ class Peers:
         config = self._parts.config
         for peer in config.peers:
             self._add_peer(peer)
-        self._add_relays(config.relays)
+        self._add_relays()
         self._follow_members()
 
     # Members of the fleet: see :class:`.fleet_members.Membership`.
@@ -41,6 +39,7 @@ class Peers:
     def add_member(self, config: PeerConfig, peer: Peer | None) -> None:
         """Carry frames to a member by certificate. ``peer``: it is in the core already."""
         self._add_peer(config, peer)
+        self._add_relays()  # a contact that is back may be one
         self._follow_members()
 
     def remove_member(self, name: str) -> None:
@@ -61,7 +60,7 @@ class Peers:
         for name in changes.removed_relays:
             if (used := parts.relays.by_name.get(name)) is not None:  # else a bulletin revoked it
                 if parts.fleet is not None:
-                    parts.fleet.exchange.forget(used.peer.settings.public_key)
+                    parts.fleet.forget(used.peer.settings.public_key)
                 perform(parts.relays.remove(name, monotonic()))
         for name in changes.removed_peers:
             if (link := parts.links.get(name)) is not None and link.key == keys[name]:
@@ -79,7 +78,7 @@ class Peers:
         for peer in config.peers:
             if peer.name not in parts.links:
                 self._add_peer(peer)
-        self._add_relays([relay for relay in config.relays if relay.name not in parts.relays.by_name])
+        self._add_relays()
         self._follow_members()
 
     def summary(self) -> str:
@@ -94,13 +93,14 @@ class Peers:
 
     # Parts.
 
-    def _add_relays(self, configs: Sequence[RelayConfig]) -> None:
-        """Call it after the peers are there: a relay may be one of them."""
-        for config in configs:
-            if self._is_accepted(config.settings):
-                self._parts.relays.add(config, monotonic())
-        if configs:
-            self._parts.relays.follow_links(monotonic())
+    def _add_relays(self) -> None:
+        """Use those of the configuration that are missing. Call it after the peers are there: a relay may be one."""
+        parts = self._parts
+        missing = [config for config in parts.config.relays if config.name not in parts.relays.by_name]
+        for config in filter(lambda config: self._is_accepted(config.settings), missing):
+            parts.relays.add(config, monotonic())
+        if missing:
+            parts.relays.follow_links(monotonic())
 
     def _is_accepted(self, settings: PeerSettings) -> bool:
         """Whether no bulletin revokes this peer or relay of the configuration."""
@@ -128,7 +128,7 @@ class Peers:
         parts.switch.remove(link)
         link.leave(monotonic(), closes=closes)
         if parts.fleet is not None:
-            parts.fleet.exchange.forget(link.key)
+            parts.fleet.forget(link.key)
         del parts.links[name]
         self._map_peers()
         self._note_delays()
