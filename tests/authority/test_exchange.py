@@ -106,7 +106,7 @@ def test_peer_with_an_older_bulletin() -> None:
 
 
 def test_flood_of_have() -> None:
-    """Different ones cause a bulletin for each wait, and *have* ten times a second at most."""
+    """Different ones cause what the peer lacks for each wait, and *have* ten times a second at most."""
     daemon = Daemon(NEW)
     daemon.up()
     sent: list[FleetRecord] = []
@@ -114,7 +114,7 @@ def test_flood_of_have() -> None:
         now = NOW + step / 1000
         daemon.receive(have(OLD, serial=step % 20, known=step % 3 * 9), now)
         sent += [record for _, record in daemon.exchange.do_due(now)]
-    assert 15 <= sum(isinstance(record, BulletinRecord) for record in sent) <= 21
+    assert 15 <= sum(record == CertificateRecord(PEER, CERTIFICATES[PEER]) for record in sent) <= 21
     assert sum(isinstance(record, Have) for record in sent) <= 101
     assert len(sent) <= 101 + 3 * 21
 
@@ -295,6 +295,20 @@ def test_peer_that_lacks_its_newer_certificate() -> None:
     assert daemon.hour(NOW + 1) == []
 
 
+def test_certificates_come_before_the_bulletin_that_refuses_older_ones() -> None:
+    """A peer without a link while all were signed again could not get them later. One that takes none gets it too."""
+    daemon = Daemon(NEW)
+    daemon.up()
+    daemon.receive(have(OLD, serial=7, known=9))
+    certificates = [CertificateRecord(PEER, CERTIFICATES[PEER]), CertificateRecord(OWN, signed(vehicle(1, 10), OWN))]
+    assert [record for _, record in daemon.due(NOW)] == certificates
+    daemon.receive(have(OLD), NOW + WAIT_S)
+    assert daemon.due(NOW + WAIT_S) == [(PEER, BulletinRecord(NEW))]
+    daemon.receive(have(OLD, serial=7), NOW + 2)
+    given_at = next(at for at, _, record in daemon.hour(NOW + 2) if record == BulletinRecord(NEW))
+    assert given_at == WAIT_S * (c.PUSH_TRIES - 1)
+
+
 def test_peer_that_holds_an_older_own_certificate() -> None:
     """It gets the newer one; a peer that holds none does not need it."""
     daemon = Daemon()
@@ -331,6 +345,7 @@ def test_newer_certificate_of_the_sender() -> None:
     assert daemon.receive(CertificateRecord(PEER, signed(vehicle(2, 21), PEER))) == Reaction()
     assert daemon.due(NOW + 1) == [(PEER, MINE._replace(known=21))]
     assert daemon.receive(CertificateRecord(PEER, signed(vehicle(4, 22), PEER)), NOW + 1) == Reaction((PEER,))
+    assert PEER not in daemon.trust.held
     assert daemon.hour(NOW + 1) == []
 
 
@@ -345,12 +360,14 @@ def test_newer_certificate_of_the_sender() -> None:
     ],
 )
 def test_certificate_that_is_refused(record: FleetRecord, reason: DropReason) -> None:
-    """One signature a second is verified. The held bytes need none."""
+    """One signature a second is verified for each of the two keys. The held bytes need none."""
     daemon = Daemon()
     daemon.up()
     assert daemon.drop(record) is reason
-    if reason is DropReason.BAD_CERTIFICATE:
-        assert daemon.drop(CertificateRecord(OWN, bytes(100)), NOW + 0.9) is DropReason.RECORD_OVER_LIMIT
+    if isinstance(record, CertificateRecord) and reason is DropReason.BAD_CERTIFICATE:
+        other = PEER if record.key == OWN else OWN
+        assert daemon.drop(CertificateRecord(record.key, bytes(100)), NOW + 0.9) is DropReason.RECORD_OVER_LIMIT
+        assert daemon.drop(CertificateRecord(other, bytes(100)), NOW - 1) is DropReason.BAD_CERTIFICATE
         assert daemon.receive(CertificateRecord(PEER, CERTIFICATES[PEER]), NOW + 0.9) == Reaction()
         assert daemon.receive(CertificateRecord(OWN, signed(vehicle(1, 11), OWN)), NOW + 1).persists
 

@@ -95,7 +95,7 @@ def test_own_certificate_is_replaced_by_a_newer_one() -> None:
         ),
         pytest.param(signed(vehicle(14, 39), KEY), DropReason.MEMBER_CONFLICT, id="older than that of its member"),
         pytest.param(
-            signed(Certificate(FLEET, 41, MemberRole.VEHICLE, (13, 15), "v13"), KEY),
+            signed(Certificate(FLEET, 39, MemberRole.VEHICLE, (13, 15), "v13"), KEY),
             DropReason.MEMBER_CONFLICT,
             id="range with the id of another member",
         ),
@@ -162,9 +162,10 @@ def test_member_that_is_given_up_reserves_nothing() -> None:
     known.hold(KEY, signed(wide, KEY))
     del known.held[bytes([7]) * 32]
     known.hold(bytes([9]) * 32, signed(vehicle(7, 30), bytes([9]) * 32))
-    inside = Certificate(FLEET, 40, MemberRole.VEHICLE, (210, 211), "v210")
+    inside = Certificate(FLEET, 19, MemberRole.VEHICLE, (210, 211), "v210")
     assert refused(known, bytes([6]) * 32, signed(inside, bytes([6]) * 32)) is DropReason.MEMBER_CONFLICT
     assert refused(known, bytes([6]) * 32, signed(vehicle(8), bytes([6]) * 32)) is DropReason.MEMBER_CONFLICT
+    assert known.hold(bytes([6]) * 32, signed(inside._replace(serial=21), bytes([6]) * 32)) == [KEY]
 
 
 def test_held_bytes_are_not_verified_again(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -273,7 +273,7 @@ class BulletinExchange:
         if own is not None and 0 < have.known < own.certificate.serial:
             records.append(CertificateRecord(trust.own_key, own.data))
         # The bulletin may refuse the certificates that these replace. Then the peer could not get them afterwards.
-        if peer.has < trust.bulletin.number and (not records or peer.tries >= c.PUSH_TRIES):
+        if peer.has < trust.bulletin.number and (not records or peer.tries >= c.PUSH_TRIES - 1):
             records.append(BulletinRecord(trust.bulletin_bytes))
         return records
 

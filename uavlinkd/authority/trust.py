@@ -83,8 +83,7 @@ class Trust:
             certificate = parse_certificate(data)
         except Drop:
             return False
-        serial = certificate.serial
-        is_newer = self.own is None or (serial > self.own.certificate.serial and not self.bulletin.refuses(serial))
+        is_newer = self.own is None or certificate.serial > self.own.certificate.serial
         if not is_newer or not self._is_signed(certificate, self.own_key, data):
             return False
         self.own = HeldCertificate(certificate, data)
