@@ -7,14 +7,13 @@ configuration changes, or when the daemon holds too many.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final, Protocol
 
 from uavlinkd.authority import state_file
 from uavlinkd.authority.constants import CERTIFICATES, CONTACTS_FIRST_S
-from uavlinkd.authority.enrolment import fingerprint_of
 from uavlinkd.authority.exchange import BulletinExchange, Reaction
 from uavlinkd.authority.state_file import FleetState
 from uavlinkd.authority.trust import BulletinVerdict, Pinned, Trust, longest_down
@@ -78,7 +77,7 @@ class FleetMembers:
     """
 
     def __init__(self, config: Config, fleet: FleetConfig, daemon: FleetShell) -> None:
-        self._fleet = fleet
+        self.config = fleet
         self._node = daemon.node
         self._links = daemon.links
         self._relays = daemon.relays
@@ -115,7 +114,7 @@ class FleetMembers:
         for key, record in self.exchange.do_due(now):
             self._send(key, record, now)
         if self._has_required and now >= self._settled_at:
-            for key, who in self._questions.pop_due(role_bits(self._fleet.call), now):
+            for key, who in self._questions.pop_due(role_bits(self.config.call), now):
                 self._send(key, who, now)
         if now >= self._disk.again_at:
             self._disk.write()
@@ -124,7 +123,7 @@ class FleetMembers:
 
     def follow(self, config: Config, fleet: FleetConfig, now: float) -> None:
         """Apply a new configuration. Call it before its peers are added, which may have names and keys of members."""
-        before, self._fleet = self._fleet, fleet
+        before, self.config = self.config, fleet
         old, new = ({contact.key for contact in one.contacts} for one in (before, fleet))
         leaving = {link.key for link in self._links.values()}  # with the configuration, as relays do
         leaving |= {relay.config.settings.public_key for relay in self._relays.by_name.values()}
@@ -170,20 +169,20 @@ class FleetMembers:
         )
 
     def _hold_contacts(self, now: float) -> None:
-        for contact in self._fleet.contacts:
+        for contact in self.config.contacts:
             with suppress(Drop):  # a finding shows it
                 for ended in self.trust.hold(contact.key, contact.certificate):
                     self._end(ended, now)
 
     def _is_contact(self, key: bytes) -> bool:
-        return self._fleet.contact(key) is not None
+        return self.config.contact(key) is not None
 
     def _is_wanted(self, certificate: Certificate) -> bool:
         """Whether members with this role have a policy here, or this daemon is their relay."""
-        return self._relay is not None or certificate.role in self._fleet.policies
+        return self._relay is not None or certificate.role in self.config.policies
 
     def _config_of(self, key: bytes) -> PeerConfig:
-        return member_peer(self._fleet, key, self.trust.held[key].certificate)
+        return member_peer(self.config, key, self.trust.held[key].certificate)
 
     # Members.
 
@@ -197,14 +196,14 @@ class FleetMembers:
             certificate = self._hold(key, data, now, needs_policy=self._relay is None)
         except Drop as drop:
             raise Drop(drop.reason, drop.detail or key) from None
-        if certificate.role in self._fleet.policies:
+        if certificate.role in self.config.policies:
             return self._config_of(key).settings
-        return relay_member(self._fleet, key, certificate).peer
+        return relay_member(self.config, key, certificate).peer
 
     def _hold(self, key: bytes, data: bytes, now: float, *, needs_policy: bool) -> Certificate:
         """Hold a certificate that is valid and wanted, and not too early or one too many. Raises Drop."""
         certificate = self.trust.judge(key, data)
-        has_policy = certificate.role in self._fleet.policies
+        has_policy = certificate.role in self.config.policies
         if needs_policy and not has_policy:
             role = certificate.role.name.lower()
             raise Drop(DropReason.ROLE_NOT_ACCEPTED, f"{certificate.name} (role {role})")
@@ -219,13 +218,13 @@ class FleetMembers:
 
     @property
     def _has_required(self) -> bool:
-        return self.trust.bulletin.number >= self._fleet.required_bulletin
+        return self.trust.bulletin.number >= self.config.required_bulletin
 
     def _make_room(self, now: float) -> None:
         """Give up the member that is down for longest, if there are as many as may be."""
         if len(self.trust.held) < self._most_members:
             return
-        contacts = {contact.key for contact in self._fleet.contacts}
+        contacts = {contact.key for contact in self.config.contacts}
         if (peer := longest_down(self._node.peers.values(), contacts)) is None:
             raise Drop(DropReason.TOO_MANY_MEMBERS)
         key = peer.settings.public_key
@@ -245,7 +244,7 @@ class FleetMembers:
             case o.SessionEstablished() | o.PeerUp() if peer.session_with(c.FEATURE_FLEET, now) is not None:
                 self._serve(key, now)  # a contact comes without an admission
                 self.exchange.on_handshake(key, now)
-                if self._fleet.call and any(relay.peer is peer for relay in self._relays.by_name.values()):
+                if self.config.call and any(relay.peer is peer for relay in self._relays.by_name.values()):
                     self._questions.begin(key, now)
             case o.PeerLost() | o.PeerClosed():
                 self.exchange.on_down(key)
@@ -261,7 +260,7 @@ class FleetMembers:
         """A member is here, or is introduced: make a link with it, and let it use the relay of this daemon."""
         if peer is not None:
             self._node.accept(peer)
-        if self.trust.held[key].certificate.role in self._fleet.policies:
+        if self.trust.held[key].certificate.role in self.config.policies:
             self._membership.add_member(self._config_of(key), peer)
         self._serve(key, now)
 
@@ -269,8 +268,8 @@ class FleetMembers:
         """Let a member use the relay of this daemon, if there is one, within the present limits."""
         peer, held = self._node.find(key), self.trust.held.get(key)
         if self._relay is not None and peer is not None and held is not None:
-            is_own = held.certificate.role not in self._fleet.policies and not self._is_contact(key)
-            self._relay.admit(peer, relay_member(self._fleet, key, held.certificate), held, now, is_own=is_own)
+            is_own = held.certificate.role not in self.config.policies and not self._is_contact(key)
+            self._relay.admit(peer, relay_member(self.config, key, held.certificate), held, now, is_own=is_own)
 
     # Records.
 
@@ -358,49 +357,14 @@ class FleetMembers:
         if (peer := self._node.find(key)) is not None:
             self._perform(self._node.send_record(peer, None, record, now))
 
-    def status(self, now: float) -> dict[str, object]:
-        """What this daemon knows of its fleet. ``events``: their age in seconds. ``bulletins``: the number that each
-        peer stated.
-        """
-        trust = self.trust
-        own = None if trust.own is None else trust.own.certificate
-        return {
-            "fleet": fingerprint_of(self._fleet.authority.public),
-            "name": own and own.name,
-            "role": own and own.role.name.lower(),
-            "serial": own and own.serial,
-            "is_revoked": own is not None and trust.bulletin.refuses(own.serial),
-            "number": trust.bulletin.number,
-            "least": trust.bulletin.least,
-            "revoked": list(trust.bulletin.revoked),
-            "held": {held.certificate.name: held.certificate.serial for held in trust.held.values()},
-            "bulletins": {name: self.exchange.shown(link.key) for name, link in self._links.items()},
-            "problem": self.problem,
-            "events": {name: now - self._events[name][0] for name in self.noticed(now)},
-        }
-
     @property
     def problem(self) -> str:
         """Why the state on the disk was not used at the start, or is not written; empty if all is well."""
         return self._disk.problem or self._unread
 
-    @property
-    def required_bulletin(self) -> int:
-        """Below this number no member is accepted."""
-        return self._fleet.required_bulletin
-
-    def noticed(self, now: float) -> dict[str, str]:
-        """Recent events of bulletins, each with the name of the peer that caused it last."""
-        return {event: who for event, (at, who) in self._events.items() if now < at + EVENT_S}
-
-    def refused_contacts(self) -> Iterator[tuple[str, DropReason]]:
-        """The contacts of the configuration that are not accepted, with their serials, and why."""
-        for contact in self._fleet.contacts:
-            if contact.key not in self.trust.held:
-                try:
-                    self.trust.judge(contact.key, contact.certificate)
-                except Drop as drop:
-                    yield (drop.detail if isinstance(drop.detail, str) else contact.name), drop.reason
+    def noticed(self, now: float) -> dict[str, tuple[float, str]]:
+        """Recent events of bulletins: when each was noticed last, and the name of the peer that caused it."""
+        return {event: noticed for event, noticed in self._events.items() if now < noticed[0] + EVENT_S}
 
     # Ends.
 
@@ -427,7 +391,7 @@ class FleetMembers:
 
     def _state(self) -> FleetState:
         held = self.trust.held
-        contacts = tuple((one.key, held[one.key].data) for one in self._fleet.contacts if one.key in held)
+        contacts = tuple((one.key, held[one.key].data) for one in self.config.contacts if one.key in held)
         own = b"" if self.trust.own is None else self.trust.own.data
         return FleetState(self.trust.bulletin_bytes, own, contacts)
 

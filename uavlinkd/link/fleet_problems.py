@@ -6,7 +6,7 @@ from collections.abc import Container, Iterator
 
 from uavlinkd.authority.exchange import ROLLED_BACK
 from uavlinkd.authority.trust import BulletinVerdict
-from uavlinkd.core.drops import Detail, DropReason
+from uavlinkd.core.drops import Detail, Drop, DropReason
 from uavlinkd.core.path import SocketAddress
 from uavlinkd.link.facts import Found, Moment, PeerFacts, details_at, fault, security, warning
 
@@ -23,18 +23,23 @@ def fleet_problems(moment: Moment) -> Iterator[Found]:
             f" {trust.own.certificate.serial}): members refuse it",
             "if this machine was not captured, run `uavlinkd enroll` here again and let the authority sign its line",
         )
-    for name, reason in fleet.refused_contacts():
-        yield fault(
-            "contact_refused",
-            f"the contact {name} is refused: {reason.meaning}",
-            "if it was not captured, let the authority sign it again, and write that certificate into its [[contact]]"
-            " here and into its own file; else write another contact",
-        )
-    if number < fleet.required_bulletin:
+    for contact in fleet.config.contacts:
+        if contact.key not in trust.held:
+            try:
+                trust.judge(contact.key, contact.certificate)
+            except Drop as drop:
+                name = drop.detail if isinstance(drop.detail, str) else contact.name
+                yield fault(
+                    "contact_refused",
+                    f"the contact {name} is refused: {drop.reason.meaning}",
+                    "if it was not captured, let the authority sign it again, and write that certificate into its"
+                    " [[contact]] here and into its own file; else write another contact",
+                )
+    if number < fleet.config.required_bulletin:
         yield fault(
             "bulletin_awaited",
             f"this daemon accepts no member by certificate: its bulletin is {number}, and require_bulletin is"
-            f" {fleet.required_bulletin}",
+            f" {fleet.config.required_bulletin}",
             "run `uavlinkd fleet publish` where this daemon is reachable, or connect it to a pinned peer that has it",
         )
     if fleet.problem:
@@ -47,24 +52,25 @@ def fleet_problems(moment: Moment) -> Iterator[Found]:
     yield from _refused(moment, trust.held)
 
 
-def _bulletins(noticed: dict[str, str]) -> Iterator[Found]:
-    """``noticed``: each event with the name of the peer that caused it last."""
+def _bulletins(noticed: dict[str, tuple[float, str]]) -> Iterator[Found]:
+    """``noticed``: each event with its time, and the name of the peer that caused it last."""
+    by = {event: who for event, (_, who) in noticed.items()}
     merged = "compare both folders of the authority; publish one with a higher number that revokes what both do"
-    if who := noticed.get(BulletinVerdict.CONFLICT.value):
+    if who := by.get(BulletinVerdict.CONFLICT.value):
         yield security(
             "bulletin_conflict",
             f"{who} has another bulletin of the same number: two copies of the authority's key are in use, or it is"
             " stolen. This daemon keeps its own one",
             merged,
         )
-    if who := noticed.get(BulletinVerdict.SHRINKS.value):
+    if who := by.get(BulletinVerdict.SHRINKS.value):
         yield security(
             "bulletin_shrinks",
             f"{who} sent a newer bulletin that accepts revoked members again, which this daemon refused: two copies"
             " of the authority's key are in use, or it is stolen",
             merged,
         )
-    if who := noticed.get(ROLLED_BACK):
+    if who := by.get(ROLLED_BACK):
         yield warning(
             "bulletin_rolled_back",
             f"{who} has an older bulletin than it had: its disk was restored, or a second machine has its key",

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
+from uavlinkd.authority.enrolment import fingerprint_of
 from uavlinkd.config.keys import encode_key
 from uavlinkd.core.path import Path, SocketAddress, relay_name
 from uavlinkd.core.path_state import PathState
 from uavlinkd.core.peer import Peer
 from uavlinkd.endpoints.ports import Endpoint
 from uavlinkd.link.diagnosis import find
+from uavlinkd.link.fleet_members import FleetMembers
 from uavlinkd.link.own_problems import codes_there, name_of_problem, stops_frames
 from uavlinkd.link.parts import DaemonParts
 from uavlinkd.link.peer_link import PeerLink
@@ -56,7 +58,7 @@ def daemon_status(daemon: DaemonParts, now: float) -> dict[str, object]:
         "findings": [finding.as_json() for finding in findings],
         "peers": {name: peer_status(link, now, daemon.peer_sockets.way_of) for name, link in daemon.links.items()},
         "relays": {name: used_relay_status(relay, daemon, now) for name, relay in daemon.relays.by_name.items()},
-        "fleet": None if daemon.fleet is None else daemon.fleet.status(now),
+        "fleet": None if daemon.fleet is None else fleet_status(daemon.fleet, daemon.links, now),
         "networks": daemon.peer_sockets.network_status(now),
         "endpoints": {
             endpoint.name: endpoint_status(endpoint, daemon.local.policies[endpoint.name], now)
@@ -91,6 +93,28 @@ def _counts(counts: Mapping[Any, int]) -> dict[str, int]:
 
 def _age(at: float | None, now: float) -> float | None:
     return None if at is None else now - at
+
+
+def fleet_status(fleet: FleetMembers, links: Mapping[str, PeerLink], now: float) -> dict[str, object]:
+    """What a daemon knows of its fleet. ``events``: their age in seconds. ``bulletins``: the number that each peer
+    stated.
+    """
+    trust = fleet.trust
+    own = None if trust.own is None else trust.own.certificate
+    return {
+        "fleet": fingerprint_of(fleet.config.authority.public),
+        "name": own and own.name,
+        "role": own and own.role.name.lower(),
+        "serial": own and own.serial,
+        "is_revoked": own is not None and trust.bulletin.refuses(own.serial),
+        "number": trust.bulletin.number,
+        "least": trust.bulletin.least,
+        "revoked": list(trust.bulletin.revoked),
+        "held": {held.certificate.name: held.certificate.serial for held in trust.held.values()},
+        "bulletins": {name: fleet.exchange.shown(link.key) for name, link in links.items()},
+        "problem": fleet.problem,
+        "events": {name: now - at for name, (at, _) in fleet.noticed(now).items()},
+    }
 
 
 def peer_status(link: PeerLink, now: float, way_of: WayOf) -> dict[str, object]:
