@@ -99,8 +99,11 @@ def test_bind_that_is_answered_is_repeated_rarely(scene: Scene) -> None:
     assert scene.link.next_at == pytest.approx(T + BIND_SOON_S)  # the other key is not answered
     scene.bound(T, (TWO, WAITING))
     assert scene.link.next_at == T + c.BIND_WAITING_S
-    scene.bound(T + 1, (TWO, 6))
-    assert scene.link.next_at == T + 1 + c.BIND_INTERVAL_S
+    scene.bound(T + 1, (ONE, 6))  # a report: the relay made another handle for it
+    assert scene.link.next_at == T + c.BIND_WAITING_S
+    assert scene.binds(T + c.BIND_WAITING_S)
+    scene.bound(T + 6, (ONE, 6), (TWO, 6))
+    assert scene.link.next_at == T + 6 + c.BIND_INTERVAL_S
 
 
 def test_peer_that_was_added_before_the_answer_is_bound_at_once(scene: Scene) -> None:

@@ -138,11 +138,13 @@ class _Binding:
             if handles != self.handles.get(key, ()):
                 changed.add(key)
             self.handles[key] = handles
+        is_answer = bool(self.unanswered)
         self.unanswered -= named.keys()
         if not self.unanswered:
             self.tries = 0
             is_waiting = not all(self.handles.get(key) for key in wanted)
-            self.due_at = now + (c.BIND_WAITING_S if is_waiting else c.BIND_INTERVAL_S)
+            due_at = now + (c.BIND_WAITING_S if is_waiting else c.BIND_INTERVAL_S)
+            self.due_at = due_at if is_answer else min(self.due_at, due_at)  # reports about others put nothing off
         return changed
 
 
