@@ -97,9 +97,9 @@ class Peers:
         """Use those of the configuration that are missing. Call it after the peers are there: a relay may be one."""
         parts = self._parts
         missing = [config for config in parts.config.relays if config.name not in parts.relays.by_name]
-        for config in filter(lambda config: self._is_accepted(config.settings), missing):
-            parts.relays.add(config, monotonic())
-        if missing:
+        if accepted := [config for config in missing if self._is_accepted(config.settings)]:
+            for config in accepted:
+                parts.relays.add(config, monotonic())
             parts.relays.follow_links(monotonic())
 
     def _is_accepted(self, settings: PeerSettings) -> bool:
