@@ -3,7 +3,14 @@
 from __future__ import annotations
 
 from tests.relay.certified import LINK, CertifiedRelay
-from uavlinkd.authority.constants import CERTIFICATES, CERTIFICATES_PER_ANSWER, INTRODUCTIONS, WHO
+from uavlinkd.authority.constants import (
+    CERTIFICATES,
+    CERTIFICATES_PER_ANSWER,
+    INTRODUCED_AGAIN_S,
+    INTRODUCED_TRIES,
+    INTRODUCTIONS,
+    WHO,
+)
 from uavlinkd.core import constants as c
 from uavlinkd.core.certificates import MemberRole
 from uavlinkd.core.drops import DropReason
@@ -118,7 +125,7 @@ def test_certificates_to_one_member_have_a_limit() -> None:
 
 
 def test_member_that_is_sought_learns_who_seeks_it() -> None:
-    """It gets the certificate once, and binds back; a renewed bind causes no other one."""
+    """It gets the certificate, and binds back; then a renewed bind causes no other one."""
     relay = CertifiedRelay()
     vehicle, operator = *relay.join(1), *relay.join(2, role=OPERATOR)
     vehicle.bind(operator)
@@ -133,14 +140,31 @@ def test_member_that_is_sought_learns_who_seeks_it() -> None:
     assert vehicle.learnt == []
 
 
-def test_introduction_is_repeated_with_renewed_binds() -> None:
-    """While the other one does not bind: a record may be lost."""
+def test_introduction_is_repeated() -> None:
+    """While the other one does not bind: a record may be lost. Later only with renewed binds."""
     relay = CertifiedRelay()
     vehicle, operator = *relay.join(1), *relay.join(2, role=OPERATOR)
-    for _ in range(3):
-        vehicle.bind(operator)
-        relay.pass_time(c.BIND_WAITING_S)
-    assert operator.learnt == [vehicle.key] * 3
+    vehicle.bind(operator)
+    relay.pass_time(INTRODUCED_AGAIN_S + 0.2)
+    assert operator.learnt == [vehicle.key] * 2
+    relay.pass_time(c.BIND_WAITING_S)
+    assert operator.learnt == [vehicle.key] * INTRODUCED_TRIES
+    vehicle.bind(operator)
+    relay.pass_time(c.BIND_WAITING_S)
+    assert operator.learnt == [vehicle.key] * (INTRODUCED_TRIES + 1)
+
+
+def test_introduction_is_not_repeated_to_one_that_bound_or_about_one_that_left() -> None:
+    relay = CertifiedRelay()
+    one, other = relay.join(1, 2)
+    (operator,) = relay.join(9, role=OPERATOR)
+    one.bind(operator)
+    other.bind(operator)
+    operator.bind(one)
+    relay.service.end(other.key, relay.now)
+    relay.members.pop(other.home)
+    relay.pass_time(c.BIND_WAITING_S)
+    assert operator.learnt == [one.key, other.key]
 
 
 def test_member_that_comes_up_is_introduced_to_its_seekers() -> None:
@@ -153,13 +177,13 @@ def test_member_that_comes_up_is_introduced_to_its_seekers() -> None:
         seeker.bind(operator)
     assert operator.learnt == []
     operator.restart()
-    relay.pass_time(2.0)
+    relay.pass_time(1.0)
     assert operator.learnt == [seeker.key for seeker in seekers]
     operator.bind(*seekers[:3])
     operator.restart()  # without a close: its wishes of before are still there
     relay.pass_time(0.2)
     operator.bind(*seekers[2:4])
-    relay.pass_time(2.0)
+    relay.pass_time(1.0)
     assert operator.learnt == [seekers[0].key, seekers[1].key, seekers[4].key]
 
 
@@ -177,7 +201,7 @@ def test_members_that_are_back_after_a_restart_of_the_relay_cause_no_introductio
     for vehicle in vehicles:
         vehicle.bind(operator)
     operator.bind(*vehicles[:2])
-    relay.pass_time(2.0)
+    relay.pass_time(1.0)
     assert operator.learnt == [vehicles[2].key]
 
 
@@ -203,6 +227,8 @@ def test_introductions_to_one_member_have_a_limit() -> None:
     assert one.learnt == [seeker.key for seeker in seekers[: INTRODUCTIONS.burst]]
     seekers[0].bind(other)
     assert other.learnt == [seekers[0].key]
+    for first in range(0, INTRODUCTIONS.burst, c.KEYS_PER_BIND):
+        one.bind(*seekers[: INTRODUCTIONS.burst][first : first + c.KEYS_PER_BIND])
     relay.pass_time(c.BIND_WAITING_S)
     for seeker in reversed(seekers):
         seeker.bind(one)
@@ -310,8 +336,8 @@ def test_revoked_member_ends_in_the_same_call() -> None:
     (handle,) = one.handles[other.key]
     (back,) = other.handles[one.key]
     assert len(relay.service.forwarding) == 2
-    learnt = list(third.learnt)
     relay.pass_time(c.BIND_WAITING_S)
+    learnt = list(third.learnt)
     session = one.peer.sessions.current
     assert session is not None
     for record in (Bind((third.key,)), Who(1 << VEHICLE)):

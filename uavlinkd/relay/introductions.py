@@ -6,6 +6,7 @@ Pure: no I/O, no clock, no randomness. Only members by certificate take part. Th
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right, insort
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from operator import itemgetter
 
@@ -45,6 +46,8 @@ class Introductions:
         """Serials and keys, ascending."""
         self._arrived: dict[bytes, float] = {}  # members with a new session, and when to introduce others, ascending
         self._due: dict[tuple[bytes, bytes], None] = {}  # who is to learn of whom
+        self._again: deque[tuple[float, bytes, bytes, int]] = deque()
+        """When to repeat which introductions, ascending: seeker, who is to learn of it, and remaining tries."""
 
     def __contains__(self, key: bytes) -> bool:
         return key in self._members
@@ -129,25 +132,28 @@ class Introductions:
                     self._members[key].seekers.setdefault(seeker, -c.NEVER)
                     self._introduce(seeker, key, now)
 
-    def _introduce(self, seeker: bytes, key: bytes, now: float) -> None:
+    def _introduce(self, seeker: bytes, key: bytes, now: float, tries: int = 1) -> None:
         """Send a seeker's certificate to the member that it wishes to reach, unless that has bound it too."""
         sought = self._members[key]
         introduced_at = sought.seekers[seeker]
+        is_first = introduced_at < sought.session_at
         if (
             sought.is_up
             and now >= sought.session_at + a.INTRODUCED_AFTER_S
             and self._wished_at(key, seeker) < sought.session_at
-            and (introduced_at < sought.session_at or now >= introduced_at + a.INTRODUCED_AGAIN_S)
+            and (is_first or now >= introduced_at + a.INTRODUCED_AGAIN_S)
             and sought.introductions.take(now)
             and sought.certificates.take(now)
         ):
             sought.seekers[seeker] = now
             self._due[key, seeker] = None
+            if (more := a.INTRODUCED_TRIES - 1 if is_first else tries - 1) > 0:
+                self._again.append((now + a.INTRODUCED_AGAIN_S, seeker, key, more))
 
     @property
     def is_due(self) -> bool:
         """Whether :meth:`pop_due` may have something."""
-        return bool(self._arrived or self._due)
+        return bool(self._arrived or self._due or self._again)
 
     def pop_due(self, now: float) -> list[tuple[bytes, CertificateRecord]]:
         """The certificates to be sent now, each with its receiver."""
@@ -156,6 +162,10 @@ class Introductions:
             self.prune(key)
             for seeker in self._members[key].seekers:
                 self._introduce(seeker, key, now)
+        while self._again and self._again[0][0] <= now:
+            _, seeker, key, tries = self._again.popleft()
+            if key in self._members and seeker in self._members[key].seekers:
+                self._introduce(seeker, key, now, tries)
         due, self._due = self._due, {}
         return [(key, self._record(seeker)) for key, seeker in due if {key, seeker} <= self._members.keys()]
 
