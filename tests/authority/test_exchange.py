@@ -85,6 +85,23 @@ def test_equal_ends() -> None:
     assert daemon.hour() == []
 
 
+def test_session_that_replaces_another_one() -> None:
+    """It tells nothing. A peer that was restarted states what it has, and is answered; then both are silent."""
+    daemon = Daemon(NEW)
+    daemon.up()
+    daemon.receive(have(NEW))
+    daemon.exchange.on_handshake(PEER, NOW + 120)
+    assert daemon.hour(NOW + 120) == []
+    daemon.receive(have(OLD), NOW + 130)
+    assert daemon.due(NOW + 130) == [(PEER, BulletinRecord(NEW)), (PEER, Have(6, digest_of(NEW), 10, 20))]
+    daemon.receive(have(NEW), NOW + 130.2)
+    assert daemon.hour(NOW + 131) == []
+    daemon.exchange.on_handshake(PEER, NOW + 240)
+    daemon.exchange.on_down(PEER)
+    daemon.exchange.on_handshake(PEER, NOW + 250)
+    assert daemon.due(NOW + 250) == [(PEER, Have(6, digest_of(NEW), 10, 20))]
+
+
 def test_peer_that_states_nothing() -> None:
     """It is asked again, ten times after the wait, then at the long interval."""
     daemon = Daemon()
@@ -156,6 +173,7 @@ def test_disk_that_cannot_be_written() -> None:
     assert daemon.due(NOW + 1) == [(OTHER, BulletinRecord(NEW))]
     daemon.exchange.on_down(OTHER)
     assert daemon.hour(NOW + 2) == []
+    daemon.exchange.on_down(PEER)
     assert daemon.up(now=NOW + 4000) == [(PEER, MINE)]
     assert daemon.trust.bulletin.number == 6
     daemon.exchange.note_persisted(6, digest_of(NEW))

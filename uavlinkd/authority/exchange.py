@@ -37,7 +37,8 @@ class _Peer:
     """What one peer stated, and when it gets what. Kept while it is down: it may come back with an older disk."""
 
     is_up: bool = False
-    have: Have | None = None  # what it stated last, on a session of the present link
+    is_renewed: bool = False  # it stated what it has on an earlier session of the present link only
+    have: Have | None = None  # what it stated last, on the present link
     has: int = 0  # the newest bulletin that it stated or sent since then
     stated: int | None = None  # the number that it stated last, ever
     order: int = -1  # of the record that stated it
@@ -77,8 +78,14 @@ class BulletinExchange:
     # Peers.
 
     def on_handshake(self, key: bytes, now: float) -> None:
-        """A session with the peer that has this static public key was made, or its link is up again."""
+        """A session with the peer that has this static public key was made, or its link is up again.
+
+        One that replaces another tells nothing: only an end that was restarted states what it has, and asks.
+        """
         peer = self._peers.setdefault(key, _Peer())
+        if peer.is_up and peer.have is not None:
+            peer.is_renewed = True
+            return
         peer.is_up, peer.have, peer.has, peer.tries = True, None, 0, 0
         peer.owes_have, peer.push_at = True, now + self._wait_s(key)
         self._note(peer)
@@ -123,9 +130,12 @@ class BulletinExchange:
     def _receive_have(self, key: bytes, peer: _Peer, have: Have, order: int, now: float) -> Reaction:
         if order <= peer.order:
             raise Drop(DropReason.OLD_RECORD)
-        is_repeated, is_rolled_back = have == peer.have, peer.stated is not None and have.number < peer.stated
+        is_renewed, peer.is_renewed = peer.is_renewed, False
+        is_repeated = have == peer.have and not is_renewed
+        is_rolled_back = peer.stated is not None and have.number < peer.stated
         peer.order, peer.have, peer.stated = order, have, have.number
-        peer.has = have.number if is_rolled_back else max(peer.has, have.number)
+        peer.has = have.number if is_renewed or is_rolled_back else max(peer.has, have.number)
+        peer.owes_have |= is_renewed
         if not is_repeated:
             peer.tries = 0
         wait_s = self._wait_s(key)
