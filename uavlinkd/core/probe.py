@@ -18,26 +18,13 @@ MAX_COUNT = 2**32 - 1
 
 
 class Probe(NamedTuple):
-    """A question, an answer, or both, and a report about the path that carries it.
+    """A question, an answer, or both, and a report about the path that carries it."""
 
-    ::
-
-        offset size field
-        0      1    type (3)
-        1      1    flags: 1 frames follow, 2 padding follows
-        2      4    question, 0 without one
-        6      4    answer: the question that it answers, 0 without one
-        10     4    datagrams of this session sent along this path, this one included
-        14     4    datagrams of this session received along this path
-        18     2    lag in ms: how much later copies arrive along this path than along the first; 65535: unknown
-        20     2    zero, only with a question
-    """
-
-    question: int
-    answer: int
-    sent: int
+    question: int  # 0 without one
+    answer: int  # the question that it answers; 0 without one
+    sent: int  # datagrams of this session along this path, this one included
     received: int
-    lag_ms: int = UNKNOWN_LAG
+    lag_ms: int = UNKNOWN_LAG  # how much later copies arrive along this path than along the first
 
     def encode(self, frames: bytes = b"", padding: int = 0) -> bytes:
         """The record, and behind it whole frames or ``padding`` bytes."""

@@ -20,21 +20,12 @@ MAX_TOTAL = 2**32 - 1
 
 
 class Refused(NamedTuple):
-    """Frames of one kind that were refused for one reason.
-
-    ::
-
-        offset size field
-        0      3    message id
-        3      2    command, 0 without one
-        5      1    reason: its code in README.md
-        6      4    total so far, at most 2^32 - 1
-    """
+    """Frames of one kind that were refused for one reason."""
 
     message: int
-    command: int
-    reason: int
-    total: int
+    command: int  # 0 without one
+    reason: int  # its code in README.md
+    total: int  # so far, at most :data:`MAX_TOTAL`
 
 
 class RefusalReport(NamedTuple):

@@ -1,6 +1,6 @@
 """Records between a member and its relay or another member, and data along a relay. Total parsers; no keys.
 
-README.md, section 21, and for the fleet's records uavlinkd/authority/README.md.
+Their layouts are in README.md, sections 21 and 22, and for the fleet's records in uavlinkd/authority/README.md.
 """
 
 from __future__ import annotations
@@ -28,33 +28,16 @@ _CERTIFIED_BYTES = 1 + c.KEY_BYTES + CERTIFICATE_BYTES
 
 
 class Bind(NamedTuple):
-    """A member wants to reach these peers along the path that carries the record.
-
-    ::
-
-        offset  size  field
-        0       1     kind (1)
-        1       32·n  static public keys, n from 1 to 16
-    """
+    """A member wants to reach these peers along the path that carries the record."""
 
     keys: tuple[bytes, ...]
 
     def encode(self) -> bytes:
-        """The record."""
         return bytes((BIND,)) + b"".join(self.keys)
 
 
 class Bound(NamedTuple):
-    """All handles of some peers on the path that carries the record, and the member's address there.
-
-    ::
-
-        offset  size  field
-        0       1     kind (2)
-        1       16    IPv6 address of the member as the relay sees it; IPv4 mapped into it
-        17      2     port
-        19      34·n  public key (32), handle (2), n from 1 to 32
-    """
+    """All handles of some peers on the path that carries the record, and the member's address there."""
 
     host: str
     """Numeric, without a zone; an IPv4 host in its own form."""
@@ -63,27 +46,18 @@ class Bound(NamedTuple):
     """Key and handle; :data:`WAITING` for a peer that has none. A peer with several has an entry for each."""
 
     def encode(self) -> bytes:
-        """The record."""
         return _BOUND_HEADER.pack(BOUND, _packed(self.host), self.port) + b"".join(
             _ENTRY.pack(*entry) for entry in self.handles
         )
 
 
 class Candidates(NamedTuple):
-    """Where the sender may be reached directly: a record between two members, along a relay.
-
-    ::
-
-        offset  size  field
-        0       1     kind (3)
-        1       18·n  IPv6 address (16), IPv4 mapped into it; port (2), n from 1 to 8
-    """
+    """Where the sender may be reached directly: a record between two members, along a relay."""
 
     places: tuple[tuple[str, int], ...]
     """Numeric host and port of each."""
 
     def encode(self) -> bytes:
-        """The record."""
         return bytes((CANDIDATES,)) + b"".join(_PLACE.pack(_packed(host), port) for host, port in self.places)
 
 
@@ -91,59 +65,32 @@ class FilterTest(NamedTuple):
     """A member asks for the token from another port of the relay: whether a NAT or a firewall lets it in.
 
     It is longer than the token and the answer together, with their IP headers.
-
-    ::
-
-        offset  size  field
-        0       1     kind (4)
-        1       16    token
-        17      79    zeros
     """
 
     token: bytes
 
     def encode(self) -> bytes:
-        """The record."""
         return (bytes((FILTER_TEST,)) + self.token).ljust(c.FILTER_TEST_BYTES, b"\0")
 
 
 class FilterTested(NamedTuple):
-    """The relay sent the token from another port, to the address that this record goes to.
-
-    ::
-
-        offset  size  field
-        0       1     kind (5)
-        1       16    token
-    """
+    """The relay sent the token from another port, to the address that this record goes to."""
 
     token: bytes
 
     def encode(self) -> bytes:
-        """The record."""
         return bytes((FILTER_TESTED,)) + self.token
 
 
 class Have(NamedTuple):
-    """The bulletin that the sender has, and which certificates.
-
-    ::
-
-        offset  size  field
-        0       1     kind (6)
-        1       4     number of the bulletin
-        5       4     first bytes of its SHA-256
-        9       4     serial of the sender's certificate, or 0
-        13      4     serial of the receiver's certificate that the sender holds, or 0
-    """
+    """The bulletin that the sender has, and which certificates."""
 
     number: int
     digest: bytes
-    serial: int = 0
-    known: int = 0
+    serial: int = 0  # of the sender's certificate
+    known: int = 0  # of the receiver's certificate that the sender holds
 
     def encode(self) -> bytes:
-        """The record."""
         return _HAVE.pack(HAVE, *self)
 
 
@@ -153,7 +100,6 @@ class BulletinRecord(NamedTuple):
     bulletin: bytes
 
     def encode(self) -> bytes:
-        """The record."""
         return bytes((BULLETIN,)) + self.bulletin
 
 
@@ -164,7 +110,6 @@ class CertificateRecord(NamedTuple):
     certificate: bytes
 
     def encode(self) -> bytes:
-        """The record."""
         return bytes((CERTIFICATE,)) + self.key + self.certificate
 
 
@@ -178,7 +123,6 @@ class Who(NamedTuple):
     after: int = 0
 
     def encode(self) -> bytes:
-        """The record."""
         return _WHO.pack(WHO, *self)
 
 
@@ -270,15 +214,7 @@ INNER_STARTS = frozenset((1, 2, 3, 0x40, 0x41))
 
 
 def wrap(handle: int, datagram: bytes) -> bytes:
-    """Data to or from a relay.
-
-    ::
-
-        offset  size  field
-        0       1     type (0x50)
-        1       2     handle
-        3       n     datagram
-    """
+    """Data to or from a relay."""
     return _RELAYED_HEADER.pack(RELAYED, handle) + datagram
 
 
@@ -294,14 +230,7 @@ TOKEN = 0x51
 
 
 def token_datagram(token: bytes) -> bytes:
-    """What a relay sends from another port.
-
-    ::
-
-        offset  size  field
-        0       1     type (0x51)
-        1       16    token
-    """
+    """What a relay sends from another port."""
     return bytes((TOKEN,)) + token
 
 

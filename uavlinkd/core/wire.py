@@ -1,6 +1,6 @@
 """Bytes to fields and back, for every message of the protocol. Total parsers; no keys.
 
-All integers are big-endian. The README beside this file draws each message.
+All integers are big-endian. README.md has the layouts: sections 6, 8, 11, 12 and 21.
 """
 
 from __future__ import annotations
@@ -41,20 +41,9 @@ _CONFIDENTIAL = 1
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """What a side asks of the session, sealed in its handshake message.
+    """What a side asks of the session, sealed in its handshake message."""
 
-    ::
-
-        offset size field
-        0      4    generation     of the session on which the sender sends to the peer, or 0
-        4      2    features       bits of protocol extensions: 1 refusal reports, 2 records, 4 problem reports
-        6      1    flags          bit 0: confidential
-        7      1    tag length     bytes: 8, 12, 16 or 32
-        8      2    MAC key bits   256, 512, 1024 or 2048
-        10     2    largest envelope that the sender takes, bytes
-    """
-
-    generation: int
+    generation: int  # of the session on which the sender sends to the peer, or 0
     confidential: bool
     tag_bytes: int
     mac_key_bits: int
@@ -64,7 +53,7 @@ class Parameters:
     SIZE = 12  # of the encoding
 
     def encode(self) -> bytes:
-        """The twelve bytes drawn above."""
+        """Twelve bytes."""
         flags = _CONFIDENTIAL if self.confidential else 0
         sizes = self.tag_bytes, self.mac_key_bits, self.max_envelope
         return _PARAMETERS.pack(self.generation, self.features, flags, *sizes)
@@ -136,18 +125,7 @@ def response_header(suite: Suite, sender_index: int, receiver_index: int) -> byt
 
 
 class Initiation(NamedTuple):
-    """Message 1, cut into its fields.
-
-    ::
-
-        offset size field
-        0      1    type (1)
-        1      1    suite
-        2      2    sender index
-        4      n    Noise message 1, its length given by the suite
-        4+n    16   mac1 over all before it
-        20+n   16   mac2 over all before it, or zero
-    """
+    """Message 1, cut into its fields."""
 
     suite: Suite
     sender_index: int
@@ -161,19 +139,7 @@ class Initiation(NamedTuple):
 
 
 class Response(NamedTuple):
-    """Message 2, cut into its fields.
-
-    ::
-
-        offset size field
-        0      1    type (2)
-        1      1    suite
-        2      2    sender index
-        4      2    receiver index
-        6      n    Noise message 2, its length given by the suite
-        6+n    16   mac1 over all before it
-        22+n   16   mac2 over all before it, or zero
-    """
+    """Message 2, cut into its fields."""
 
     suite: Suite
     sender_index: int
@@ -183,17 +149,7 @@ class Response(NamedTuple):
 
 
 class CookieReply(NamedTuple):
-    """Message 3, cut into its fields.
-
-    ::
-
-        offset size field
-        0      1    type (3)
-        1      1    zero
-        2      2    receiver index
-        4      16   nonce
-        20     32   cookie, sealed
-    """
+    """Message 3, cut into its fields."""
 
     receiver_index: int
     nonce: bytes
@@ -257,15 +213,6 @@ def envelope_header(receiver_index: int, counter: int) -> bytes:
 def parse_envelope_header(datagram: bytes) -> tuple[int, int, int]:
     """Receiver index, counter and header length of an envelope; its first byte is one of the two types.
 
-    ::
-
-        offset size field
-        0      1    type (0x40, 0x41)
-        1      2    receiver index
-        3      2/4  counter: 2 bytes after 0x40, 4 bytes after 0x41
-        5/7    n    payload
-        5/7+n  t    tag
-
     Raises:
         Drop: ``MALFORMED`` for index 0, for a counter at the limit, and for less than a header and the
             shortest tag; ``LONG_COUNTER``.
@@ -297,27 +244,17 @@ ECHO_REQUEST_BYTES = _ECHO_REQUEST.size
 
 
 class Echo(NamedTuple):
-    """An echo request or reply: the round trip, what its sender has received on this session, and what is new.
-
-    ::
-
-        offset size field
-        0      1    type: 1 request, 2 reply
-        1      4    token, repeated by the reply
-        5      4    envelopes received
-        9      4    envelopes expected: the highest counter and one
-        13     4    fresh, in a reply alone
-    """
+    """An echo request or reply: the round trip, what its sender has received on this session, and what is new."""
 
     is_reply: bool
     token: int
     received: int
-    expected: int
+    expected: int  # the highest counter and one
     fresh: int = 0
     """On the session that carried the request: the lowest counter that the replier used recently, or its next one."""
 
     def encode(self) -> bytes:
-        """The thirteen bytes of a request or seventeen of a reply, as drawn above."""
+        """The thirteen bytes of a request or seventeen of a reply."""
         if self.is_reply:
             return _ECHO_REPLY.pack(ECHO_REPLY, self.token, self.received, self.expected, self.fresh)
         return _ECHO_REQUEST.pack(ECHO_REQUEST, self.token, self.received, self.expected)
