@@ -74,11 +74,7 @@ class Admission:
         self._initiations.set_burst(max(c.INITIATIONS.burst, burst))
 
     def read(self, path: Path, now: float) -> None:
-        """An initiation from there is to be read.
-
-        Raises:
-            Drop: ``RATE_LIMITED``.
-        """
+        """An initiation from there is to be read. Raises ``RATE_LIMITED``."""
         if not self._take(self._known_read, self._read, path, now):
             raise Drop(DropReason.RATE_LIMITED)
 
@@ -87,19 +83,11 @@ class Admission:
         return self._take(self._known_versions, self._versions, path, now)
 
     def admit(self, message: Message, now: float, *, is_response: bool) -> None:
-        """An initiation or a response costs a key exchange.
-
-        Raises:
-            Drop: ``COOKIE_REQUIRED`` or ``RATE_LIMITED``.
-        """
+        """An initiation or a response costs a key exchange. Raises ``COOKIE_REQUIRED`` or ``RATE_LIMITED``."""
         self._admit(self._responses if is_response else self._initiations, self._cookied, message, now)
 
     def admit_answer(self, peer: Peer, message: Message, now: float) -> None:
-        """An authentic initiation of this peer is to be answered.
-
-        Raises:
-            Drop: ``COOKIE_REQUIRED`` or ``RATE_LIMITED``.
-        """
+        """An authentic initiation of this peer is to be answered. Raises ``COOKIE_REQUIRED`` or ``RATE_LIMITED``."""
         # Recorded initiations of this peer can be replayed from anywhere: they may use up the answers to all senders,
         # not those to a sender that proves its address.
         answers = peer.answers_while_up if peer.is_up else peer.answers
@@ -108,8 +96,7 @@ class Admission:
     def admit_group(self, peer: Peer, suite: Suite, message: Message, now: float) -> None:
         """An authentic initiation costs the arithmetic of its group.
 
-        Raises:
-            Drop: ``GROUP_BUDGET_SPENT``; ``COOKIE_REQUIRED`` or ``RATE_LIMITED`` where a cookie would help.
+        Raises ``GROUP_BUDGET_SPENT``; ``COOKIE_REQUIRED`` or ``RATE_LIMITED`` where a cookie would help.
         """
         # An attacker can send a recorded initiation under the peer's own address: only a cookie proves an address.
         is_there = peer.paths.find(message.path) is not None
@@ -144,8 +131,7 @@ class Admission:
     def _require_cookie(self, message: Message, now: float) -> NoReturn:
         """Refuse a message without a cookie, and send one back unless too many were sent there.
 
-        Raises:
-            Drop: ``COOKIE_REQUIRED``, or ``RATE_LIMITED`` without a reply.
+        Raises ``COOKIE_REQUIRED``, or ``RATE_LIMITED`` without a reply.
         """
         datagram, sender_index, path, cookies = message
         is_due = self._is_known(path.place) and self._known.take(path.sender, now)

@@ -84,11 +84,7 @@ class Certificate(NamedTuple):
 
 
 def parse_certificate(data: bytes) -> Certificate:
-    """The certificate in these bytes; its signature is not verified.
-
-    Raises:
-        Drop: ``BAD_CERTIFICATE``.
-    """
+    """The certificate in these bytes; its signature is not verified. Raises ``BAD_CERTIFICATE``."""
     if len(data) == CERTIFICATE_BYTES:
         version, fleet, serial, signer, role, first, last, groups, padded = _SIGNED.unpack_from(data)
         name = padded.rstrip(b"\0")

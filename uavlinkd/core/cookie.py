@@ -51,11 +51,7 @@ class MacKeys:
         return AeadKey(hmac_sha256(self._cookie, nonce)).seal(0, cookie, mac1)
 
     def open_cookie(self, reply: wire.CookieReply, mac1: bytes) -> bytes:
-        """The cookie in a reply to our message that carried ``mac1``.
-
-        Raises:
-            Drop: ``BAD_COOKIE``.
-        """
+        """The cookie in a reply to our message that carried ``mac1``. Raises ``BAD_COOKIE``."""
         cookie = AeadKey(hmac_sha256(self._cookie, reply.nonce)).open(0, reply.sealed, mac1)
         if cookie is None:
             raise Drop(DropReason.BAD_COOKIE)

@@ -132,8 +132,7 @@ class KeyPair:
     def exchange(self, public: bytes) -> bytes:
         """The shared secret with the holder of ``public``.
 
-        Raises:
-            Drop: ``INVALID_KEY_SHARE`` for a point of low order, whose secret is public (RFC 7748, section 6.1).
+        Raises ``INVALID_KEY_SHARE`` for a point of low order, whose secret is public (RFC 7748, section 6.1).
         """
         try:
             return self._private.exchange(X25519PublicKey.from_public_bytes(public))
@@ -168,8 +167,7 @@ FIELD_PRIME = 2**255 - 19
 class AuthorityKey:
     """A public key of Ed25519 (RFC 8032). Compared by its bytes.
 
-    Raises:
-        ValueError: it is not one, or everyone can sign under it.
+    Raises ValueError: it is not one, or everyone can sign under it.
     """
 
     __slots__ = ("_key", "public")
@@ -244,11 +242,7 @@ def _pem(label: str, data: bytes) -> str:
 
 
 def read_signing_key(pem: bytes, passphrase: Secret | None) -> Secret:
-    """The private key of Ed25519 in a PKCS #8 file.
-
-    Raises:
-        ValueError: it is not one, or the passphrase is wrong.
-    """
+    """The private key of Ed25519 in a PKCS #8 file. Raises ValueError: it is not one, or the passphrase is wrong."""
     try:
         key = serialization.load_pem_private_key(pem, None if passphrase is None else passphrase.reveal())
     except (ValueError, TypeError, UnsupportedAlgorithm):
@@ -288,11 +282,9 @@ def mlkem_generate(bits: int, seed: bytes) -> tuple[bytes, Callable[[bytes], byt
 def mlkem_encapsulate(bits: int, public: bytes) -> tuple[bytes, bytes]:
     """Ciphertext and shared secret for the holder of ``public``.
 
-    The one place where the core does not take its randomness as an argument: FIPS 203 draws it inside,
-    and OpenSSL's generator does that here.
-
-    Raises:
-        Drop: ``INVALID_KEY_SHARE`` where the encapsulation key fails FIPS 203's checks (section 7.2).
+    The one place where the core does not take its randomness as an argument: FIPS 203 draws it inside, and OpenSSL's
+    generator does that here. Raises ``INVALID_KEY_SHARE`` where the encapsulation key fails FIPS 203's checks
+    (section 7.2).
     """
     kind = mlkem.MLKEM768PublicKey if bits == 768 else mlkem.MLKEM1024PublicKey
     try:

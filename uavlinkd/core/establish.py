@@ -54,8 +54,7 @@ def initiate(peer: Peer, now: float) -> list[Output]:
 def receive_response(peer: Peer, pending: Pending, response: wire.Response, path: Path, now: float) -> list[Output]:
     """The first response to an own initiation: the session is confirmed here, and the peer learns it at once.
 
-    Raises:
-        Drop: as :meth:`Initiator.receive_response`; then nothing was changed.
+    Raises Drop: as :meth:`Initiator.receive_response`; then nothing was changed.
     """
     keys = peer.initiator.receive_response(pending, response)
     lifetimes = peer.durations.reject_after_s, peer.verify_interval_s
@@ -93,8 +92,7 @@ def receive_hint(peer: Peer, now: float) -> list[Output]:
 def answer(peer: Peer, received: Received, initiation: bytes, path: Path, now: float) -> list[Output]:
     """Answer an authentic initiation. The session waits, beside what is there, until it is confirmed.
 
-    Raises:
-        Drop: ``NO_FREE_INDEX`` or ``INVALID_KEY_SHARE``.
+    Raises ``NO_FREE_INDEX`` or ``INVALID_KEY_SHARE``.
     """
     index = peer.indices.pick(now)
     response, keys = handshake.respond(received, peer.settings, index, peer.sessions.generation, peer.entropy)

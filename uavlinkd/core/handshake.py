@@ -69,11 +69,7 @@ def initiate(
 
 
 def receive_initiation(identity: KeyPair, initiation: wire.Initiation) -> Received:
-    """Read message 1.
-
-    Raises:
-        Drop: ``BAD_HANDSHAKE``, ``INVALID_KEY_SHARE``, ``HEADER_MISMATCH`` or ``BAD_PARAMETERS``.
-    """
+    """Read message 1. Raises ``BAD_HANDSHAKE``, ``INVALID_KEY_SHARE``, ``HEADER_MISMATCH`` or ``BAD_PARAMETERS``."""
     suite = initiation.suite
     state = noise.responder(suite, wire.prologue(suite), identity)
     state, payload = state.read(initiation.noise)
@@ -86,8 +82,7 @@ def respond(
 ) -> tuple[bytes, Keys]:
     """Message 2 without macs, and the session's keys: the initiator has them too once it has read it.
 
-    Raises:
-        Drop: ``INVALID_KEY_SHARE``.
+    Raises ``INVALID_KEY_SHARE``.
     """
     initiation = received.initiation
     header = wire.response_header(initiation.suite, index, initiation.sender_index)
@@ -98,11 +93,7 @@ def respond(
 
 
 def receive_response(initiated: Initiated, response: wire.Response) -> Keys:
-    """Read message 2.
-
-    Raises:
-        Drop: ``BAD_HANDSHAKE``, ``INVALID_KEY_SHARE``, ``HEADER_MISMATCH`` or ``BAD_PARAMETERS``.
-    """
+    """Read message 2. Raises ``BAD_HANDSHAKE``, ``INVALID_KEY_SHARE``, ``HEADER_MISMATCH`` or ``BAD_PARAMETERS``."""
     if response.suite != initiated.state.suite:
         raise Drop(DropReason.HEADER_MISMATCH)
     state, payload = initiated.state.read(response.noise)

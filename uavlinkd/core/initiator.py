@@ -157,8 +157,7 @@ class Initiator:
     def receive_response(self, pending: Pending, response: wire.Response) -> Keys:
         """The keys of the session that this response makes. Its index is not free: it is the session's now.
 
-        Raises:
-            Drop: as :func:`handshake.receive_response`; then the genuine response can still come.
+        Raises Drop: as :func:`handshake.receive_response`; then the genuine response can still come.
         """
         keys = handshake.receive_response(pending.initiated, response)
         del self.pending[response.receiver_index]
@@ -168,10 +167,7 @@ class Initiator:
         """The peer is under load: keep its cookie, and try again soon.
 
         A cookie proves one address of ours. With several, such as one for IPv4 and one for IPv6, it is valid on that
-        ``path`` alone.
-
-        Raises:
-            Drop: ``BAD_COOKIE``.
+        ``path`` alone. Raises ``BAD_COOKIE``.
         """
         cookie = self._mac_keys.open_cookie(reply, mac1)
         self._received_cookies.pop(path, None)

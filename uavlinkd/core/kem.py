@@ -40,8 +40,7 @@ class KemPrivateKey:
     def decapsulate(self, ciphertext: bytes) -> bytes:
         """The shared secret.
 
-        Raises:
-            Drop: ``INVALID_KEY_SHARE``, or ``GROUP_BUDGET_SPENT`` for another ciphertext than the first.
+        Raises ``INVALID_KEY_SHARE``, or ``GROUP_BUDGET_SPENT`` for another ciphertext than the first.
         """
         if self._computed is None:
             self._computed = ciphertext, Secret(self._compute(ciphertext))
@@ -79,8 +78,7 @@ class FfdheGroup:
     def encapsulate(self, share: bytes, entropy: Entropy) -> tuple[bytes, bytes]:
         """The responder's public value, and the secret shared with the holder of ``share``.
 
-        Raises:
-            Drop: ``INVALID_KEY_SHARE``.
+        Raises ``INVALID_KEY_SHARE``.
         """
         base = self.element(share)  # refused before any work is done for it
         exponent = entropy(FFDHE_EXPONENT_BYTES)
@@ -89,8 +87,7 @@ class FfdheGroup:
     def element(self, share: bytes) -> int:
         """The public value on the wire, checked to be in 2 ... p-2 (RFC 7919, section 5.1).
 
-        Raises:
-            Drop: ``INVALID_KEY_SHARE``.
+        Raises ``INVALID_KEY_SHARE``.
         """
         value = int.from_bytes(share, "big")
         if not 2 <= value <= ffdhe_prime(self.bits) - 2:

@@ -41,13 +41,8 @@ PEERS_AT_ONCE = 8
 class Node:
     """All peers of one identity.
 
-    Args:
-        private_key: the static X25519 key of this daemon.
-        entropy: returns unpredictable bytes.
-        now: monotonic seconds.
-        screen: splits a payload into frames that may be old and frames that must be new. By default all must be new.
-        admit: decides on certificates. Without it, none is valid.
-        most_admitted: by certificate.
+    Without ``screen`` all frames must be new. Without ``admit`` no certificate is valid. ``most_admitted``: peers by
+    certificate.
     """
 
     def __init__(
@@ -90,8 +85,7 @@ class Node:
     def add_peer(self, settings: PeerSettings, now: float) -> Peer:
         """Accept this peer from now on. Without an address it has to initiate.
 
-        Raises:
-            ValueError: the name or the key is there already, or the key is ours.
+        Raises ValueError: the name or the key is there already, or the key is ours.
         """
         handshakes = self._handshakes
         if settings.name in self.peers or settings.public_key in handshakes.peers:

@@ -72,11 +72,7 @@ class SymmetricState(NamedTuple):
         return self._replace(h=sha256(self.h + ciphertext), n=self.n + 1), ciphertext
 
     def decrypt_and_hash(self, ciphertext: bytes) -> tuple[SymmetricState, bytes]:
-        """The next state, and the plaintext.
-
-        Raises:
-            Drop: ``BAD_HANDSHAKE`` where the tag does not verify.
-        """
+        """The next state, and the plaintext. Raises ``BAD_HANDSHAKE`` where the tag does not verify."""
         assert self.k is not None, "the first token makes a key"
         plaintext = self.k.open(self.n, ciphertext, self.h)
         if plaintext is None:
@@ -112,8 +108,7 @@ class HandshakeState(NamedTuple):
     def write(self, payload: bytes, entropy: Entropy) -> tuple[HandshakeState, bytes]:
         """WriteMessage: the next state and the message.
 
-        Raises:
-            Drop: ``INVALID_KEY_SHARE`` if the other side's share is invalid.
+        Raises ``INVALID_KEY_SHARE`` if the other side's share is invalid.
         """
         state, message = self, b""
         for step in tokens_of(self.suite)[not self.is_initiator]:
@@ -140,8 +135,7 @@ class HandshakeState(NamedTuple):
     def read(self, message: bytes) -> tuple[HandshakeState, bytes]:
         """ReadMessage: the next state and the payload. A message that is too short fails as any forged one.
 
-        Raises:
-            Drop: ``BAD_HANDSHAKE`` or ``INVALID_KEY_SHARE``.
+        Raises ``BAD_HANDSHAKE`` or ``INVALID_KEY_SHARE``.
         """
         state, rest = self, message
         for step in tokens_of(self.suite)[self.is_initiator]:

@@ -157,8 +157,7 @@ class SocketFacts:
     def check_network(self, peer: Hashable, path: Path) -> None:
         """A datagram that names this peer, or is of it, came along a path.
 
-        Raises:
-            Drop: ``WRONG_NETWORK`` if there is another peer at the other end of this network.
+        Raises ``WRONG_NETWORK`` if there is another peer at the other end of this network.
         """
         if self.peer_at.get(path.socket, peer) is not peer:
             raise Drop(DropReason.WRONG_NETWORK)

@@ -45,8 +45,7 @@ def receive_envelope(
 ) -> list[Output]:
     """Open an envelope and act on it. ``header``: as :func:`wire.parse_envelope_header` returns it.
 
-    Raises:
-        Drop: as :meth:`Session.open`, or ``REPLAYED``; then nothing was changed.
+    Raises Drop: as :meth:`Session.open`, or ``REPLAYED``; then nothing was changed.
     """
     _, counter, header_bytes = header
     payload = session.open(datagram, header_bytes, counter, now)

@@ -54,8 +54,7 @@ class HandshakeReceiver:
     def receive(self, datagram: bytes, path: Path, now: float) -> list[Output]:
         """What to do about a datagram that is not an envelope.
 
-        Raises:
-            Drop: in particular :class:`.admission.CookieRequired`, with a reply to the sender.
+        Raises Drop: in particular :class:`.admission.CookieRequired`, with a reply to the sender.
         """
         kind = datagram[0] if datagram else 0
         if kind == wire.INITIATION:

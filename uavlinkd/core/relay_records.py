@@ -143,11 +143,7 @@ def _host_of(packed: bytes) -> str:
 
 
 def parse_record(data: bytes) -> Record:
-    """The record in decrypted bytes.
-
-    Raises:
-        Drop: ``BAD_CONTROL``.
-    """
+    """The record in decrypted bytes. Raises ``BAD_CONTROL``."""
     kind, size = data[:1], len(data)
     if kind == bytes((BIND,)):
         count, rest = divmod(size - 1, c.KEY_BYTES)

@@ -155,8 +155,7 @@ class Session:
     def open_record(self, counter: int, sealed: bytes) -> bytes:
         """The record in an authentic envelope with this counter.
 
-        Raises:
-            Drop: ``BAD_CONTROL`` if it does not open, or if this session has no records.
+        Raises ``BAD_CONTROL`` if it does not open, or if this session has no records.
         """
         record = None if self._record_keys is None else self._record_keys[1].open(counter, sealed, b"")
         if record is None:
@@ -176,10 +175,8 @@ class Session:
     def open(self, datagram: bytes, header_bytes: int, counter: int, now: float) -> bytes | None:
         """The payload of an envelope whose header says it is for this session. None for an authentic copy.
 
-        A copy has a counter that was accepted before, or that is below the window. It changes nothing.
-
-        Raises:
-            Drop: ``TOO_LONG``, ``SESSION_EXPIRED``, ``DELAYED`` or ``BAD_TAG``.
+        A copy has a counter that was accepted before, or that is below the window. It changes nothing. Raises
+        ``TOO_LONG``, ``SESSION_EXPIRED``, ``DELAYED`` or ``BAD_TAG``.
         """
         if len(datagram) > self.max_envelope:
             raise Drop(DropReason.TOO_LONG)

@@ -39,8 +39,7 @@ class Indices(Generic[Owner_co]):
     def pick(self, now: float) -> int:
         """An index without an owner: 1 to 65535. It stays free until it is put into :attr:`owners`.
 
-        Raises:
-            Drop: ``NO_FREE_INDEX``.
+        Raises ``NO_FREE_INDEX``.
         """
         self._release(now)
         for _ in range(_DRAWS):

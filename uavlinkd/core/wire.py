@@ -76,8 +76,7 @@ class Parameters:
 def parse_parameters(data: bytes) -> Parameters:
     """The parameters in an authentic handshake payload of :attr:`Parameters.SIZE` bytes.
 
-    Raises:
-        Drop: ``BAD_PARAMETERS`` for values outside the protocol.
+    Raises ``BAD_PARAMETERS`` for values outside the protocol.
     """
     generation, features, flags, tag_bytes, mac_key_bits, max_envelope = _PARAMETERS.unpack(data)
     if tag_bytes not in TAG_LENGTHS or mac_key_bits not in MAC_KEY_LENGTHS or max_envelope < c.MIN_ENVELOPE_LIMIT:
@@ -213,9 +212,8 @@ def envelope_header(receiver_index: int, counter: int) -> bytes:
 def parse_envelope_header(datagram: bytes) -> tuple[int, int, int]:
     """Receiver index, counter and header length of an envelope; its first byte is one of the two types.
 
-    Raises:
-        Drop: ``MALFORMED`` for index 0, for a counter at the limit, and for less than a header and the
-            shortest tag; ``LONG_COUNTER``.
+    Raises ``MALFORMED`` for index 0, for a counter at the limit, and for less than a header and the shortest tag;
+    ``LONG_COUNTER``.
     """
     if datagram[0] == SHORT_ENVELOPE:
         if len(datagram) < SHORT_HEADER_BYTES + TAG_LENGTHS[0]:
@@ -291,8 +289,7 @@ Control = Echo | ProbeAndFrames | Close | RefusalReport | SealedRecord | Problem
 def parse_control(payload: bytes) -> Control:
     """The control record in an authentic payload (not empty, first byte below :data:`FRAMES_FROM`).
 
-    Raises:
-        Drop: ``BAD_CONTROL``.
+    Raises ``BAD_CONTROL``.
     """
     kind, size = payload[0], len(payload)
     if kind == ECHO_REQUEST and size == _ECHO_REQUEST.size:

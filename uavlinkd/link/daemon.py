@@ -72,12 +72,7 @@ class Daemon:
     # Life.
 
     async def run(self) -> None:
-        """Start, work until SIGTERM or SIGINT, and end cleanly.
-
-        Raises:
-            BindError: if the daemon cannot listen on an address. Then nothing was started.
-            ControlError: if it cannot open the control socket. Then nothing was started.
-        """
+        """Start, work until SIGTERM or SIGINT, and end cleanly. Raises as :meth:`start`, having started nothing."""
         stop = asyncio.Event()
         for name in ("SIGTERM", "SIGINT"):
             on_signal(name, stop.set)
@@ -90,12 +85,7 @@ class Daemon:
             await self.stop()
 
     async def start(self) -> None:
-        """Bind every socket, then start to read.
-
-        Raises:
-            BindError: if the daemon cannot listen on an address.
-            ControlError: if it cannot open the control socket.
-        """
+        """Bind every socket, then start to read. Raises BindError or ControlError if one of them cannot be opened."""
         parts, config = self.parts, self.parts.config
         try:
             parts.peer_sockets.open(config.listen, config.networks)
@@ -189,11 +179,7 @@ class Daemon:
         return None
 
     async def reload(self) -> None:
-        """Reload when the reloads before have ended. The configuration of the last one stays in force.
-
-        Raises:
-            ConfigError: the new configuration was refused, as a whole.
-        """
+        """Reload when the reloads before have ended. Raises ConfigError if the new file was refused, as a whole."""
         async with self._reload_lock:
             self._supervisor.reloading()
             try:
@@ -217,9 +203,8 @@ class Daemon:
     async def _apply_file(self) -> None:
         """Read the configuration again and apply its changes. Everything else stays as it is.
 
-        Raises:
-            ConfigError: the new file is wrong, changes what only a restart can change, or has an endpoint that cannot
-                be opened. The old configuration stays in force, as a whole.
+        Raises ConfigError: the new file is wrong, changes what only a restart can change, or has an endpoint that
+        cannot be opened. The old configuration stays in force, as a whole.
         """
         before, local = self.parts.config, self.parts.local
         try:

@@ -17,13 +17,7 @@ _THREAD = Threads(1, "fleet state")
 
 
 class FleetDisk:
-    """The file of one daemon.
-
-    Args:
-        path: of the file.
-        state: returns what it is to have.
-        on_written: is called with what it has.
-    """
+    """The file of one daemon. ``state`` returns what it is to have, ``on_written`` is called with what it has."""
 
     def __init__(self, path: Path, state: Callable[[], FleetState], on_written: Callable[[FleetState], None]) -> None:
         self._path = path

@@ -187,11 +187,7 @@ class FleetMembers:
     # Members.
 
     def admit(self, key: bytes, data: bytes, now: float) -> PeerSettings:
-        """An initiation shows this certificate. Returns the settings of its peer.
-
-        Raises:
-            Drop: why it is refused.
-        """
+        """An initiation shows this certificate. Returns the settings of its peer. Raises Drop: why it is refused."""
         try:
             certificate = self._hold(key, data, now, needs_policy=self._relay is None)
         except Drop as drop:

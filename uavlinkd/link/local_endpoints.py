@@ -40,10 +40,8 @@ from uavlinkd.system.stall import StallWatch
 def open_endpoint(config: EndpointConfig, handler: PortHandler, instead_of: Endpoint | None = None) -> Endpoint:
     """Open the endpoint: a socket that listens is bound. It begins to work when it is started.
 
-    ``instead_of``: an endpoint with the same URL that is about to be closed.
-
-    Raises:
-        BindError: if the daemon cannot listen on its address.
+    ``instead_of``: an endpoint with the same URL that is about to be closed. Raises BindError if the daemon cannot
+    listen on its address.
     """
     match config.url:
         case NetworkUrl(EndpointKind.UDPIN, address):
@@ -96,10 +94,8 @@ class LocalEndpoints:
         """Bind endpoints. :meth:`start` starts them.
 
         One with the URL of an endpoint in ``leaving``, which is about to be closed, takes over its socket. So
-        endpoints can be renamed, or swap ports.
-
-        Raises:
-            BindError: one cannot be opened. Then none is, and the others are as they were. The message names the key.
+        endpoints can be renamed, or swap ports. Raises BindError: one cannot be opened. Then none is, and the others
+        are as they were. The message names the key.
         """
         shared = {self._urls[one.name]: one for one in self.endpoints if one.name in leaving}
         for config in configs:

@@ -142,11 +142,8 @@ def parse_frames(
 ) -> tuple[int, FrameFault | None]:
     """Append the frames that follow each other from ``position`` on.
 
-    Returns:
-        Where they end, and why the bytes there are not a frame; None at the end of the data. TRUNCATED: they could
-        become one with more bytes.
-
-    If no frame ``is_expected`` at the first place, a frame there must be known.
+    Returns where they end, and why the bytes there are not a frame; None at the end of the data. TRUNCATED: they could
+    become one with more bytes. If no frame ``is_expected`` at the first place, a frame there must be known.
     """
     size, before = len(data), len(frames)
     fault: FrameFault | None = None
@@ -217,8 +214,7 @@ def find_frames(
 ) -> tuple[int, bool]:
     """Append the frames in ``data``. Skip and count the bytes between them.
 
-    Returns:
-        How many bytes are finished, and whether they end in garbage.
+    Returns how many bytes are finished, and whether they end in garbage.
 
     Unless ``is_final``, an incomplete frame stays for the next call. Each decision depends on the bytes from its
     position alone, never on how many more there are, so chunking cannot change the result. The exception: with

@@ -153,11 +153,7 @@ class Lanes:
         return urgent.size + events.size + states.size
 
     def put(self, frame: Frame, now: float) -> Lane:
-        """Let a frame wait. A state replaces older ones that are superseded. The oldest of too many is dropped.
-
-        Returns:
-            The frame's lane.
-        """
+        """Let a frame wait in its lane, which is returned. It replaces superseded states; the oldest of too many goes."""
         flow = self._flow_of(frame, now)
         queue = self.queues[flow.lane]
         if not flow.frames:
