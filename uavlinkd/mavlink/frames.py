@@ -142,7 +142,7 @@ def parse_frames(
 ) -> tuple[int, FrameFault | None]:
     """Append the frames that follow each other from ``position`` on.
 
-    Returns where they end, and why the bytes there are not a frame; None at the end of the data. TRUNCATED: they could
+    Returns where they end, and why no frame is there: None at the end of the data, TRUNCATED if the bytes could
     become one with more bytes. If no frame ``is_expected`` at the first place, a frame there must be known.
     """
     size, before = len(data), len(frames)

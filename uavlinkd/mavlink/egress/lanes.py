@@ -153,7 +153,7 @@ class Lanes:
         return urgent.size + events.size + states.size
 
     def put(self, frame: Frame, now: float) -> Lane:
-        """Let a frame wait in its lane, which is returned. It replaces superseded states; the oldest of too many goes."""
+        """Let a frame wait in the lane that is returned. Superseded states and the oldest of too many go."""
         flow = self._flow_of(frame, now)
         queue = self.queues[flow.lane]
         if not flow.frames:
