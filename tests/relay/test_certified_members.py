@@ -177,13 +177,13 @@ def test_member_that_comes_up_is_introduced_to_its_seekers() -> None:
         seeker.bind(operator)
     assert operator.learnt == []
     operator.restart()
-    relay.pass_time(1.0)
+    relay.pass_time(0.8)
     assert operator.learnt == [seeker.key for seeker in seekers]
     operator.bind(*seekers[:3])
     operator.restart()  # without a close: its wishes of before are still there
     relay.pass_time(0.2)
     operator.bind(*seekers[2:4])
-    relay.pass_time(1.0)
+    relay.pass_time(0.8)
     assert operator.learnt == [seekers[0].key, seekers[1].key, seekers[4].key]
 
 
@@ -201,7 +201,7 @@ def test_members_that_are_back_after_a_restart_of_the_relay_cause_no_introductio
     for vehicle in vehicles:
         vehicle.bind(operator)
     operator.bind(*vehicles[:2])
-    relay.pass_time(1.0)
+    relay.pass_time(0.6)
     assert operator.learnt == [vehicles[2].key]
 
 

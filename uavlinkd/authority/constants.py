@@ -23,6 +23,6 @@ INTRODUCTIONS = Rate(8.0, 200)
 """A ground station that starts behind a relay learns of its whole fleet at once."""
 INTRODUCED_AFTER_S = 0.5
 """After a session a member binds those that it knows. Until then no other is introduced to it."""
-INTRODUCED_AGAIN_S = 1.0
+INTRODUCED_AGAIN_S = 0.5
 INTRODUCED_TRIES = 3
 """In a session. A lost one would else follow with the next bind, after 5 s."""

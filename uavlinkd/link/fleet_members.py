@@ -91,7 +91,7 @@ class FleetMembers:
         self.exchange = BulletinExchange(self.trust, os.urandom, self._wait_s)
         self._events: dict[str, tuple[float, str]] = {}
         """When something about bulletins was noticed last that a person has to know, and the name of the cause."""
-        self._questions = MemberQuestions()
+        self._questions = MemberQuestions(self._wait_s)
         self._limits: dict[bytes, TokenBucket] = {}  # of certificates, by key of the sender
         self._settled_at = monotonic() + CONTACTS_FIRST_S if fleet.contacts else -c.NEVER
         self._disk = FleetDisk(fleet.state_file, self._state, self._on_written)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -10,8 +10,9 @@ from uavlinkd.authority.constants import CERTIFICATES_PER_ANSWER, WHO_INTERVAL_S
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.relay_records import Who
 
-WHO_SOON_S: Final = 0.5
-"""Between two questions of a round, and between rounds while they find members."""
+WHO_AGAIN_S: Final = 0.1
+"""Between two questions of a round, and between rounds while they find members: at least, and as long as an answer
+takes."""
 
 WHO_TRIES: Final = 2
 """A round ends after so many questions without an answer: one may be lost."""
@@ -31,15 +32,19 @@ class _Asking:
     """The highest serial of this round: ask on from there."""
     received: int = 0
     """Certificates since the last question."""
+    is_resting: bool = False
+    """All rounds have ended."""
 
 
 class MemberQuestions:
     """The questions to each relay that is up, by its static public key. Times are monotonic seconds.
 
     A round asks from serial 0 on until questions have no answer. There are more rounds, as parts of it may be lost.
+    ``wait_s``: how long a relay's answer may take, at least.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, wait_s: Callable[[bytes], float] = lambda _: 0.0) -> None:
+        self._wait_s = wait_s
         self._askings: dict[bytes, _Asking] = {}
 
     @property
@@ -66,8 +71,8 @@ class MemberQuestions:
                     asking.rounds += 1
                 yield relay, Who(roles, asking.after)
                 asking.tries, asking.received = asking.tries + 1, 0
-                is_rest = asking.tries == WHO_TRIES and asking.rounds >= WHO_ROUNDS
-                asking.due_at = now + (WHO_INTERVAL_S if is_rest else WHO_SOON_S)
+                asking.is_resting = asking.tries == WHO_TRIES and asking.rounds >= WHO_ROUNDS
+                asking.due_at = now + (WHO_INTERVAL_S if asking.is_resting else self._soon_s(relay))
 
     def note(self, relay: bytes, serial: int, now: float) -> None:
         """A relay sent the certificate with this serial. Ask for the others: at once if the answer was full.
@@ -75,14 +80,17 @@ class MemberQuestions:
         Without a question it is an introduction, which has no effect here.
         """
         asking = self._askings.get(relay)
-        if asking is None or asking.due_at > now + WHO_SOON_S:
+        if asking is None or asking.is_resting:
             return
         asking.received += 1
         asking.after = max(asking.after, serial)
-        soon = 0.0 if asking.received == CERTIFICATES_PER_ANSWER else WHO_SOON_S
-        asking.due_at = min(asking.due_at, now + soon)
+        soon_s = 0.0 if asking.received == CERTIFICATES_PER_ANSWER else self._soon_s(relay)
+        asking.due_at = min(asking.due_at, now + soon_s)
 
     def found(self, relay: bytes) -> None:
         """That certificate is accepted, and of a member that was not here."""
         if (asking := self._askings.get(relay)) is not None:
             asking.rounds = 0
+
+    def _soon_s(self, relay: bytes) -> float:
+        return max(self._wait_s(relay), WHO_AGAIN_S)
