@@ -8,7 +8,7 @@ from __future__ import annotations
 from uavlinkd.core import constants as c
 from uavlinkd.core import wire
 from uavlinkd.core.drops import DropReason
-from uavlinkd.core.outputs import Deliver, FreshnessUnverified, FreshnessVerified, Output
+from uavlinkd.core.outputs import Deliver, Output
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.problem_reports import ProblemReport
 from uavlinkd.core.refusals import RefusalReport
@@ -27,7 +27,6 @@ def deliver(peer: Peer, session: Session, counter: int, payload: bytes, now: flo
         return [*out, Deliver(peer, payload, session.order_of(counter))]
     if peer.unverified_since is None and now > verification.until + session.held.pace.hold_s:
         peer.unverified_since = now
-        out.append(FreshnessUnverified(peer))
     passing, waiting = peer.screen(payload)
     if passing:
         out.append(Deliver(peer, passing, session.order_of(counter)))
@@ -80,10 +79,8 @@ def receive_answer(peer: Peer, echo: wire.Echo, now: float) -> list[Output]:
         return []
     session.refuse_below(echo.fresh)
     session.verification.answered(request.sent_at, now)
+    peer.unverified_since = None
     out: list[Output] = []
-    if peer.unverified_since is not None:
-        out.append(FreshnessVerified(peer, now - peer.unverified_since))
-        peer.unverified_since = None
     if peer.round_trip_s <= session.held.pace.hold_s:
         session.trusted_until = now + c.LATE_AFTER_S
         out += peer.note_received(now)

@@ -136,20 +136,6 @@ class PathSuspected(NamedTuple):
     path: Path
 
 
-class FreshnessUnverified(NamedTuple):
-    """Frames of the peer arrive, but no answers: frames that must be new are held, the others are delivered."""
-
-    peer: LinkedPeer
-
-
-class FreshnessVerified(NamedTuple):
-    """The peer answers again, ``unverified_s`` after it stopped."""
-
-    peer: LinkedPeer
-    unverified_s: float
-
-
 PathEvent = PathChanged | PathStateChanged | PathSuspected
-FreshnessEvent = FreshnessUnverified | FreshnessVerified
-Event = PeerAdmitted | PeerExpired | PeerUp | PeerLost | PeerClosed | SessionEstablished | PathEvent | FreshnessEvent
+Event = PeerAdmitted | PeerExpired | PeerUp | PeerLost | PeerClosed | SessionEstablished | PathEvent
 Output = Transmit | Deliver | RecordReceived | Dropped | Event

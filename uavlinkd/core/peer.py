@@ -122,7 +122,7 @@ class Peer:
         """When an envelope or response that is known to be new arrived last."""
         self.round_trip_s: float | None = None
         self.unverified_since: float | None = None
-        """When unverified freshness was reported; None while frames are known to be new."""
+        """Since when frames that must be new are held, because no answers arrive; None while they are verified."""
         self.sent_at = now
         """When an envelope was sent last."""
         self.unanswered_since: float | None = None

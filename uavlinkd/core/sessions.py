@@ -113,16 +113,8 @@ class Sessions:
     """
 
     __slots__ = (
-        "_first_proofs",
-        "_has_smaller_key",
-        "_highest",
-        "_indices",
-        "_made",
-        "_peer",
-        "confirmed",
-        "current",
-        "twins",
-        "unconfirmed",
+        *("_first_proofs", "_has_smaller_key", "_highest", "_indices", "_made", "_peer"),
+        *("confirmed", "current", "twins", "unconfirmed"),
     )
 
     def __init__(self, indices: Indices[object], peer: str, *, has_smaller_key: bool) -> None:

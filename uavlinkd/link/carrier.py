@@ -304,7 +304,10 @@ class FrameCarrier:
                 if self._is_turn:
                     self._cost += cost_of(payload, len(frames))
                 if order:  # the peer has several paths
-                    frames = self._pick_newest(link, output, frames)
+                    came, frames = len(frames), link.pick_newest(frames, order, self._read_at)
+                    if count := came - len(frames):
+                        reason = ShellReason.SUPERSEDED
+                        self._parts.drops.add("frames_dropped", reason, link.name, count, monotonic())
                 elif link.output.repair.is_on:
                     link.note_requests(frames, self._read_at)
                 if link in self._frames:
@@ -329,12 +332,6 @@ class FrameCarrier:
                 self._switch.forward(link, frames, self._read_at, self._epoch)
         if self._node.next_deadline() < self._timer_at:
             self.arm()
-
-    def _pick_newest(self, link: PeerLink, delivered: Deliver, frames: list[Frame]) -> list[Frame]:
-        picked = link.pick_newest(frames, delivered.order, self._read_at)
-        if count := len(frames) - len(picked):
-            self._parts.drops.add("frames_dropped", ShellReason.SUPERSEDED, link.name, count, monotonic())
-        return picked
 
     def _drop_datagram(self, reason: DropReason, name: str = "", path: Path | None = None) -> None:
         """Count a datagram that the core does not drop."""
@@ -372,16 +369,12 @@ class FrameCarrier:
         parts.relays.on_event(event, now)
         link = self._links.get(event.peer)
         if link is not None and not isinstance(event, o.PathSuspected):
-            self._on_link_event(link, event, now)
+            parts.events.write(event, now)
+            if isinstance(event, o.PeerLost | o.PeerClosed):
+                link.on_down(now, is_closed=isinstance(event, o.PeerClosed))
+            elif not isinstance(event, o.PeerUp):
+                link.follow_paths(now)
         self.arm()
-
-    def _on_link_event(self, link: PeerLink, event: o.Event, now: float) -> None:
-        parts = self._parts
-        parts.events.write(event, now)
-        if isinstance(event, o.PeerLost | o.PeerClosed):
-            link.on_down(now, is_closed=isinstance(event, o.PeerClosed))
-        elif isinstance(event, o.PathChanged | o.PathStateChanged | o.SessionEstablished):
-            link.follow_paths(now)
 
     # Time.
 

@@ -64,19 +64,6 @@ KNOWN_S: Final = 30.0
 class _Waiting:
     """A sealed datagram that waits: a copy for one path, or an envelope that is sent again along its paths."""
 
-    __slots__ = (
-        "datagram",
-        "due_at",
-        "is_copy",
-        "is_replaceable",
-        "last",
-        "number",
-        "paths",
-        "put_at",
-        "rank",
-        "states",
-    )
-
     def __init__(
         self, datagram: bytes, paths: Sequence[Path], frames: Sequence[Frame], last: int, now: float
     ) -> None:

@@ -156,27 +156,18 @@ class DropSummary:
         if phase is Phase.BEGAN:
             self._log.warning(key[0], count=condition.count, **self._facts(key), **omitted)
             return
-        write, event = (
-            (self._log.warning, "drops_continued") if phase is Phase.CONTINUED else (self._log.info, "drops_ended")
-        )
-        write(
-            event,
-            kind=key[0],
-            count=condition.count,
-            duration_s=condition.duration_s,
-            **self._facts(key, with_meaning=False),
-            **omitted,
-        )
+        counted = {"kind": key[0], "count": condition.count, "duration_s": condition.duration_s}
+        facts = {**counted, **self._facts(key, with_meaning=False), **omitted}
+        if phase is Phase.CONTINUED:
+            self._log.warning("drops_continued", **facts)
+        else:
+            self._log.info("drops_ended", **facts)
 
     def _facts(self, key: Key, *, with_meaning: bool = True) -> dict[str, str]:
         kind = self._kinds[key]
         meaning = kind.reason.meaning if isinstance(kind.reason, Reason) else meaning_of(kind.reason)
-        facts = {
-            "reason": kind.reason,
-            "who": key[2],
-            "meaning": "" if not with_meaning else meaning,
-            "last": _describe(kind.last, kind.reason),
-        }
+        facts = {"reason": kind.reason, "who": key[2], "meaning": meaning if with_meaning else ""}
+        facts["last"] = _describe(kind.last, kind.reason)
         return {field: fact for field, fact in facts.items() if fact}
 
     def on_loop_failure(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:

@@ -94,8 +94,6 @@ class EventLog:
 
     def write(self, event: o.Event, now: float) -> None:
         """Write an event, within the limit of its peer. ``now`` is monotonic seconds."""
-        if isinstance(event, o.FreshnessEvent):  # a finding reports it
-            return
         if isinstance(event, o.SessionEstablished) and event.rekey:
             omitted = self._limits.take("debug", event.peer.name, now)
             if omitted is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Container, Iterator
+from typing import Final
 
 from uavlinkd.authority.exchange import ROLLED_BACK
 from uavlinkd.authority.trust import BulletinVerdict
@@ -78,39 +79,37 @@ def _bulletins(noticed: dict[str, tuple[float, str]]) -> Iterator[Found]:
         )
 
 
+_REFUSED: Final = {
+    DropReason.BAD_CERTIFICATE: warning(
+        "bad_certificate",
+        "the authority of this fleet did not sign the certificate of",
+        "if the sender is yours, run `uavlinkd enroll` there again, for this fleet; else it is an attacker",
+    ),
+    DropReason.CERTIFICATE_REVOKED: warning(
+        "certificate_revoked",
+        "refused, because the bulletin revokes it, or `deny` in this file names it:",
+        "none if it was captured; else let the authority sign it again",
+    ),
+    DropReason.MEMBER_CONFLICT: warning(
+        "member_conflict",
+        "two members claim one name or system id, and one is refused:",
+        "sign one of them again with another name and other ids, and revoke the certificate that it had",
+    ),
+    DropReason.ROLE_NOT_ACCEPTED: warning(
+        "role_not_accepted",
+        "this file has no policy for members of its role:",
+        'none if that is meant, as with operator = "pinned"; else write a [[fleet_role]]',
+    ),
+}
+"""The senders follow each text."""
+
+
 def _refused(moment: Moment, held: Container[Detail]) -> Iterator[Found]:
     named: set[SocketAddress | None] = set()
-
-    def who(reason: DropReason) -> str:
-        details = _seen(moment, reason)
-        named.update(details.values())
-        return details_at(details)
-
-    if senders := who(DropReason.BAD_CERTIFICATE):
-        yield warning(
-            "bad_certificate",
-            f"the authority of this fleet did not sign the certificate of {senders}",
-            "if the sender is yours, run `uavlinkd enroll` there again, for this fleet; else it is an attacker, and"
-            " refused",
-        )
-    if senders := who(DropReason.CERTIFICATE_REVOKED):
-        yield warning(
-            "certificate_revoked",
-            f"refused, because the bulletin revokes it, or `deny` in this file names it: {senders}",
-            "none if it was captured; else let the authority sign it again",
-        )
-    if senders := who(DropReason.MEMBER_CONFLICT):
-        yield warning(
-            "member_conflict",
-            f"two members claim one name or system id, and one is refused: {senders}",
-            "sign one of them again with another name and other ids, and revoke the certificate that it had",
-        )
-    if senders := who(DropReason.ROLE_NOT_ACCEPTED):
-        yield warning(
-            "role_not_accepted",
-            f"this file has no policy for members of its role: {senders}",
-            'none if that is meant, as with operator = "pinned"; else write a [[fleet_role]]',
-        )
+    for reason, found in _REFUSED.items():
+        if details := _seen(moment, reason):
+            named.update(details.values())
+            yield found._replace(text=f"{found.text} {details_at(details)}")
     unknown = _seen(moment, DropReason.UNKNOWN_PEER)
     if strangers := {key: at for key, at in unknown.items() if key not in held and at not in named}:
         yield warning(
