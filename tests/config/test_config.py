@@ -58,7 +58,7 @@ def test_ten_lines_are_enough(tmp_path: Path) -> None:
     assert (peer.name, peer.settings.public_key) == ("drone1", keys.decode_key(KEY["drone1"]))
     assert peer.addresses == (PeerAddress(Address("10.13.0.2", 5790)),)
     assert (peer.settings.link, peer.settings.psk, peer.egress) == (Link(), None, EgressSettings())
-    assert (config.log.level, config.log.format, config.routing.relay) == ("info", "auto", False)
+    assert (config.log.level, config.log.format, config.relays_frames) == ("info", "auto", False)
     assert (config.control_socket, config.metrics, config.recording, config.networks) == (None, None, None, ())
     assert config.warnings == ()
 
@@ -73,7 +73,7 @@ def test_every_section_is_read(tmp_path: Path) -> None:
     )
     assert config.control_socket == tmp_path / "a.sock"
     assert (config.endpoints[0].radio_status, config.endpoints[0].status_text) == (True, True)
-    assert config.routing.relay
+    assert config.relays_frames
     assert config.metrics == Address("127.0.0.1", 9790)
     assert (config.log.level, config.log.format) == ("debug", "json")
     assert config.recording == Recording(tmp_path / "flights", 100, 1_000_000_000)

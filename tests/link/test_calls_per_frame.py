@@ -22,7 +22,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from tests.daemon.udp import Client, open_client
 from tests.endpoints.clients import address_of
 from tests.waiting import until
-from uavlinkd.config.model import Config, EndpointConfig, Log, PeerAddress, PeerConfig, Routing
+from uavlinkd.config.model import Config, EndpointConfig, Log, PeerAddress, PeerConfig
 from uavlinkd.core.crypto import KeyPair, Secret
 from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.endpoints.udp import UdpEndpoint
@@ -76,7 +76,7 @@ def config(name: str, url: NetworkUrl, peer: str, addresses: tuple[Address, ...]
         peers=(
             PeerConfig(PeerSettings(peer, PUBLIC[peer], None, Link()), tuple(map(PeerAddress, addresses)), rules),
         ),
-        routing=Routing(),
+        relays_frames=False,
         control_socket=None,
         metrics=None,
         recording=None,

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from itertools import combinations
 from math import ceil
 
-from uavlinkd.config.model import Config, EndpointConfig, FleetConfig, PeerAddress, PeerConfig, Routing
+from uavlinkd.config.model import Config, EndpointConfig, FleetConfig, PeerAddress, PeerConfig
 from uavlinkd.core import constants as c
 from uavlinkd.core.certificates import parse_bulletin, parse_certificate
 from uavlinkd.core.wire import initiation_bytes, response_bytes
@@ -42,13 +42,13 @@ def advice(config: Config) -> Iterator[str]:
     for warning, names in about.items():
         yield f"{'every peer' if names == every and len(every) > 1 else ', '.join(names)}: {warning}"
     yield from _shared_systems(endpoints, peers)
-    yield from _relayed(peers, config.routing)
+    yield from _relayed(peers, config.relays_frames)
     yield from _exposed_metrics(config.metrics)
     yield from _reach(() if config.has_ip_networks else config.listen, peers)
     yield from _shared(peers)
     if config.is_only_relay:
         return
-    if not endpoints and not (config.routing.relay and len(peers) > 1):
+    if not endpoints and not (config.relays_frames and len(peers) > 1):
         yield "there is no [[endpoint]]: no MAVLink client can connect to this daemon"
     if not peers and config.fleet is None:
         yield "there is no [[peer]]: this daemon makes no link"
@@ -147,9 +147,9 @@ def _shared_systems(endpoints: Sequence[EndpointConfig], peers: Sequence[PeerCon
         )
 
 
-def _relayed(peers: Sequence[PeerConfig], routing: Routing) -> Iterator[str]:
+def _relayed(peers: Sequence[PeerConfig], relays_frames: bool) -> Iterator[str]:
     vehicles = [f'"{peer.name}"' for peer in peers if peer.policy.get("role") == "vehicle"]
-    if routing.relay and len(vehicles) > 1:
+    if relays_frames and len(vehicles) > 1:
         yield (
             f'relay = true, and peers {", ".join(vehicles)} have the role "vehicle": the answers of a vehicle to its'
             " operator (mission items, parameters, file transfer) are writes to another vehicle, so a captured"

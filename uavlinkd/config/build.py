@@ -23,7 +23,6 @@ from uavlinkd.config.model import (
     Recording,
     RelayConfig,
     RelayServer,
-    Routing,
 )
 from uavlinkd.config.network_rules import network_of
 from uavlinkd.config.problems import Found, Sections, Values, role_of
@@ -75,7 +74,7 @@ def build(path: Path, file: Sections, states: Path) -> Config:
         listen=tuple(top.get("listen", ())),
         endpoints=tuple(_endpoint(endpoint) for endpoint in file.endpoints),
         peers=(*pinned, *(_contact_peers(file, fleet) if fleet else ())),
-        routing=Routing(**file.routing.valid),
+        relays_frames=file.routing.get("relay", False),
         control_socket=file.folder / socket if socket else None,
         metrics=file.metrics.get("listen"),
         recording=_recording(file),

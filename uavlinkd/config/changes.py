@@ -16,7 +16,7 @@ _FIXED = {
     "networks": "network",
     "control_socket": "control_socket",
     "log": "log",
-    "routing": "routing",
+    "relays_frames": "routing",
     "metrics": "metrics",
     "recording": "recording",
 }

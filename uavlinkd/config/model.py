@@ -217,13 +217,6 @@ class FleetConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class Routing:
-    """``relay``: whether frames from a peer may go to other peers."""
-
-    relay: bool = False
-
-
-@dataclass(frozen=True, slots=True)
 class Recording:
     """Recordings of the frames on the link: the newest ``max_files``. ``min_free_bytes`` stay free on the disk."""
 
@@ -244,7 +237,8 @@ class Log:
 class Config:
     """The complete configuration of a daemon. Its secrets do not print.
 
-    ``listen`` is empty if the daemon only initiates. ``metrics`` is the address of the server for Prometheus.
+    ``listen`` is empty if the daemon only initiates. ``relays_frames``: whether frames from a peer may go to other
+    peers. ``metrics`` is the address of the server for Prometheus.
     ``warnings`` are sentences for a person; the daemon runs in spite of them. If ``networks`` has no interface or
     address, the kernel's routes decide how to reach peers over IP.
     """
@@ -256,7 +250,7 @@ class Config:
     listen: tuple[Address, ...]
     endpoints: tuple[EndpointConfig, ...]
     peers: tuple[PeerConfig, ...]
-    routing: Routing
+    relays_frames: bool
     control_socket: Path | None
     metrics: Address | None
     recording: Recording | None

@@ -144,42 +144,35 @@ def _host_of(packed: bytes) -> str:
 
 def parse_record(data: bytes) -> Record:
     """The record in decrypted bytes. Raises ``BAD_CONTROL``."""
-    kind, size = data[:1], len(data)
-    if kind == bytes((BIND,)):
+    kind, size = data[0] if data else 0, len(data)
+    if kind == BIND:
         count, rest = divmod(size - 1, c.KEY_BYTES)
         if not rest and 1 <= count <= c.KEYS_PER_BIND:
             return Bind(tuple(data[at : at + c.KEY_BYTES] for at in range(1, size, c.KEY_BYTES)))
-    elif kind == bytes((BOUND,)) and size > _BOUND_HEADER.size:
+    elif kind == BOUND and size > _BOUND_HEADER.size:
         count, rest = divmod(size - _BOUND_HEADER.size, _ENTRY.size)
         if not rest and count <= c.ENTRIES_PER_BOUND:
             _, packed, port = _BOUND_HEADER.unpack_from(data)
             entries: Iterator[tuple[bytes, int]] = _ENTRY.iter_unpack(data[_BOUND_HEADER.size :])
             return Bound(_host_of(packed), port, tuple(entries))
-    elif kind == bytes((CANDIDATES,)):
+    elif kind == CANDIDATES:
         count, rest = divmod(size - 1, _PLACE.size)
         if not rest and 1 <= count <= c.CANDIDATES:
             places: Iterator[tuple[bytes, int]] = _PLACE.iter_unpack(data[1:])
             return Candidates(tuple((_host_of(packed), port) for packed, port in places))
-    elif kind == bytes((FILTER_TEST,)) and size == c.FILTER_TEST_BYTES and not any(data[_TOKEN_END:]):
+    elif kind == FILTER_TEST and size == c.FILTER_TEST_BYTES and not any(data[_TOKEN_END:]):
         return FilterTest(data[1:_TOKEN_END])
-    elif kind == bytes((FILTER_TESTED,)) and size == _TOKEN_END:
+    elif kind == FILTER_TESTED and size == _TOKEN_END:
         return FilterTested(data[1:])
-    elif (record := _fleet_record(data)) is not None:
-        return record
-    raise Drop(DropReason.BAD_CONTROL)
-
-
-def _fleet_record(data: bytes) -> FleetRecord | None:
-    kind, size = data[0] if data else 0, len(data)
-    if kind == HAVE and size == _HAVE.size:
+    elif kind == HAVE and size == _HAVE.size:
         return Have(*_HAVE.unpack(data)[1:])
-    if kind == BULLETIN and size > 1:  # its own parser checks it
+    elif kind == BULLETIN and size > 1:  # its own parser checks it
         return BulletinRecord(data[1:])
-    if kind == CERTIFICATE and size == _CERTIFIED_BYTES:
+    elif kind == CERTIFICATE and size == _CERTIFIED_BYTES:
         return CertificateRecord(data[1 : 1 + c.KEY_BYTES], data[1 + c.KEY_BYTES :])
-    if kind == WHO and size == _WHO.size:
+    elif kind == WHO and size == _WHO.size:
         return Who(*_WHO.unpack(data)[1:])
-    return None
+    raise Drop(DropReason.BAD_CONTROL)
 
 
 def binds_of(keys: Sequence[bytes]) -> Iterator[Bind]:

@@ -59,7 +59,7 @@ class DaemonParts:
         self.stall = StallWatch(now, self._on_pause)
         self.peer_sockets = sockets = PeerSockets(self.stall, self.drops, self.evidence, log, node)
         self.events = EventLog(log, limits, sockets.network_name)
-        self.switch = Switch(Router[PeerLink | LocalPort](relays=config.routing.relay), self.stall, self.drops)
+        self.switch = Switch(Router[PeerLink | LocalPort](relays=config.relays_frames), self.stall, self.drops)
         self.local = LocalEndpoints(config.name, self.switch, self.events, self.stall)
         self.recorder: Recorder | None = None
         """From the start on, if the daemon records."""

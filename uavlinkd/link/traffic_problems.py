@@ -222,7 +222,7 @@ def _roles_exchanged(peer: PeerFacts, *, is_blocked: bool) -> Iterator[Found]:
     refused = peer.history.incoming.reasons.within(REFUSED_S, peer.now)
     withheld = peer.history.outgoing.reasons.within(REFUSED_S, peer.now)
     # With routing.relay the frames may be those of other peers.
-    is_withheld = Refusal.MESSAGE_NOT_ALLOWED in withheld and not peer.daemon.config.routing.relay
+    is_withheld = Refusal.MESSAGE_NOT_ALLOWED in withheld and not peer.daemon.config.relays_frames
     sign = ""
     if role == "vehicle":
         is_one = "a vehicle"

@@ -122,7 +122,7 @@ def _identity(config: Config) -> Iterator[tuple[str, str | Text]]:
     yield "public key", encode_key(config.public_key)  # whole: the user copies it into the files of the peers
     yield "listens on", _listening(config)
     if not config.is_only_relay:
-        others = ", and from peer to peer" if config.routing.relay else " only"
+        others = ", and from peer to peer" if config.relays_frames else " only"
         yield "routing", f"between peers and endpoints{others}"
     if config.metrics is not None:
         yield "metrics", f"http://{config.metrics}/metrics"
@@ -297,16 +297,10 @@ def table_rows(policy: Policy, data: PolicyData) -> _Rows:
     A message passes in a direction if a row allows its group or its name, and no row refuses a whole group that
     contains it.
     """
-    rows = []
-    for row in policy.describe():
-        if row.subject == "rates":
-            # As in the file: a group may have a hundred messages, each with this rate.
-            role = ROLES.get(str(data.get("role")))
-            sides = _rates(data.get("rate_in"), role.rate_in if role else {}), _rates(data.get("rate_out"), {})
-            rows.append(PolicyRow(row.subject, *sides))
-        elif row.subject not in _NOT_IN_TABLES:
-            rows.append(row)
-    return tuple(rows)
+    role = ROLES.get(str(data.get("role")))
+    # As in the file: a group may have a hundred messages, each with this rate.
+    rates = _rates(data.get("rate_in"), role.rate_in if role else {}), _rates(data.get("rate_out"), {})
+    return *(row for row in policy.describe() if row.subject not in _NOT_IN_TABLES), PolicyRow("rates", *rates)
 
 
 def _rates(written: object, by_role: Mapping[str, float]) -> str:

@@ -73,7 +73,6 @@ class Policy:
             PolicyRow("messages unknown to the dialect", *unknown),
             PolicyRow("MAVLink 1", mavlink1, mavlink1),
             PolicyRow("ground station's HEARTBEAT", _passes(settings.ground_station), "passes"),
-            PolicyRow("rates", *map(_rates_text, settings.rates.values())),
         ]
 
 
@@ -164,7 +163,3 @@ def _numbers_text(rules: Rules) -> str:
 def _lists_text(allowed: Iterable[str], denied: Iterable[str]) -> str:
     texts = {"allowed": ", ".join(allowed), "denied": ", ".join(denied)}
     return "; ".join(f"{verdict}: {text}" for verdict, text in texts.items() if text) or "-"
-
-
-def _rates_text(rates: Mapping[int, float]) -> str:
-    return ", ".join(f"{dialect.name_of(msgid)} {rate:g}/s" for msgid, rate in sorted(rates.items())) or "-"
