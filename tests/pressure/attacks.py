@@ -11,12 +11,13 @@ import select
 import socket
 import sys
 from base64 import b64decode
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from time import monotonic
 from unittest.mock import patch
 
+from tests.authority.signing import CERTIFICATE, signed
 from tests.kernel_queues import memory_of, receive_queue
 from uavlinkd.core import constants as c
 from uavlinkd.core import handshake, wire
@@ -32,6 +33,8 @@ from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.core.suites import SUITES_BY_NAME, X25519
 
 HOSTS = tuple(f"127.0.0.{number}" for number in range(2, 6))
+STRANGERS_HOSTS = tuple(f"127.2.{number}.9" for number in range(50))
+STRANGERS = 200
 SPOOFED_SOCKETS = 500
 FRAME_BYTES = 8
 STARTS_FRAME_BYTES = 266
@@ -110,27 +113,57 @@ def initiations(target: Target) -> None:
 
     The daemon cannot tell them from recorded ones that it reads for the first time.
     """
-    socks = [_socket(host) for host in HOSTS]
-    cookies: dict[socket.socket, bytes] = {}
-    macs = MacKeys(b64decode(target.public_key))
     captured, settings = KeyPair(b64decode(target.captured_key)), target.settings()
-    sent: dict[tuple[socket.socket, int], bytes] = {}
-    number = 0
     share = FfdheGroup(int(target.suite.removeprefix("ffdhe"))).generate(os.urandom)
     with patch.object(FfdheGroup, "generate", lambda *_: share):  # the attacker does not pay for what it never uses
-        for due in _ticks(target.per_s):
-            for _ in range(due):
-                number += 1
-                sock, index = socks[number % len(socks)], 1 + number % 65535
-                message = handshake.initiate(captured, settings, index, 0, os.urandom).message
-                datagram = macs.add_macs(message, cookies.get(sock))
-                sent[sock, index] = mac1_of(datagram)
-                _send(sock, datagram, target)
-            for sock in socks:
-                for answer in _received(sock):
-                    with suppress(Drop, KeyError):
-                        reply = wire.parse_cookie_reply(answer)
-                        cookies[sock] = macs.open_cookie(reply, sent[sock, reply.receiver_index])
+        _initiate(target, HOSTS, lambda index: handshake.initiate(captured, settings, index, 0, os.urandom).message)
+
+
+def strangers(target: Target) -> None:
+    """Initiations of keys that the daemon does not know, from many hosts that answer with their cookies."""
+    _initiate_as_strangers(target, b"")
+
+
+def certificates(target: Target) -> None:
+    """The same, each with a certificate that the authority signed for another key."""
+    _initiate_as_strangers(target, signed(CERTIFICATE, os.urandom(c.KEY_BYTES)))
+
+
+def silence(target: Target) -> None:
+    """Nothing, to compare with."""
+    for _ in _ticks(target.per_s):
+        pass
+
+
+def _initiate_as_strangers(target: Target, certificate: bytes) -> None:
+    settings = target.settings()
+    messages = [
+        handshake.initiate(KeyPair(os.urandom(c.KEY_BYTES)), settings, 1 + number, 0, os.urandom, certificate).message
+        for number in range(STRANGERS)
+    ]
+    # The daemon remembers only the messages of peers: it reads these again.
+    _initiate(target, STRANGERS_HOSTS, lambda index: messages[(index - 1) % STRANGERS])
+
+
+def _initiate(target: Target, hosts: Sequence[str], message: Callable[[int], bytes]) -> None:
+    """Send initiations from hosts that answer with their cookies. ``message``: the next one, by a number."""
+    socks = [_socket(host) for host in hosts]
+    cookies: dict[socket.socket, bytes] = {}
+    macs = MacKeys(b64decode(target.public_key))
+    sent: dict[tuple[socket.socket, int], bytes] = {}
+    number = 0
+    for due in _ticks(target.per_s):
+        for _ in range(due):
+            number += 1
+            sock = socks[number % len(socks)]
+            datagram = macs.add_macs(message(1 + number % 65535), cookies.get(sock))
+            sent[sock, wire.parse_initiation(datagram).sender_index] = mac1_of(datagram)
+            _send(sock, datagram, target)
+        for sock in socks:
+            for answer in _received(sock):
+                with suppress(Drop, KeyError):
+                    reply = wire.parse_cookie_reply(answer)
+                    cookies[sock] = macs.open_cookie(reply, sent[sock, reply.receiver_index])
 
 
 def spoofed(target: Target) -> None:
@@ -222,7 +255,9 @@ def _received(sock: socket.socket) -> Iterator[bytes]:
             yield sock.recv(65536)
 
 
-ATTACKS = {item.__name__: item for item in (initiations, spoofed, envelopes, starts)}
+ATTACKS = {
+    item.__name__: item for item in (initiations, strangers, certificates, silence, spoofed, envelopes, starts)
+}
 
 if __name__ == "__main__":
     ATTACKS[sys.argv[1]](Target(**json.loads(sys.stdin.readline())))

@@ -24,6 +24,9 @@ datagrams while the daemon waits for a processor, however long that takes: 20 da
 # Reasons that must be counted, and the share of a core that the daemon may use; None: all of it.
 EXPECTED: dict[str, tuple[set[str], float | None]] = {
     "insider initiations": ({"group_budget_spent"}, 0.5),
+    "no attack": (set(), 0.5),
+    "strangers": ({"unknown_peer"}, 0.5),
+    "bad certificates": ({"bad_certificate"}, 0.5),
     "spoofed initiations": ({"rate_limited", "cookie_required"}, 0.5),
     "64 kB envelopes": ({"too_long"}, 0.5),
     "agreed envelopes": ({"over_share"}, None),
