@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.bench import held
 from tests.bench.measure import resident_bytes
 from tests.bench.relay import turn
 from tests.bench.relay.load import Generator
@@ -71,3 +72,9 @@ def test_addresses_in_stun() -> None:
     response = turn.message(0x0103, bytes(12), {0x0022: b"test", 0x0016: value})
     assert turn.relayed_address(response) == ("192.0.2.1", 32853)
     assert turn.relayed_address(turn.message(0x0103, bytes(12), {0x0022: b"test"})) is None
+
+
+async def test_certificates_are_held() -> None:
+    """The daemon holds as many as it is asked about, and none of their links is up."""
+    before, after = await held.memory(PAIRS, SECONDS)
+    assert 1e6 < before <= after

@@ -22,13 +22,16 @@ LINK = Link(features=c.FEATURE_RECORDS)
 
 
 class CoreMember:
-    """Keeps a session with the relay. It does not bind by itself."""
+    """Keeps a session with the relay. It does not bind by itself. ``certify`` makes the certificate for its key."""
 
-    def __init__(self, relay_key: bytes, relay: Sockaddr) -> None:
+    def __init__(
+        self, relay_key: bytes, relay: Sockaddr, certify: Callable[[bytes], bytes] = lambda key: b""
+    ) -> None:
         private = os.urandom(c.KEY_BYTES)
         self.key = KeyPair(private).public
         self.node = Node(Secret(private), os.urandom, monotonic())
         self.peer = self.node.add_peer(PeerSettings("relay", relay_key, None, LINK), monotonic())
+        self.peer.initiator.certificate = certify(self.key)
         self.path = Path(0, relay)
         self.node.set_paths(self.peer, [self.path], monotonic())
         self.sock = open_socket("127.0.0.1")
