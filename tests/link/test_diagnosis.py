@@ -69,7 +69,7 @@ class Daemon(Scene):
                 public_key=OWN_KEY,
                 listen=[Address("0.0.0.0", 5799)],
                 endpoints=[],
-                routing=SimpleNamespace(relay=False),
+                relays_frames=False,
             ),
             links=self.links,
             node=self.node,
