@@ -50,10 +50,10 @@ class Membership(Protocol):
     def add_member(self, config: PeerConfig, peer: Peer | None) -> None:
         """Carry frames to a member. ``peer``: it is in the core already."""
 
-    def remove_member(self, name: str) -> None:
-        """End the link at once, without a close."""
+    def remove_peer(self, name: str, *, closes: bool) -> None:
+        """End the link at once. ``closes``: with a close."""
 
-    def change_member(self, config: PeerConfig) -> None:
+    def change_peer(self, config: PeerConfig) -> None:
         """Apply another policy."""
 
 
@@ -150,7 +150,7 @@ class FleetMembers:
                 self._end(key, now)
                 continue
             if link is not None and (config_now := self._config_of(key)) != link.config:
-                self._membership.change_member(config_now)
+                self._membership.change_peer(config_now)
             if self._relay is not None and key in self._relay.members:
                 self._serve(key, now)
 
@@ -373,7 +373,7 @@ class FleetMembers:
             if relay.config.settings.public_key == key:
                 self._relays.remove(name, now)
         for name in [name for name, link in self._links.items() if link.key == key]:
-            self._membership.remove_member(name)
+            self._membership.remove_peer(name, closes=False)
         if (peer := self._node.find(key)) is not None:
             self._node.remove_peer(peer, now, closes=False)
 

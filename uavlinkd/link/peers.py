@@ -42,13 +42,31 @@ class Peers:
         self._add_relays()  # a contact that is back may be one
         self._follow_members()
 
-    def remove_member(self, name: str) -> None:
-        """End the link with a member at once, without a close."""
-        self._remove_peer(name, closes=False)
+    def remove_peer(self, name: str, *, closes: bool = True) -> None:
+        """End the link at once: nothing of this peer is accepted any more."""
+        parts = self._parts
+        parts.peer_sockets.stop_following(name)
+        link = parts.links[name]
+        parts.switch.remove(link)
+        link.leave(monotonic(), closes=closes)
+        if parts.fleet is not None:
+            parts.fleet.forget(link.key)
+        del parts.links[name]
+        self._map_peers()
+        self._note_delays()
+        parts.events.forget(name)
+        parts.drops.forget(name)
 
-    def change_member(self, config: PeerConfig) -> None:
-        """Apply another policy to a member."""
-        self._change_peer(config)
+    def change_peer(self, config: PeerConfig) -> None:
+        """Apply other rules or addresses to the same identity. Its session continues."""
+        parts, link = self._parts, self._parts.links[config.name]
+        parts.peer_sockets.stop_following(config.name)
+        link.change(config, monotonic())
+        self._map_peers()
+        parts.switch.set_policy(link, link.policy)
+        parts.drops.forget(config.name)  # the new policy may withhold other frames
+        self._note_delays()
+        parts.peer_sockets.follow(link)
 
     def follow(self, config: Config, changes: ConfigChanges) -> None:
         """Apply the changes of a new configuration."""
@@ -64,7 +82,7 @@ class Peers:
                 perform(parts.relays.remove(name, monotonic()))
         for name in changes.removed_peers:
             if (link := parts.links.get(name)) is not None and link.key == keys[name]:
-                self._remove_peer(name)
+                self.remove_peer(name)
         # First of all give up names and keys: what is added may have them.
         if parts.relay is not None and config.relay_server is not None:
             parts.relay.release(config.relay_server.by_key, config.keys_of_others, monotonic())
@@ -73,7 +91,7 @@ class Peers:
                 parts.relays.change(relay)
         for peer in changes.changed_peers:
             if (link := parts.links.get(peer.name)) is not None and link.key == peer.settings.public_key:
-                self._change_peer(peer)
+                self.change_peer(peer)
         # Also those that a bulletin or a name in `deny` had ended, and that are accepted again.
         for peer in config.peers:
             if peer.name not in parts.links:
@@ -117,32 +135,6 @@ class Peers:
         parts.links[config.name] = link
         self._map_peers()
         parts.switch.add(link, link.policy)
-        self._note_delays()
-        parts.peer_sockets.follow(link)
-
-    def _remove_peer(self, name: str, *, closes: bool = True) -> None:
-        """End the link at once: nothing of this peer is accepted any more."""
-        parts = self._parts
-        parts.peer_sockets.stop_following(name)
-        link = parts.links[name]
-        parts.switch.remove(link)
-        link.leave(monotonic(), closes=closes)
-        if parts.fleet is not None:
-            parts.fleet.forget(link.key)
-        del parts.links[name]
-        self._map_peers()
-        self._note_delays()
-        parts.events.forget(name)
-        parts.drops.forget(name)
-
-    def _change_peer(self, config: PeerConfig) -> None:
-        """Apply other rules or addresses to the same identity. Its session continues."""
-        parts, link = self._parts, self._parts.links[config.name]
-        parts.peer_sockets.stop_following(config.name)
-        link.change(config, monotonic())
-        self._map_peers()
-        parts.switch.set_policy(link, link.policy)
-        parts.drops.forget(config.name)  # the new policy may withhold other frames
         self._note_delays()
         parts.peer_sockets.follow(link)
 
