@@ -36,8 +36,6 @@ PAIRS = [HEX[at : at + 2] for at in range(0, 64, 2)]
 @pytest.mark.parametrize(
     ("text", "redacted"),
     [
-        (f"{OTHER_KEY} {KEY} {KEY[:8]}... {'Ab1' * 3}...", "key-1 key-2 key-2... Ab1Ab1Ab1..."),
-        (f"drone1  {KEY[:8]}...  10", "drone1  key-1...  10"),
         (f'public_key = "{KEY[:30]}"', 'public_key = "key-1"'),
         (f"PrivateKey = {KEY[:-1]}", "PrivateKey = key-1"),
         (f"PresharedKey={KEY}", "PresharedKey=key-1"),
@@ -52,7 +50,7 @@ PAIRS = [HEX[at : at + 2] for at in range(0, 64, 2)]
     ],
 )
 def test_keys_in_any_form_are_replaced(text: str, redacted: str) -> None:
-    """Whole, damaged, their beginning, without padding, in dumps, in TOML, JSON, JSON in JSON, WireGuard's format."""
+    """Whole, damaged, without padding, in dumps, in TOML, JSON, JSON in JSON, WireGuard's format."""
     assert Redactor().redact(text) == redacted
 
 

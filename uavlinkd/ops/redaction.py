@@ -18,8 +18,6 @@ _KEY: Final = re.compile(
     r"(?![A-Za-z0-9+/=_-])"
 )
 """32 or 64 bytes as base64 or hexadecimal digits, or at least 32 bytes as pairs of digits."""
-_BEGINNING: Final = re.compile(r"(?<![A-Za-z0-9+/_-])[A-Za-z0-9+/]{8}(?=\.\.\.)")
-"""The first characters of a key, as ``check`` shows them."""
 _LONG: Final = re.compile(r"[A-Za-z0-9+/_-]{40,88}={0,2}")
 """What may be a damaged key, if it has letters of both kinds and digits."""
 _IPV4: Final = re.compile(r"(?<![\w.])\d{1,3}(?:\.\d{1,3}){3}(?![\w]|\.\d)")
@@ -49,7 +47,6 @@ class Redactor:
         text = _KEY.sub(lambda match: self._key(match[0]), text)
         text = _KEY_VALUE.sub(lambda match: match[1] + self._value(match[2]), text)
         text = _LONG.sub(lambda match: self._key(match[0]) if _is_mixed(match[0]) else match[0], text)
-        text = _BEGINNING.sub(lambda match: self._key_with(match[0]), text)
         text = _IPV4.sub(lambda match: self._address(match[0]), text)
         text = _IPV6.sub(lambda match: self._address(match[0]), text)
         for host, name in sorted(self._peers.items(), key=lambda item: -len(item[0])):
@@ -59,11 +56,6 @@ class Redactor:
 
     def _key(self, key: str) -> str:
         return self._keys.setdefault(key.rstrip("="), f"key-{len(self._keys) + 1}")
-
-    def _key_with(self, beginning: str) -> str:
-        """The pseudonym of the key that begins so."""
-        known = (name for key, name in self._keys.items() if key.startswith(beginning))
-        return next(known, None) or self._key(beginning)
 
     def _value(self, value: str) -> str:
         quote = value[: len(value) - len(value.lstrip("\"'\\"))]
