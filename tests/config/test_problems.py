@@ -89,9 +89,10 @@ _AT_TOP_ROWS = [
     ('folder = "flights"', "folder", "in [recording]"),
     ("tag_bits = 96", "tag_bits", "in [link] or in a [[peer]]"),
     (f'private_key = "{KEY["b"]}"', "private_key", "this file never contains a key"),
+    ('previous_private_key_file = "a.key"', "previous_private_key_file", "`uavlinkd fleet rotate NAME` writes"),
 ]
 _URLS, _SECOND = "endpoint[1].url (gcs)", "endpoint[0] (autopilot)"
-_PSK = 'psk_file = "pair.psk"'
+_PREVIOUS, _PSK = f'previous_public_key = "{KEY["vps"]}"', 'psk_file = "pair.psk"'
 _MEMBERS = member("drone1") + member("b")
 _AS_PEER = relay(key=KEY["drone1"])
 # Whole files.
@@ -194,6 +195,7 @@ _FILE_ROWS = [
     (relays(relay() + relay("b") + relay("c") + relay("d")), "relay", "at most 3"),
     (relays(relay() + relay("vps", key=KEY["b"], addresses='["b:1"]')), "relay[1].name (vps)", "of relay[0] (vps)"),
     (relays(relay() + relay("b", key=KEY["vps"])), "relay[1].public_key (b)", "each relay has its own"),
+    (relays(relay(more=_PREVIOUS)), "relay[0].previous_public_key (vps)", "was removed: to change a key, write the"),
     (relays(_AS_PEER + _PSK + "\n"), "relay[0].psk_file (vps)", "because peer[0] (drone1) has the same"),
     (relays(relay(key=KEY["drone1"], addresses="[]")), "relay[0].addresses (vps)", "a relay never initiates"),
     (relays(_AS_PEER, 'relays = ["vps"]'), "peer[0].relays (drone1)", "which has this peer's key"),

@@ -115,6 +115,13 @@ def test_damaged_manifest_is_refused(tmp_path: Path, damage: bytes) -> None:
         read_manifest(tmp_path)
 
 
+def test_manifest_of_an_earlier_version_is_refused(folder: Path) -> None:
+    """The message says what becomes of its members."""
+    (folder / "fleet.toml").write_text('[fleet]\naddress_plan = "none"\npsk = true\n')
+    with pytest.raises(FleetError, match=r"without an authority\. Its members work as before"):
+        read_manifest(folder)
+
+
 @pytest.mark.parametrize(
     ("old", "new"),
     [

@@ -30,27 +30,31 @@ class OutgoingFrames:
         self._dropped = dropped
         self._delivered = delivered
         self.queue = FairQueue(self._on_drop)  # the frames that are not committed
-        self.committed = b""
-        """The bytes to write next."""
+        self._committed = b""
         self._ends: deque[int] = deque()  # sizes of the committed frames; for the first, of its unwritten rest
 
     def __len__(self) -> int:
         """How many frames are not completely written."""
         return self.queue.count + len(self._ends)
 
+    @property
+    def committed(self) -> bytes:
+        """The bytes to write next."""
+        return self._committed
+
     def commit(self, frames: Sequence[Frame], source: Source, now: float) -> None:
         """Commit these frames without queueing. Call it only while the queue is empty."""
         admit = self._delivered.admit
         parts = [data for frame in frames if (data := admit(frame, source, now))]
         self._ends.extend(map(len, parts))
-        self.committed += b"".join(parts)
+        self._committed += b"".join(parts)
 
     def commit_next(self, held: int, limit: int, now: float) -> None:
         """Commit frames from the queue while they and the kernel's ``held`` bytes are at most ``limit``.
 
         If the kernel holds no bytes, commit at least one frame.
         """
-        held += len(self.committed)
+        held += len(self._committed)
         parts = []
         while (popped := self.queue.pop(limit - held if held else inf, now)) is not None:
             opened_by = self._delivered.opened_by
@@ -60,16 +64,16 @@ class OutgoingFrames:
                 parts.append(data)
                 self._ends.append(len(data))
                 held += len(data)
-        self.committed += b"".join(parts)
+        self._committed += b"".join(parts)
 
     def mark_written(self, count: int) -> int:
         """The kernel has accepted the first ``count`` committed bytes. Returns how many frames are now complete."""
-        if count == len(self.committed):
+        if count == len(self._committed):
             completed = len(self._ends)
-            self.committed = b""
+            self._committed = b""
             self._ends.clear()
             return completed
-        self.committed = self.committed[count:]
+        self._committed = self._committed[count:]
         completed = 0
         while count >= self._ends[0]:
             count -= self._ends.popleft()
@@ -83,7 +87,7 @@ class OutgoingFrames:
         if self._ends:
             self._dropped["unsent"] += len(self._ends)
         self._ends.clear()
-        self.committed = b""
+        self._committed = b""
 
     def _on_drop(self, reason: EgressDrop) -> None:
         self._dropped[_REASONS.get(reason, str(reason))] += 1

@@ -55,6 +55,11 @@ class Reader:
     of 0 a busy socket is read at once too: a relay must not delay what it forwards.
     """
 
+    __slots__ = (
+        *("_deliver", "_done_at", "_found_several", "_is_burst", "_is_watched", "_loop", "_on_failure", "_pause_s"),
+        *("_sock", "_stall", "_timer", "_waiting", "backlog", "gather_s"),
+    )
+
     def __init__(
         self,
         sock: socket.socket,

@@ -219,6 +219,11 @@ def read_manifest(folder: Path) -> Fleet:
 
 def _fleet(table: dict[str, Any]) -> Fleet:
     facts = table["fleet"]
+    if "authority" not in facts:
+        raise FleetError(
+            "is of an earlier version, without an authority. Its members work as before, and their files are edited"
+            " by hand; or create a new fleet in another folder"
+        )
     authority, published = AuthorityKey(from_base64(facts.pop("authority"))), from_base64(facts.pop("bulletin"))
     if (bulletin := verified_bulletin(published, authority)) is None:
         raise ValueError("not a bulletin of this fleet")
