@@ -240,7 +240,8 @@ _set_routes, _ask_for_echo, _reply = PathSet._set_routes, send.ask_for_echo, rec
 def _only_paths_that_work(paths: PathSet, now: float) -> None:
     _set_routes(paths, now)
     critical = paths.routes[Class.CRITICAL]
-    paths.routes[Class.CRITICAL] = tuple(state for state in critical if state is paths.best or state.works)
+    working = tuple(state for state in critical if state is paths.best or state.works)
+    paths.routes = {**paths.routes, Class.CRITICAL: working}
 
 
 def _nothing(*_: Any) -> list[Any]:

@@ -165,7 +165,7 @@ FIRST_WAITS_S = 8.0
 REGULAR_AFTER_S = 4.0
 """A question is one of many if its session is so old: a peer with one path may ask along it when a session begins."""
 
-_Counts = deque[tuple[float, int]]
+_Counts = list[tuple[float, int]]
 
 
 class MissingEnvelopes:
@@ -181,8 +181,8 @@ class MissingEnvelopes:
         self.total = 0
         self._seen = 0
         self._until = -c.NEVER  # gaps wait for reports until then
-        self._gaps: _Counts = deque()
-        self._lost: _Counts = deque()
+        self._gaps: _Counts = []
+        self._lost: _Counts = []
 
     def note_report(self, lost: int, now: float, session_age_s: float, *, asks: bool) -> None:
         """The peer reported; ``lost``: how many datagrams a path that works lost since its last report.
@@ -204,19 +204,19 @@ class MissingEnvelopes:
             self._gaps.clear()
             self._lost.clear()
         while self._gaps and self._lost:
-            gap_at, gap = self._gaps.popleft()
-            lost_at, lost = self._lost.popleft()
+            gap_at, gap = self._gaps.pop(0)
+            lost_at, lost = self._lost.pop(0)
             both = min(gap, lost)
             self.total += both
             if gap > both:
-                self._gaps.appendleft((gap_at, gap - both))
+                self._gaps.insert(0, (gap_at, gap - both))
             if lost > both:
-                self._lost.appendleft((lost_at, lost - both))
+                self._lost.insert(0, (lost_at, lost - both))
         return self.total
 
 
 def _add(counts: _Counts, number: int, now: float) -> None:
     while counts and now > counts[0][0] + WAITS_S:
-        counts.popleft()
+        counts.pop(0)
     if number > 0:
         counts.append((now, number))

@@ -24,7 +24,6 @@ class PathSlots:
         """The slots in use: the configured paths first, then the oldest."""
         self.best: PathState | None = None
         """Where frames go; a path that failed stays the best while there is no other."""
-        self._reported: set[PathState] = set()  # those that were reported as usable
         self.unproven = 0
         """Learned paths that were given up because they answered nothing; it only grows."""
         self.candidates: tuple[Path, ...] = ()
@@ -130,7 +129,6 @@ class PathSlots:
         return PathState(path, number, now, is_configured=is_configured, is_metered=is_metered)
 
     def _drop(self, state: PathState) -> None:
-        self._reported.discard(state)
         self.unproven += not (state.is_validated or state.is_configured)
         if not state.is_known:
             return

@@ -54,6 +54,8 @@ class PathState:
     """Whether it may get more bytes than came from there: it is configured, or validated."""
     is_off: bool = False
     """Whether its network is gone: nothing is sent there."""
+    is_reported: bool = False
+    """Whether it was reported as usable, and not as down since."""
     condition: PathCondition = PathCondition.UNPROVEN
     reason: str = "new"
     """Why it is in this condition: ``answered``, ``unanswered``, ``loss``, ``network`` or ``new``."""

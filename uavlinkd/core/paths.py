@@ -5,8 +5,9 @@ README.md, section 15. The paths share one session. Nothing here sends: :mod:`.p
 
 from __future__ import annotations
 
-from collections import Counter, deque
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from typing import Final
 
 from uavlinkd.core import constants as c
 from uavlinkd.core.outputs import LinkedPeer, PathChanged, PathEvent, PathStateChanged, PathSuspected
@@ -90,6 +91,8 @@ def _cost(state: PathState, lags: dict[PathState, float] | None) -> float:
 Route = tuple[PathState, ...]
 """The paths along which one envelope goes, the best first."""
 
+_NO_ROUTES: Final[Mapping[Class, Route]] = dict.fromkeys(Class, ())
+
 
 class PathSet(PathSlots):
     """The paths to one peer."""
@@ -116,7 +119,7 @@ class PathSet(PathSlots):
         """Whether the condition of a path is reported even if it is the only one."""
         self.is_multiple = False
         """Whether critical frames go along several paths: then an envelope holds frames of one class."""
-        self.routes: dict[Class, Route] = dict.fromkeys(Class, ())
+        self.routes = _NO_ROUTES
         """The paths of each class; all empty before a path is known."""
         self.echo_route: Route = ()
         """Of echo requests that are repeated if they are lost, and of their replies."""
@@ -130,7 +133,7 @@ class PathSet(PathSlots):
         """When a candidate was asked last."""
         self.stream_at = -c.NEVER
         """When the best path carried a stream last."""
-        self._stream_times = deque[float](maxlen=c.STREAM_ENVELOPES)  # of envelopes, the oldest first
+        self._stream_times = [-c.NEVER] * c.STREAM_ENVELOPES  # of the last envelopes, the oldest first
 
     # Facts.
 
@@ -190,7 +193,7 @@ class PathSet(PathSlots):
         if self.best is not None and len(self.by_path) == 1:
             self.best.note_echo(round_trip_s, now)
             self.note_answer(self.best, now)
-            if self.reports_single and self.best not in self._reported:
+            if self.reports_single and not self.best.is_reported:
                 self.revise(now)
 
     def note_echo_counts(self, asked_at: float, sent: int, repeats: Repeats, received: int) -> None:
@@ -233,11 +236,11 @@ class PathSet(PathSlots):
         self.best, reason = self._election.elect(self.best, self.by_path.values(), now)
         for state in self.by_path.values() if self.has_several or self.reports_single else ():
             is_usable = state.condition is PathCondition.USABLE
-            if is_usable and state not in self._reported:
-                self._reported.add(state)
+            if is_usable and not state.is_reported:
+                state.is_reported = True
                 changes.append(PathStateChanged(peer, state.path, True, state.reason))
-            elif state.condition is PathCondition.DOWN and state in self._reported:
-                self._reported.remove(state)
+            elif state.condition is PathCondition.DOWN and state.is_reported:
+                state.is_reported = False
                 changes.append(PathStateChanged(peer, state.path, False, state.reason))
         for state in self.states:
             if now >= self._gone_at(state):
@@ -262,7 +265,7 @@ class PathSet(PathSlots):
     def _set_routes(self, now: float) -> None:
         best = self.best
         if best is None:
-            self.routes, self.is_multiple = dict.fromkeys(Class, ()), False
+            self.routes, self.is_multiple = _NO_ROUTES, False
             self.stream_route = self.echo_route = ()
             return
         others = [
@@ -352,10 +355,8 @@ class PathSet(PathSlots):
         It carries one only with enough envelopes a second: questions four times a second would cost more than a rare
         frame is worth.
         """
-        times = self._stream_times
-        is_stream = len(times) == c.STREAM_ENVELOPES and now < times[0] + c.STREAM_ENDS_AFTER_S
-        times.append(now)
-        if not is_stream:
+        self._stream_times.append(now)
+        if now >= self._stream_times.pop(0) + c.STREAM_ENDS_AFTER_S:
             return False
         begins = now >= self.stream_at + c.STREAM_ENDS_AFTER_S
         self.stream_at = now

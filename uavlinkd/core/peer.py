@@ -6,7 +6,7 @@ Functions change it, in modules by topic: :mod:`.send`, :mod:`.receive`, :mod:`.
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -73,6 +73,16 @@ class Shared(NamedTuple):
 class Peer:
     """The link with one peer. It is compared by identity; its parts do not refer to it."""
 
+    __slots__ = (
+        *("answers", "answers_while_up", "asked_at", "candidate_questions", "cookied_answers", "durations"),
+        *("echo_after_s", "echo_at", "echo_requests", "entropy", "established_at", "group_work"),
+        *("handshake_after_s", "handshake_s", "hinted_at", "indices", "initiator", "is_up", "losses"),
+        *("lost_after_s", "name", "offered_at", "own_problems", "own_refusals", "paths", "problem_claim"),
+        *("proven_group_work", "provisional_until", "received_at", "recent", "refusal_claims", "remembered"),
+        *("round_trip_s", "screen", "sent_at", "sessions", "settings", "silence_s", "timers", "traffic"),
+        *("unanswered_since", "unverified_since", "verify_interval_s", "__weakref__"),
+    )
+
     def __init__(self, settings: PeerSettings, identity: KeyPair, shared: Shared, now: float) -> None:
         self.settings = settings
         self.name = settings.name
@@ -102,9 +112,9 @@ class Peer:
         """CPU time for the groups of its suites that it may cause from anywhere."""
         self.proven_group_work = TokenBucket(*c.GROUP_WORK_PER_PEER, now)
         """The same in addition, where it proves to be at its own address."""
-        self.remembered: deque[bytes] = deque()
+        self.remembered: list[bytes] = []
         """Ephemerals of its initiations, the oldest first."""
-        self.recent: deque[tuple[float, bytes]] = deque(maxlen=c.RESENT_ENVELOPES)
+        self.recent: list[tuple[float, bytes]] = []
         """Critical envelopes, and when they were sent, if a path leads through a relay: a new path may carry them."""
         self.paths = PathSet(settings.link.redundancy, settings.link.idle_probe_s, shared.known, shared.facts)
         """Where the peer is, or may be."""

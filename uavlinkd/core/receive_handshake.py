@@ -87,7 +87,7 @@ class HandshakeReceiver:
         self.remembered[ephemeral] = peer
         peer.remembered.append(ephemeral)
         if len(peer.remembered) > c.REMEMBERED_INITIATIONS:
-            self.remembered.pop(peer.remembered.popleft(), None)
+            self.remembered.pop(peer.remembered.pop(0), None)
 
     def forget(self, peer: Peer) -> None:
         """Accept nothing from this peer any more."""

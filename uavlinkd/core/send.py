@@ -58,7 +58,8 @@ def send_frames(peer: Peer, frames: Sequence[bytes], now: float, cls: Class) -> 
         out += seal(peer, session, payload, route, now)
     if cls is Class.CRITICAL and paths.has_relayed:
         sent = (output.datagram for output in out if isinstance(output, Transmit))
-        peer.recent.extend((now, datagram) for datagram in dict.fromkeys(sent))
+        peer.recent += ((now, datagram) for datagram in dict.fromkeys(sent))
+        del peer.recent[: -c.RESENT_ENVELOPES]
     return out
 
 
@@ -66,13 +67,13 @@ def resend(peer: Peer, state: PathState, now: float) -> list[Output]:
     """Send the recent critical envelopes of the current session along a new path too. Each is sent again once."""
     session = peer.sessions.current
     out: list[Output] = []
-    while peer.recent:
-        sent_at, datagram = peer.recent.popleft()
+    for sent_at, datagram in peer.recent:
         is_current = session is not None and wire.claimed_receiver_index(datagram) == session.remote_index
         if now <= sent_at + c.RESENT_S and is_current and peer.paths.carries(state, len(datagram)):
             state.sent += 1
             peer.count_sent(state, 1, len(datagram))
             out.append(Transmit(datagram, state.path, is_copy=True))
+    peer.recent = []
     return out
 
 

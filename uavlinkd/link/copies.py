@@ -13,7 +13,7 @@ of an envelope that is not critical does not wait. Sans-IO: ``now`` is monotonic
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Container, Mapping, Sequence
 from math import ceil, inf, log, prod
 from typing import Final
@@ -271,7 +271,7 @@ class Repair:
         """and since when."""
         self.left_out: Sequence[PathState] = ()
         """Paths without repeats: they do not answer, or are so slow that repeats along another path arrive first."""
-        self._losses: deque[tuple[float, float]] = deque()
+        self._losses: list[tuple[float, float]] = []
 
     def update(self, paths: Sequence[PathState], now: float, *, is_allowed: bool) -> None:
         """Judge the paths that carry critical frames. Call it about once a second."""
@@ -289,7 +289,7 @@ class Repair:
         losses = [self._loss_of(path) for path in answering or quick]
         self._losses.append((now, prod(losses) if answering else max(losses, default=0.0)))
         while self._losses[0][0] <= now - HOLD_S:
-            self._losses.popleft()
+            self._losses.pop(0)
         highest = max(loss for _, loss in self._losses)
         if not self.is_on and highest > BEGIN_LOSS:
             self.is_on, self.began_at = True, now

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict, deque
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping
 from typing import Final, NamedTuple
 
@@ -296,17 +296,19 @@ class LinkWatch:
         self.shares: dict[LinkProblem, float] = {}
         """Of the envelopes, when a problem was noted last."""
         self._received = 0
-        self._steps: deque[tuple[float, Counter[LinkProblem], int]] = deque()
+        self._steps: list[tuple[float, Counter[LinkProblem], int]] = []  # when, and the totals then, if they changed
 
     def measure(self, totals: Mapping[LinkProblem, int], received: int, now: float) -> dict[LinkProblem, Growth]:
         """Compare with the totals of a minute ago. Call it about once a second."""
         grown = {problem: total - self.totals[problem] for problem, total in totals.items()}
-        self.totals.update(grown)
-        if not self._steps or now - self._steps[-1][0] >= STEP_S:
-            self._steps.append((now, self.totals - Counter(grown), self._received))
+        before = self.totals, self._received
+        if any(grown.values()):
+            self.totals = self.totals + Counter(grown)
         self._received = received
+        if not self._steps or (now - self._steps[-1][0] >= STEP_S and before != self._steps[-1][1:]):
+            self._steps.append((now, *before))
         while len(self._steps) > 1 and self._steps[1][0] <= now - WINDOW_S:
-            self._steps.popleft()
+            self._steps.pop(0)
         _, then, received_then = self._steps[0]
         arrived = received - received_then
         missing = self.totals[LinkProblem.ENVELOPES_MISSING] - then[LinkProblem.ENVELOPES_MISSING]

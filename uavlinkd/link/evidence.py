@@ -7,7 +7,6 @@ of its own. All other places share one entry per kind, so that an attacker canno
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Hashable, Iterable, Mapping
 from types import MappingProxyType
 from typing import Final, Generic, TypeVar
@@ -204,6 +203,8 @@ K = TypeVar("K", bound=Hashable)
 class RecentGrowth(Generic[K]):
     """The recent growth of counters by key. As bounded as the counters."""
 
+    __slots__ = ("_before", "_recent", "_sum")
+
     def __init__(self) -> None:
         self._before: dict[K, int] = {}
         self._sum = 0
@@ -278,8 +279,8 @@ class PartHistory:
         self.garbage = RecentGrowth[str]()
         self.silent_since = now
         """When the last frame was received."""
-        self.mixed: deque[float] = deque(maxlen=3)
-        """The latest seconds in which a foreign system was refused, soon after frames passed."""
+        self.mixed = (float("-inf"),) * 3
+        """The latest three seconds in which a foreign system was refused, soon after frames passed."""
         self._frames = 0
 
     def update(self, frames: int, frames_sent: int, policy: Policy, now: float) -> None:
@@ -289,7 +290,7 @@ class PartHistory:
         foreign = self.incoming.update(policy.incoming, frames, now, frames_may_be_refused=True)
         self.outgoing.update(policy.outgoing, frames_sent, now, frames_may_be_refused=False)
         if foreign and now - self.incoming.passed_at <= OWN_FRAMES_S:
-            self.mixed.append(now)
+            self.mixed = (*self.mixed[1:], now)
 
     def blocked(self, now: float) -> list[str]:
         """The directions, ``in`` and ``out``, in which the policy recently refused all frames."""
@@ -309,7 +310,7 @@ class History:
         self._parts: dict[tuple[str, str], PartHistory] = {}
 
     def part(self, kind: str, name: str) -> PartHistory:
-        """The history of a ``peer`` or ``endpoint``; an empty one before the first sample."""
+        """The history of a ``peer`` or ``endpoint``; an empty one before the first frame of a peer."""
         return self._parts.get((kind, name)) or PartHistory(self.began_at)
 
     def blocked(self, now: float) -> list[Blocked]:
@@ -322,8 +323,10 @@ class History:
         """Read the counters. Call it once a second. Peers and endpoints that are not named are forgotten."""
         before, self._parts = self._parts, {}
         for link in links:
-            part = self._parts["peer", link.name] = before.get(("peer", link.name)) or PartHistory(now)
-            part.update(link.counters.frames, link.frames_sent, link.policy, now)
+            key = "peer", link.name
+            if key in before or link.counters.frames or link.frames_sent or link.policy.outgoing.totals:
+                part = self._parts[key] = before.get(key) or PartHistory(now)
+                part.update(link.counters.frames, link.frames_sent, link.policy, now)
         for endpoint, policy in endpoints:
             part = self._parts["endpoint", endpoint.name] = before.get(("endpoint", endpoint.name)) or PartHistory(
                 now

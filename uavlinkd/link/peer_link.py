@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import itemgetter, sub
@@ -54,7 +53,7 @@ class Rates:
         self._rates = {
             one: ((received - self._totals[one][0]) / elapsed_s, (sent - self._totals[one][1]) / elapsed_s)
             for one, (received, sent) in totals.items()
-            if one in self._totals
+            if (received, sent) != self._totals.get(one, (received, sent))
         }
         self._measured_at, self._totals = now, totals
 
@@ -112,7 +111,7 @@ class PeerLink:
         self._direct: Sequence[Path] = ()
         self.losses: tuple[tuple[int, int], ...] = ()
         """In and out, how many envelopes were sent recently, and how many of them lost: by the last measurement."""
-        self._missing = deque[tuple[int, int, int]](maxlen=1 + round(LOSS_WINDOW_S))  # session, expected, missing
+        self._missing: list[tuple[int, int, int]] = []  # session, expected, missing; the oldest first
         self._sample: tuple[int, tuple[int, int, int, int]] | None = None
         # A session, and its counters at one moment: expected and received here, and as the peer reports.
         self.output = PeerOutput(config.egress, peer, carriage.node, carriage.budgets, self._on_sent, now)
@@ -285,9 +284,9 @@ class PeerLink:
         best, session = self.peer.paths.best, self.peer.sessions.current
         if best is None or session is None:
             return ()
-        if self._missing and self._missing[-1][0] != session.local_index:
-            self._missing.clear()
-        self._missing.append((session.local_index, session.expected, missing))
+        counted_now = session.local_index, session.expected, missing
+        earlier = [one for one in self._missing if one[0] == session.local_index]
+        self._missing = [*earlier[-round(LOSS_WINDOW_S) :], counted_now]
         into, out = best.recent_losses(now)
         if not self.peer.paths.has_several:  # then the peer may send few reports
             counted = session.expected - self._missing[0][1], missing - self._missing[0][2]

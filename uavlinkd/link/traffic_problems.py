@@ -57,8 +57,7 @@ def peer_problems(peer: PeerFacts) -> Iterator[Found]:
     if has_twin(peer.link.peer, Twin.PEERS, peer.now):
         yield two_machines(f"{peer.name}'s private key: sessions came from {places(peer.link.peer)}")
     yield from _hidden_frames(peer)
-    mixed = peer.history.mixed
-    is_mixed = len(mixed) == mixed.maxlen and peer.now - mixed[0] <= SECURITY_S
+    is_mixed = peer.now - peer.history.mixed[0] <= SECURITY_S
     if is_mixed and (owned := _owned(peer, peer.history.incoming.systems.within(SECURITY_S, peer.now))):
         whose = listed(f"{system} ({owner})" for system, owner in owned.items())
         cut_off = "delete its [[peer]] and run `uavlinkd reload`"
