@@ -16,7 +16,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PlainValidato
 
 from uavlinkd.authority.trust import HeldCertificate
 from uavlinkd.config.keys import decode_key, is_canonical_public_key
-from uavlinkd.config.model import SERIAL, PeerAddress
+from uavlinkd.config.model import SERIAL, WEB_RESOURCE, PeerAddress
 from uavlinkd.core import constants as c
 from uavlinkd.core.certificates import LAST_SERIAL, parse_bulletin, parse_certificate
 from uavlinkd.core.certificates import NAME as MEMBER_NAME
@@ -32,6 +32,7 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
 _INTERFACE = re.compile(r"[^\s/:]{1,15}")  # as dev_valid_name() of Linux
 # A complete or nearly complete key in base64 or hex: no message repeats it.
 _LIKE_A_KEY = re.compile(r"[A-Za-z0-9+/_-]{40,}={0,2}")
+_RESOURCE = re.compile(r"[A-Za-z0-9._~/-]{0,64}")  # of a URL, behind its first slash
 _SMALL_GROUP = re.compile(r"(?:modp|ffdhe?|dhe?)?[-_ ]?(?:512|768|1024)")
 ENROLL_AGAIN = "run `uavlinkd enroll --finish` again with the line of `uavlinkd fleet sign`"
 LEAST_BUDGET = 1000
@@ -128,6 +129,8 @@ def _peer_address(value: Any) -> PeerAddress:
                 " for a serial network"
             )
         text, network = value["address"], _name(value["network"])
+    if isinstance(text, str) and "://" in text:
+        return _web_address(text, network)
     try:
         address = parse_address(_text(text), allow_names=True)
     except AddressError as error:
@@ -139,6 +142,18 @@ def _peer_address(value: Any) -> PeerAddress:
     if address.is_wildcard:
         raise ValueError('is every address of this machine: write the peer\'s own, such as "10.13.0.2:5790"')
     return PeerAddress(address, network)
+
+
+def _web_address(text: str, network: str) -> PeerAddress:
+    scheme, _, rest = text.partition("://")
+    place, slash, resource = rest.partition("/")
+    if scheme != "wss" or network or not _RESOURCE.fullmatch(resource):
+        raise ValueError('is not the URL of a relay: write one such as "wss://relay.example.org:443/uavlink"')
+    has_port = place.rpartition("]")[2].count(":") == 1
+    address = parse_address(place if has_port else f"{place}:443", allow_names=True)
+    if address.is_wildcard:
+        raise ValueError('is every address of this machine: write the relay\'s own, such as "relay.example.org"')
+    return PeerAddress(address, resource=slash + resource or WEB_RESOURCE)
 
 
 def _interface(value: Any) -> str:

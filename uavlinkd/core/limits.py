@@ -40,12 +40,16 @@ class TokenBucket:
 
 def source_of(host: str) -> Hashable:
     """The source of a numeric host: itself, or its /64 in IPv6, because one machine may have every address of it."""
-    return IPv6Address(host).packed[:8] if ":" in host else host
+    return IPv6Address(host).packed[:8] if _is_ipv6(host) else host
 
 
 def prefix_of(host: str) -> Hashable:
     """The network of a numeric host: its /24 in IPv4, its /64 in IPv6. Of another host, itself."""
-    return IPv6Address(host).packed[:8] if ":" in host else host.rpartition(".")[0] or host
+    return IPv6Address(host).packed[:8] if _is_ipv6(host) else host.rpartition(".")[0] or host
+
+
+def _is_ipv6(host: str) -> bool:
+    return ":" in host and "/" not in host  # no URL
 
 
 class SourceLimiter:

@@ -180,7 +180,7 @@ class Node:
 
     def set_metered(self, sockets: Iterable[int], now: float) -> None:
         """The sockets whose network is paid by the byte. This hastens no try."""
-        self.facts.metered = set(sockets)
+        self.facts.metered = {*sockets, *self.facts.streams}
         for peer in self.peers.values():
             peer.paths.set_metered()
             self._revise_paths(peer, now)

@@ -16,6 +16,10 @@ SocketAddress = tuple[str, int] | tuple[str, int, int, int]
 SERIAL_HOST = "serial"
 """The host of the only path along a serial network: ``Path(socket, (SERIAL_HOST, 0))``."""
 
+WEB_HOST = "wss://"
+"""How the host of the only path along a connection by TLS to a relay begins: ``Path(socket, (URL, 0))``. At the relay
+such a path has the address of its TCP connection."""
+
 
 RELAY_HOST = "relay "
 """How the host of a relayed path begins; the relay's name follows. See :func:`relayed`."""
@@ -37,6 +41,16 @@ class Path(NamedTuple):
     def is_serial(self) -> bool:
         """Whether it is a line, which has no addresses."""
         return self.address[0] == SERIAL_HOST
+
+    @property
+    def is_udp(self) -> bool:
+        """Whether it has the address of a socket."""
+        return not (self.is_serial or self.is_relayed or self.is_web)
+
+    @property
+    def is_web(self) -> bool:
+        """Whether it is a connection by TLS to a relay."""
+        return self.address[0].startswith(WEB_HOST)
 
     @property
     def is_relayed(self) -> bool:
@@ -81,12 +95,16 @@ FREE = Pace()
 
 
 class SocketFacts:
-    """The facts about each socket. ``metered``: those whose network is paid by the byte."""
+    """The facts about each socket. ``metered``: those whose network is paid by the byte, and all ``streams``.
 
-    __slots__ = ("_budgets", "_rates", "envelope_limits", "metered", "peer_at", "peers")
+    ``streams``: those whose datagrams travel in TCP connections, which deliver late what UDP would lose.
+    """
+
+    __slots__ = ("_budgets", "_rates", "envelope_limits", "metered", "peer_at", "peers", "streams")
 
     def __init__(self, metered: Iterable[int] = ()) -> None:
         self.metered = set(metered)
+        self.streams = set[int]()
         self._budgets: dict[int, float] = {}
         self._rates: dict[int, float] = {}
         self.peers = 0

@@ -125,8 +125,8 @@ class PathSlots:
     def _new(self, path: Path, now: float, *, is_configured: bool, others: dict[Path, PathState]) -> PathState:
         taken = {state.number for state in (*others.values(), *self.by_path.values())}
         number = next(number for number in range(1, 256) if number not in taken)
-        is_metered = path.socket in self.facts.metered
-        return PathState(path, number, now, is_configured=is_configured, is_metered=is_metered)
+        is_metered, is_stream = path.socket in self.facts.metered, path.socket in self.facts.streams
+        return PathState(path, number, now, is_configured=is_configured, is_metered=is_metered, is_stream=is_stream)
 
     def _drop(self, state: PathState) -> None:
         self.unproven += not (state.is_validated or state.is_configured)

@@ -48,6 +48,8 @@ class PathState:
     now: InitVar[float]
     is_configured: bool
     is_metered: bool
+    is_stream: bool = False
+    """Whether TCP carries it: the last choice, also after metered ones."""
     is_known: bool = False
     """Whether the peer was there: a session was made along it, or it is validated."""
     is_proven: bool = False

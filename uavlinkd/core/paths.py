@@ -48,14 +48,17 @@ class Election:
 
     def _elect(self, best: PathState | None, states: Iterable[PathState], now: float) -> tuple[PathState | None, str]:
         working = [state for state in states if state.works]
-        pool = [state for state in working if not state.is_metered] or working
+        datagrams = [state for state in working if not state.is_stream]
+        pool = [state for state in datagrams if not state.is_metered] or datagrams or working
         usable = [state for state in pool if state.condition is PathCondition.USABLE]
         if best is None or best not in pool:
             self._better = None
             if not pool:
                 return best, ""
             elected = min(usable or pool, key=lambda state: _cost(state, None))
-            return elected, "first" if best is None else "metered" if best.works else best.reason
+            if best is None or not best.works:
+                return elected, "first" if best is None else best.reason
+            return elected, "udp" if best.is_stream else "metered"
         rivals = [state for state in usable if state is not best and now >= state.returns_at]
         if best.path.is_relayed and (direct := [state for state in rivals if not state.path.is_relayed]):
             elected = min(direct, key=lambda state: _cost(state, None))
@@ -157,7 +160,7 @@ class PathSet(PathSlots):
         return FREE if self.best is None else self.facts.pace(self.best.path)
 
     def role(self, state: PathState) -> str:
-        """What the path is used for: ``best``, ``metered`` or ``standby``."""
+        """What the path is used for: ``best``, ``metered`` (or by TCP), or ``standby``."""
         return "best" if state is self.best else "metered" if state.is_metered else "standby"
 
     def handshake_paths(self, *, is_answering: bool = True) -> tuple[list[Path], list[Path]]:

@@ -131,7 +131,7 @@ class Moment:
     def working(self, partner: PeerLink | RelayLink) -> list[Path]:
         """The paths along which a partner answers directly over UDP."""
         states = partner.peer.paths.states if partner.peer.is_up else ()
-        return [state.path for state in states if state.works and state.is_validated and _is_udp(state.path)]
+        return [state.path for state in states if state.works and state.is_validated and state.path.is_udp]
 
     def other_answer(self, hosts: Collection[str]) -> str:
         """A partner that answers at none of these hosts, but at one as near: UDP gets out."""
@@ -151,7 +151,7 @@ class Moment:
         """The configured addresses of a relay from which no answer comes."""
         for state in relay.peer.paths.states:
             is_over = state.datagrams_sent >= TRIES and self.now - state.since >= NOT_ANSWERING_S
-            if state.is_configured and not state.works and not state.is_off and is_over and _is_udp(state.path):
+            if state.is_configured and not state.works and not state.is_off and is_over and state.path.is_udp:
                 yield state.path
 
     def owner(self, system: int, other_than: str) -> str | None:
@@ -225,13 +225,9 @@ class EndpointFacts(PartFacts):
         self.config = config
 
 
-def _is_udp(path: Path) -> bool:
-    return not (path.is_relayed or path.is_serial)
-
-
 def hosts_of(relay: RelayLink) -> set[str]:
     """Those of its addresses, as they are resolved now."""
-    return {path.host for path in relay.peer.paths.configured if _is_udp(path)}
+    return {path.host for path in relay.peer.paths.configured if path.is_udp}
 
 
 def _nearness(host: str) -> tuple[bool, bool]:

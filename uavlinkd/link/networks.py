@@ -32,6 +32,8 @@ from uavlinkd.system.addresses import IPV4_UDP_BYTES, IPV6_UDP_BYTES, Address
 
 COPIES_SHARE: Final = 0.5
 """The part of a budget that copies may use. The rest is for what only this network carries."""
+WEB_BYTES: Final = 82
+"""Of a message by TLS over IPv4: headers of IP and TCP (with timestamps), TLS record, and WebSocket frame."""
 LARGEST_BYTES: Final = 400
 """A bucket holds a largest frame in an envelope, with IP and UDP header."""
 RATE_CHANGE: Final = 0.25
@@ -53,6 +55,8 @@ def carrier_bytes(path: Path) -> int:
     """
     if path.is_serial:
         return LINE_BYTES
+    if path.is_web:
+        return WEB_BYTES
     if path.is_relayed:
         return RELAY_BYTES + IPV6_UDP_BYTES
     return IPV6_UDP_BYTES if ":" in path.host else IPV4_UDP_BYTES

@@ -34,6 +34,7 @@ from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.peer_names import PeerNames
 from uavlinkd.link.relay_link import RelayHandles, RelayLink
 from uavlinkd.link.serial_networks import SerialNetwork, SerialNetworks
+from uavlinkd.link.web_relays import WebRelay
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.resolver import Resolved
@@ -90,6 +91,8 @@ class PeerSockets:
         self.networks = Networks((), (), self.put, self.open_sockets, node, log)
         """Those of interfaces and addresses."""
         self.serial = SerialNetworks((), 0, node, stall, log)
+        self.web: dict[PeerAddress, WebRelay] = {}
+        """Those of relays that are reached by TLS, by address in the configuration."""
         self.handles = RelayHandles()
         """Those that relays assigned to this daemon."""
         self.budgets: dict[int, NetworkBudget] = {}
@@ -200,7 +203,8 @@ class PeerSockets:
             if network.config.budget_bits_s:
                 budget = NetworkBudget(network.config.budget_bits_s, now)
                 self.budgets.update({sock.number: budget for sock in network.sockets})
-        self._node.facts.set_budgets({number: budget.bits_s for number, budget in self.budgets.items()})
+        budgets = {number: budget.bits_s for number, budget in self.budgets.items() if budget.bits_s}
+        self._node.facts.set_budgets(budgets)
         self._node.facts.envelope_limits = {line.number: line.envelope_limit for line in self.serial.networks}
         self._choose_senders()
 
@@ -238,6 +242,8 @@ class PeerSockets:
         for slot in self._slots:
             self._read(slot)
         self.serial.start(receive, on_change)
+        for names in self._names.values():
+            self._start_web(names.link)
         if self.networks.networks:
             self.check_networks()
 
@@ -273,6 +279,8 @@ class PeerSockets:
             self.stop_following(name)
         for line in self.serial.networks:
             line.line.close()
+        for web in self.web.values():
+            web.stop()
         for slot in self._slots:
             self.put(slot.number, None)
 
@@ -349,6 +357,23 @@ class PeerSockets:
         """Resolve the peer's names, and connect to it at their addresses from every socket that may reach them."""
         names = self._names[link.name] = PeerNames(link, self._set_paths, self._log)
         self._set_paths(names)
+        if self._is_started:
+            self._start_web(link)
+
+    def _start_web(self, link: PeerLink | RelayLink) -> None:
+        for written in link.config.addresses:
+            if written in self.web:
+                self.web[written].start(link.peer, self._receive, self._on_change)
+
+    def _web_relay(self, written: PeerAddress) -> WebRelay:
+        """The place of a relay that is reached by TLS. It keeps its number while the daemon runs."""
+        if (web := self.web.get(written)) is None:
+            web = WebRelay(written, len(self._slots), self._node, self._stall, self._log)
+            self.web[written] = web
+            self._slots.append(_Slot(web.number, socket.AF_UNSPEC, web.send))
+            self.budgets[web.number] = web.budget
+            self._choose_senders()
+        return web
 
     def _set_paths(self, names: PeerNames) -> None:
         link = names.link
@@ -371,12 +396,17 @@ class PeerSockets:
         self.networks.report_absent(now)
         for line in self.serial.networks:
             line.report_state()
+        for web in self.web.values():
+            web.report_state()
 
     def _paths_to(self, written: PeerAddress, resolved: Resolved) -> Iterator[Path]:
         """The paths to an address of a peer."""
         if written.is_serial:
             if (path := self.serial.path_to(written.network)) is not None:
                 yield path
+            return
+        if written.resource:
+            yield self._web_relay(written).path
             return
         for family, sockaddr in resolved:
             for number in (slot.number for slot in self._slots if slot.family == family):
@@ -388,3 +418,6 @@ class PeerSockets:
         self.without_socket.discard(name)
         if (names := self._names.pop(name, None)) is not None:
             names.stop()
+            for written in names.link.config.addresses:
+                if written in self.web:
+                    self.web[written].stop()

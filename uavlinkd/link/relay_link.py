@@ -190,8 +190,9 @@ class RelayLink:
         return silent_since(self.peer, self._expected_since)
 
     def views(self) -> list[tuple[Path, Address]]:
-        """The paths to the relay, each with this daemon's address as the relay sees it there."""
-        return [(path, binding.seen_as) for path, binding in self._bindings.items() if binding.seen_as is not None]
+        """The paths to the relay by UDP, each with this daemon's address as the relay sees it there."""
+        seen = ((path, binding.seen_as) for path, binding in self._bindings.items() if path.is_udp)
+        return [(path, seen_as) for path, seen_as in seen if seen_as is not None]
 
     def state_for(self, link: PeerLink) -> str:
         """Whether a peer is reached along the relay: ``bound``, ``waiting`` for it to ask too, or ``unanswered``."""
@@ -310,8 +311,8 @@ class RelayLink:
     # Parts.
 
     def _states(self) -> Iterator[PathState]:
-        """The paths to it over IP."""
-        return (state for state in self.peer.paths.states if not (state.path.is_relayed or state.path.is_serial))
+        """The paths to it over IP, by UDP or TLS."""
+        return (state for state in self.peer.paths.states if state.path.is_udp or state.path.is_web)
 
     def _working(self) -> Iterator[_Binding]:
         for state in self._states():

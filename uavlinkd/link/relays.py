@@ -175,7 +175,7 @@ def _best_paths(relay: Peer) -> Iterator[PathState]:
     best: dict[int, PathState] = {}
     for state in relay.paths.states if relay.is_up else ():
         path = state.path
-        if state.works and not (path.is_relayed or path.is_serial):
+        if state.works and path.is_udp:
             before = best.get(path.socket)
             if before is None or (state.srtt_s or NEVER) < (before.srtt_s or NEVER):
                 best[path.socket] = state

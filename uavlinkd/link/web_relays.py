@@ -1,0 +1,217 @@
+"""Relays that are reached by TLS, where UDP does not pass. uavlinkd/core/README.md, section 23.
+
+Each URL has one socket number and one path. UDP comes first: a connection is made when its relay has not answered by
+UDP for :data:`UDP_SILENT_S`, and ends when it has done so again for :data:`UDP_BACK_S`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Final
+
+from structlog.typing import FilteringBoundLogger
+
+from uavlinkd.config.model import PeerAddress
+from uavlinkd.core.node import Node
+from uavlinkd.core.path import Path, SocketAddress
+from uavlinkd.core.peer import Peer
+from uavlinkd.link.conditions import LineLimits
+from uavlinkd.link.networks import NetworkBudget, Receive
+from uavlinkd.mavlink.egress.bucket import Bucket
+from uavlinkd.system.clock import monotonic
+from uavlinkd.system.stall import StallWatch
+from uavlinkd.system.tasks import keep_running
+
+if TYPE_CHECKING:
+    from uavlinkd.endpoints.web_stream import WebStream
+
+UDP_SILENT_S: Final = 1.0
+"""Four times as long as RFC 8305 lets an address try alone: a mobile network that sleeps answers late."""
+UDP_BACK_S: Final = 10.0
+"""So a network that passes UDP now and then does not cost a connection each time."""
+LOOK_S: Final = 0.25
+RETRY_S: Final = 1.0, 15.0
+"""After a failure, the first wait; each further one is twice as long, up to the second value."""
+WAIT_S: Final = 0.01
+"""Frames look so often whether a connection takes them again."""
+
+
+class Gate(Bucket):
+    """Lets frames out when a connection sends them at once: they wait here, where newer ones replace them."""
+
+    __slots__ = ("_room",)
+
+    def __init__(self, room: Callable[[], float]) -> None:
+        super().__init__(0.0, 0.0, 1.0)
+        self.rate = float(1 << 30)  # that of the connection is not known
+        self._room = room
+
+    def level(self, now: float) -> float:
+        return self._room()
+
+    def spend(self, wire_bytes: float, now: float) -> None:
+        """The connection itself knows what it was given."""
+
+    def wait_s(self, price: float, now: float) -> float:
+        return 0.0 if self.level(now) >= price else WAIT_S
+
+
+class WebBudget(NetworkBudget):
+    """What a connection takes: not known in advance."""
+
+    def __init__(self, room: Callable[[], float]) -> None:
+        self.bits_s = 0
+        self.core_bits_s = 0.0
+        self.all = self.copies = Gate(room)
+
+    def charge(self, datagram: bytes, path: Path, now: float) -> None:
+        """Nothing is charged."""
+
+
+class WebRelay:
+    """One URL of a relay. ``number``: that of its socket."""
+
+    def __init__(
+        self,
+        written: PeerAddress,
+        number: int,
+        node: Node,
+        stall: StallWatch,
+        log: FilteringBoundLogger,
+    ) -> None:
+        self.written = written
+        self.number = number
+        self.path = Path(number, (str(written), 0))
+        self.budget = WebBudget(self._room)
+        self.error = ""
+        """Why the last try to connect failed, or the connection ended."""
+        self._node = node
+        self._stall = stall
+        self._log = log
+        self._limits = LineLimits()
+        self._receive: Receive = lambda *_: None
+        self._on_change: Callable[[], None] = lambda: None
+        self._stream: WebStream | None = None
+        self._ended = asyncio.Event()
+        self._peer: Peer | None = None
+        self._task: asyncio.Task[None] | None = None
+        node.facts.streams.add(number)
+        node.facts.metered.add(number)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether datagrams can be sent."""
+        return self._stream is not None
+
+    def start(self, peer: Peer, receive: Receive, on_change: Callable[[], None]) -> None:
+        """Connect whenever this relay does not answer by UDP."""
+        self._peer, self._receive, self._on_change = peer, receive, on_change
+        if self._task is None:
+            self._task = keep_running(self._keep(), f"the connection to {self.written}")
+
+    def stop(self) -> None:
+        """End the connection, and make no other one."""
+        if self._task is not None:
+            self._task.cancel()
+            self._task = None
+        if self._stream is not None:
+            self._stream.lose("closed")
+
+    def send(self, datagram: bytes, _address: SocketAddress) -> int:
+        """As a socket's ``sendto``."""
+        if self._stream is None:
+            raise OSError(errno.ENOTCONN, "there is no connection")
+        self._stream.send(datagram)
+        return len(datagram)
+
+    def report_state(self) -> None:
+        """Tell the core whether there is a connection."""
+        if not self.is_open:
+            self._node.set_socket_state(self.number, monotonic(), is_up=False)
+
+    def _room(self) -> float:
+        return 0.0 if self._stream is None else self._stream.room(monotonic())
+
+    # The connection.
+
+    async def _keep(self) -> None:
+        # Imported only if configured: a daemon on UDP starts faster and stays smaller.
+        from uavlinkd.endpoints.web_connect import connect  # noqa: PLC0415
+
+        wait_s = RETRY_S[0]
+        while True:
+            await self._until(UDP_SILENT_S, works=False)
+            self._ended.clear()
+            try:
+                stream = await connect(self.written.address, self.written.resource, self._stall, self)
+            except OSError as error:
+                self._fail(str(error))
+            else:
+                wait_s = RETRY_S[0]
+                self._open(stream)
+                await self._until_not_needed()
+            await asyncio.sleep(wait_s)
+            wait_s = min(2 * wait_s, RETRY_S[1])
+
+    async def _until(self, seconds: float, *, works: bool) -> None:
+        """Until UDP works, or does not, for so long. A relay without an address for UDP needs no wait."""
+        since = monotonic()
+        while monotonic() < since + seconds and (works or self._has_udp):
+            await asyncio.sleep(LOOK_S)
+            if self._udp_works is not works:
+                since = monotonic()
+
+    async def _until_not_needed(self) -> None:
+        back = asyncio.ensure_future(self._until(UDP_BACK_S, works=True))
+        ended = asyncio.ensure_future(self._ended.wait())
+        try:
+            await asyncio.wait((back, ended), return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            back.cancel()
+            ended.cancel()
+        if self._stream is not None:
+            self._stream.lose("UDP works again")
+
+    @property
+    def _has_udp(self) -> bool:
+        assert self._peer is not None, "started"
+        return any(state.path.is_udp for state in self._peer.paths.states)
+
+    @property
+    def _udp_works(self) -> bool:
+        assert self._peer is not None, "started"
+        return self._peer.is_up and any(state.works and state.path.is_udp for state in self._peer.paths.states)
+
+    def _open(self, stream: WebStream) -> None:
+        self._stream, self.error = stream, ""
+        self._node.set_socket_state(self.number, monotonic(), is_up=True)
+        self._write("info", "relay_connected")
+        self._on_change()
+
+    def _fail(self, reason: str) -> None:
+        self.error = reason
+        self._write("warning", "relay_not_connected", reason=reason)
+
+    def _write(self, level: str, event: str, **facts: str) -> None:
+        omitted = self._limits.take("web", self.path.host, monotonic())
+        if omitted is None:
+            self._limits.omit("web", self.path.host)
+        else:
+            getattr(self._log, level)(event, address=self.path.host, **facts, **omitted)
+
+    # As the connection's handler.
+
+    def on_datagrams(self, datagrams: list[bytes], now: float, epoch: int) -> None:
+        """Messages came in one read."""
+        address = self.path.address
+        self._receive(self.number, [(datagram, address) for datagram in datagrams], now, epoch, 0.0)
+
+    def on_lost(self, reason: str) -> None:
+        """The connection ended."""
+        self._stream = None
+        self._ended.set()
+        self._node.set_socket_state(self.number, monotonic(), is_up=False)
+        self._fail(reason)
+        self._on_change()
