@@ -11,6 +11,7 @@ from tests.config.files import (
     GCS,
     GOOD,
     HEAD,
+    HTTPS,
     KEY,
     LTE,
     MESH,
@@ -84,6 +85,7 @@ def test_changes_are_found(tmp_path: Path, before: str, after: str, changes: dic
         (GOOD, GOOD + '[metrics]\nlisten = "127.0.0.1:9790"\n', "metrics"),
         (GOOD, GOOD + '[recording]\nfolder = "a"\n', "recording"),
         (GOOD, GOOD + member("c"), "member"),
+        (GOOD + member("c"), GOOD + member("c") + HTTPS, "relay_server.https"),
     ],
 )
 def test_other_changes_need_a_restart(tmp_path: Path, before: str, after: str, key: str) -> None:

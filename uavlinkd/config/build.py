@@ -302,7 +302,7 @@ def _relay_server(file: Sections) -> RelayServer | None:
     link = replace(link_of(LinkSection.model_construct(**file.link.valid)), features=c.FEATURE_RECORDS)
     link = fleet_link(link) if file.has_fleet else link
     every = tuple(_member(file, section, link) for section in file.members)
-    return RelayServer(every, RelayLimits(keys.datagrams_s, keys.bits_s))
+    return RelayServer(every, RelayLimits(keys.datagrams_s, keys.bits_s), keys.https)
 
 
 def _member(file: Sections, section: Values, link: Link) -> MemberSettings:

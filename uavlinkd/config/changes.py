@@ -65,6 +65,8 @@ def compare(old: Config, new: Config) -> ConfigChanges:
     fixed = [key for field, key in _FIXED.items() if getattr(old, field) != getattr(new, field)]
     if (old.relay_server is None) != (new.relay_server is None):
         fixed.append("member")
+    elif old.relay_server and new.relay_server and old.relay_server.https != new.relay_server.https:
+        fixed.append("relay_server.https")
     if (old.fleet and (old.fleet.authority, old.fleet.state_file)) != (
         new.fleet and (new.fleet.authority, new.fleet.state_file)
     ):

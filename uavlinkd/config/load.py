@@ -22,6 +22,7 @@ from uavlinkd.config.build import build
 from uavlinkd.config.keys import CREDENTIALS, KeyFileError, decode_key, find_secret_file, read_secret_file
 from uavlinkd.config.model import Config, ConfigError, Problem
 from uavlinkd.config.problems import Problems, Sections, Values, example_of
+from uavlinkd.config.tls_files import TlsFileError, find_tls_files
 from uavlinkd.core.crypto import Secret
 from uavlinkd.system.tasks import Threads
 
@@ -61,6 +62,11 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
     for section, key in ((file.top, "private_key_file"), *((section, "psk_file") for section in file.others)):
         if (secret := _secret(problems, section, key, path, environ)) is not None:
             file.secrets[section.at(key)] = secret
+    if (https := file.relay_server.get("https")) is not None:
+        try:
+            file.relay_server.valid["https"] = find_tls_files(https, file.folder, environ)
+        except TlsFileError as error:
+            problems.add(file.relay_server.at("https"), str(error))
     for place, message in checks.check(file):
         problems.add(place, message)
     problems.raise_any()

@@ -154,11 +154,23 @@ class PeerConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class HttpsServer:
+    """Where members reach a relay by TLS. Without files: through a web server on this machine that has the
+    certificate.
+    """
+
+    listen: Address
+    certificate: Path | None = None
+    key: Path | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class RelayServer:
     """This daemon is a relay. ``limits``: of all members together."""
 
     members: tuple[MemberSettings, ...]
     limits: RelayLimits
+    https: HttpsServer | None = None
 
     @property
     def by_key(self) -> dict[bytes, MemberSettings]:

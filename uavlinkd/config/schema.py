@@ -10,13 +10,14 @@ import re
 from collections.abc import Callable
 from contextlib import suppress
 from ipaddress import IPv4Address, IPv6Address, ip_address
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PlainValidator, ValidationInfo, field_validator
 
 from uavlinkd.authority.trust import HeldCertificate
 from uavlinkd.config.keys import decode_key, is_canonical_public_key
-from uavlinkd.config.model import SERIAL, WEB_RESOURCE, PeerAddress
+from uavlinkd.config.model import SERIAL, WEB_RESOURCE, HttpsServer, PeerAddress
 from uavlinkd.core import constants as c
 from uavlinkd.core.certificates import LAST_SERIAL, parse_bulletin, parse_certificate
 from uavlinkd.core.certificates import NAME as MEMBER_NAME
@@ -34,6 +35,7 @@ _INTERFACE = re.compile(r"[^\s/:]{1,15}")  # as dev_valid_name() of Linux
 _LIKE_A_KEY = re.compile(r"[A-Za-z0-9+/_-]{40,}={0,2}")
 _RESOURCE = re.compile(r"[A-Za-z0-9._~/-]{0,64}")  # of a URL, behind its first slash
 _SMALL_GROUP = re.compile(r"(?:modp|ffdhe?|dhe?)?[-_ ]?(?:512|768|1024)")
+_HTTPS = '{ listen = "0.0.0.0:443", certificate = "relay.pem", key = "relay-tls.key" }'
 ENROLL_AGAIN = "run `uavlinkd enroll --finish` again with the line of `uavlinkd fleet sign`"
 LEAST_BUDGET = 1000
 _LEAST_AIR = 1000
@@ -156,6 +158,28 @@ def _web_address(text: str, network: str) -> PeerAddress:
     return PeerAddress(address, resource=slash + resource or WEB_RESOURCE)
 
 
+def _https(value: Any) -> HttpsServer:
+    files = {"certificate", "key"}
+    if not isinstance(value, dict) or not {"listen"} <= set(value) <= {"listen", *files}:
+        raise ValueError(f"has keys of its own: write {_HTTPS}")
+    names: dict[str, Path] = {}
+    part = "listen"
+    try:
+        listen = parse_address(_text(value["listen"]), allow_names=False)
+        for part in sorted(files & set(value)):
+            names[part] = Path(_file_name(value[part]))
+    except ValueError as error:
+        raise ValueError(f"{part} {error}") from None
+    if len(names) == 1:
+        raise ValueError("has only one of certificate and key: write both, or none if a web server here has them")
+    if not names and not listen.is_loopback:
+        raise ValueError(
+            "has no certificate, so only a web server on this machine may connect: write certificate and key, or"
+            ' listen = "127.0.0.1:5443"'
+        )
+    return HttpsServer(listen, **names)
+
+
 def _interface(value: Any) -> str:
     text = _text(value)
     if not _INTERFACE.fullmatch(text) or not text.isprintable() or text in (".", ".."):
@@ -211,6 +235,7 @@ Interface = Annotated[str, PlainValidator(_interface)]
 OwnAddress = Annotated[str, PlainValidator(_own_address)]
 SerialLine = Annotated[SerialUrl, PlainValidator(lambda value: parse_line(_text(value)))]
 Url = Annotated[EndpointUrl, PlainValidator(lambda value: parse_url(_text(value)))]
+Https = Annotated[HttpsServer, PlainValidator(_https)]
 Budget = Annotated[int, AfterValidator(_budget)]
 Authority = Annotated[AuthorityKey, _signed(AuthorityKey, "the public key of an authority")]
 KeyHash = Annotated[bytes, _signed(lambda data: data if len(data) == c.KEY_BYTES else None, "a hash of 32 bytes")]
@@ -325,6 +350,7 @@ class MemberSection(KeySection):
 
 
 class RelayServerSection(Section):
+    https: Https | None = Field(default=None, examples=[_HTTPS])
     datagrams_s: int = Field(default=10**6, ge=1, le=10**6, examples=["100_000"])
     bits_s: int = Field(default=10**10, ge=LEAST_BUDGET, le=10**10, examples=["100_000_000"])
     member_max_peers: int = Field(default=256, ge=1, le=4000)

@@ -1,0 +1,67 @@
+"""The certificate of a relay that is reached by TLS. Members do not check it: TLS carries, the links protect."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from uavlinkd.config.keys import find_secret_file
+from uavlinkd.config.model import HttpsServer
+
+if TYPE_CHECKING:
+    from ssl import SSLContext
+
+_MAKE = (
+    "`openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes -days 3650 -subj /CN=relay"
+    " -keyout relay-tls.key -out relay.pem` makes both, and members accept that"
+)
+
+
+class TlsFileError(ValueError):
+    """A certificate or its key cannot be used. The message has a remedy."""
+
+
+def find_tls_files(server: HttpsServer, folder: Path, environ: Mapping[str, str]) -> HttpsServer:
+    """The same with the paths of its files, which are systemd credentials if there are such.
+
+    Raises TlsFileError if they cannot be used.
+    """
+    if server.certificate is None or server.key is None:
+        return server
+    certificate, key = (find_secret_file(str(name), folder, environ)[0] for name in (server.certificate, server.key))
+    load_tls(certificate, key)
+    return replace(server, certificate=certificate, key=key)
+
+
+def load_tls(certificate: Path, key: Path) -> SSLContext:
+    """What a server of TLS needs. Raises TlsFileError if the files cannot be used."""
+    # Imported only if configured.
+    import ssl  # noqa: PLC0415
+
+    for what, path in (("certificate", certificate), ("key", key)):
+        try:
+            if path.exists() and not path.is_file():  # opening a pipe would wait for its writer
+                raise TlsFileError(f"{what} {path} is not a regular file: {_MAKE}")
+            path.open("rb").close()
+        except OSError as error:
+            remedy = _MAKE if isinstance(error, FileNotFoundError) else "the daemon's user has to read it"
+            raise TlsFileError(f"{what} {path} cannot be read: {error.strerror}: {remedy}") from None
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    context.num_tickets = 0  # a member that comes again makes a new session
+    try:
+        context.load_cert_chain(certificate, key, password=_no_passphrase)
+    except (OSError, ValueError) as error:
+        if getattr(error, "reason", "") == "KEY_VALUES_MISMATCH":
+            text = f"key {key} is not that of the certificate {certificate}: write the two that were made together"
+        else:
+            text = f"{certificate} and {key} are not a certificate and its key, in PEM without a passphrase: {_MAKE}"
+        raise TlsFileError(text) from None
+    return context
+
+
+def _no_passphrase() -> str:
+    """Otherwise OpenSSL asks for one on the terminal."""
+    return ""
