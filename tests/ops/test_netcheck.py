@@ -54,6 +54,7 @@ def answer(*views: dict[str, Any], state: str = "up", filtering: tuple[dict[str,
         "candidates": [PUBLIC, PRIVATE],
         "other": "",
         "is_udp_blocked": False,
+        "web": {},
         "is_relay": False,
         "own": [PRIVATE],
     }

@@ -70,6 +70,32 @@ class WebBudget(NetworkBudget):
         """Nothing is charged."""
 
 
+class _Attempt:
+    """The handler of one connection. ``owner``: None for a probe."""
+
+    def __init__(self, owner: WebRelay | None) -> None:
+        self.opened = asyncio.get_running_loop().create_future()
+        """Its result is why there is no connection; empty if there is one."""
+        self._owner = owner
+
+    def on_open(self) -> None:
+        if not self.opened.done():
+            self.opened.set_result("")
+
+    def on_datagrams(self, datagrams: list[bytes], now: float, epoch: int) -> None:
+        if self._owner is not None:
+            self._owner.receive(datagrams, now, epoch)
+
+    def on_lost(self, reason: str) -> None:
+        if not self.opened.done():
+            self.opened.set_result(reason)
+        elif self._owner is not None:
+            self._owner.lost(reason)
+
+    def on_writable(self) -> None:
+        """Frames that wait ask for room every :data:`WAIT_S`."""
+
+
 class WebRelay:
     """One URL of a relay. ``number``: that of its socket."""
 
@@ -136,16 +162,32 @@ class WebRelay:
 
     # The connection.
 
-    async def _keep(self) -> None:
-        # Imported only if configured: a daemon on UDP starts faster and stays smaller.
-        from uavlinkd.endpoints.web_connect import connect  # noqa: PLC0415
+    async def probe(self) -> str:
+        """Connect once more. Returns why that is not possible; empty if it is."""
+        try:
+            stream = await self._connect(None)
+        except OSError as error:
+            return str(error)
+        stream.lose("probed")
+        return ""
 
+    async def _connect(self, owner: WebRelay | None) -> WebStream:
+        # Imported only if configured: a daemon on UDP starts faster and stays smaller.
+        from uavlinkd.endpoints import web_connect  # noqa: PLC0415
+
+        attempt = _Attempt(owner)
+        stream = await web_connect.connect(self.path.host, attempt, self._stall)
+        if reason := await attempt.opened:
+            raise ConnectionError(reason)
+        return stream
+
+    async def _keep(self) -> None:
         wait_s = RETRY_S[0]
         while True:
             await self._until(UDP_SILENT_S, works=False)
             self._ended.clear()
             try:
-                stream = await connect(self.written.address, self.written.resource, self._stall, self)
+                stream = await self._connect(self)
             except OSError as error:
                 self._fail(str(error))
             else:
@@ -201,15 +243,15 @@ class WebRelay:
         else:
             getattr(self._log, level)(event, address=self.path.host, **facts, **omitted)
 
-    # As the connection's handler.
+    # Of the connection.
 
-    def on_datagrams(self, datagrams: list[bytes], now: float, epoch: int) -> None:
+    def receive(self, datagrams: list[bytes], now: float, epoch: int) -> None:
         """Messages came in one read."""
         address = self.path.address
         self._receive(self.number, [(datagram, address) for datagram in datagrams], now, epoch, 0.0)
 
-    def on_lost(self, reason: str) -> None:
-        """The connection ended."""
+    def lost(self, reason: str) -> None:
+        """It ended."""
         self._stream = None
         self._ended.set()
         self._node.set_socket_state(self.number, monotonic(), is_up=False)

@@ -129,6 +129,19 @@ ONE_PORT = (
     "The same host answers at another port: let UDP to the silent port through the firewalls here and there, or"
     " correct `listen` of the relay, or `addresses` here"
 )
+_WEB_ERRORS: Final = (
+    (
+        "http_404",
+        "a web server answers there, but not for this path: correct the URL, or the web server before the relay",
+    ),
+    (
+        "http_",
+        "a web server or proxy answers there and refuses the WebSocket: see uavlinkd/relay/README.md",
+    ),
+    ("tls", "something answers there that does not speak TLS"),
+    ("slow_handshake", "something accepts the connection and does not answer"),
+)
+"""By how the reason begins."""
 _ICMP: Final = {"": "", "ECONNREFUSED": " (ICMP: no process listens there)"}
 _UNREACHABLE: Final = " (ICMP: not reachable)"
 
@@ -149,6 +162,8 @@ def report(answer: Answer) -> Iterator[str]:
     yield f"UDP          {_headline(answer, down, ports)}"
     for name, relay in relays.items():
         yield f"relay        {name}: {relay['state']}{_about(relay)}"
+    for url, error in answer["web"].items():
+        yield f"TLS          {url}: {_meaning(error) if error else 'connects'}"
     for view in answer["views"] if up else ():
         network = f" on {view['network']}" if view["network"] else ""
         yield f"seen as      {view['seen_as']} by {view['relay']} at {view['relay_address']}{network}"
@@ -183,6 +198,10 @@ def _headline(answer: Answer, down: list[str], ports: list[str]) -> str:
         which = "one port does" if len(ports) == 1 else f"{len(ports)} ports do"
         return f"gets out: {counted}; {which} not: {', '.join(ports)}"
     return f"gets out: {counted}"
+
+
+def _meaning(error: str) -> str:
+    return next((text for start, text in _WEB_ERRORS if error.startswith(start)), error)
 
 
 def folded(line: str) -> str:

@@ -1,0 +1,92 @@
+"""Members that reach their relay by TLS, where UDP does not pass: real daemons."""
+
+from __future__ import annotations
+
+from tests.daemon.fleet import drone_and_ground, relay_for
+from tests.daemon.frames import heartbeat
+from tests.daemon.harness import Stage
+from tests.daemon.process import DaemonProcess
+from tests.daemon.tls import listen_for_tls
+from tests.daemon.udp import Client, Sockaddr
+from uavlinkd.lab.sim.loopback_ports import free_port
+
+
+class Scene:
+    """A drone and a ground station, with a relay that has this URL."""
+
+    def __init__(self, stage: Stage) -> None:
+        self.stage = stage
+        self.drone, self.ground = drone_and_ground(stage)
+        for one in (self.drone, self.ground):
+            one.config["peer"][0]["addresses"] = []
+        self.relay = relay_for(stage, self.drone, self.ground)
+        self.url = listen_for_tls(self.relay)
+        self.into: Sockaddr
+        self.pilot: Client
+
+    async def start(self, drone: list[str], ground: list[str]) -> None:
+        """Start all, with these addresses of the relay at the members, and wait for the link."""
+        for member, addresses in ((self.drone, drone), (self.ground, ground)):
+            member.config["relay"][0]["addresses"] = addresses
+        self.into, self.pilot = self.drone.add_endpoint("autopilot"), await self.stage.client()
+        self.ground.add_endpoint("pilot", f"udpout:{self.pilot}")
+        await self.stage.start(self.relay, linked=False)
+        await self.stage.start(self.drone, self.ground)
+
+    async def talk(self) -> None:
+        """Heartbeats of the drone arrive at the pilot's client."""
+        autopilot, before = await self.stage.client(), len(self.pilot.received)
+        autopilot.send(heartbeat(), self.into)
+        await self.pilot.until(lambda: len(self.pilot.received) > before)
+
+    async def connections(self) -> int:
+        """Of the relay by TLS."""
+        status = await self.relay.status()
+        return int(status["relay"]["https"]["connections"])
+
+
+async def carrying(member: DaemonProcess) -> str:
+    """Where the best path of a member to the relay leads."""
+    status = await member.status()
+    return str(status["relays"]["vps"]["paths"][0]["address"])
+
+
+async def test_one_member_by_tls_and_another_by_udp(stage: Stage) -> None:
+    """They reach each other."""
+    scene = Scene(stage)
+    await scene.start([scene.url], [scene.relay.address])
+    await scene.talk()
+    assert await carrying(scene.drone) == scene.url
+    assert await carrying(scene.ground) == scene.relay.address
+    assert await scene.connections() == 1
+
+
+async def test_both_by_tls_because_udp_is_silent(stage: Stage) -> None:
+    """The address for UDP comes first, and no process answers there."""
+    scene = Scene(stage)
+    silent = f"127.0.0.1:{free_port()}"
+    await scene.start([silent, scene.url], [silent, scene.url])
+    await scene.talk()
+    assert await scene.connections() == 2
+    connected = scene.drone.events("relay_connected")
+    assert [line["address"] for line in connected] == [scene.url]
+
+
+async def test_udp_comes_first(stage: Stage) -> None:
+    """While the relay answers by UDP, nothing connects to it."""
+    scene = Scene(stage)
+    await scene.start([scene.relay.address, scene.url], [scene.url, scene.relay.address])
+    await scene.talk()
+    assert await scene.connections() == 0
+    assert scene.drone.events("relay_connected") == []
+
+
+async def test_relay_that_restarts(stage: Stage) -> None:
+    """Its members connect again, and the link is back."""
+    scene = Scene(stage)
+    await scene.start([scene.url], [scene.url])
+    await scene.relay.kill()
+    await scene.drone.until(lambda status: status["peers"]["ground"]["state"] != "up")
+    await scene.relay.start()
+    await scene.drone.until_linked()
+    await scene.talk()
