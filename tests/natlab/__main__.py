@@ -34,6 +34,7 @@ def main() -> int:
     parser.add_argument("--loss-percent", type=float, default=0, help=lost)
     parser.add_argument("--direct-s", type=float, default=0, help="wait so long for a direct path")
     parser.add_argument("--ipv6", action="store_true", help="pairs of which both or one have IPv6")
+    parser.add_argument("--tls", action="store_true", help="the relay listens for TLS too")
     parser.add_argument("--faults", type=int, default=0, metavar="TRIES", help="let each fault happen so often")
     parser.add_argument("--at-once", type=int, default=4, help="pairs of daemons that run at the same time")
     parser.add_argument("--members", type=int, default=0, metavar="COUNT", help="a fleet with so many vehicles")
@@ -64,10 +65,12 @@ def _connect(options: argparse.Namespace) -> None:
         else:
             pairs = make_pairs(laboratory, options.kind or PAIRED, **line)
         with redirect_stdout(StringIO()):  # what the daemons said
-            run = daemons.connect_all(pairs, public, direct_limit_s=options.direct_s, at_once=options.at_once)
+            limits = {"direct_limit_s": options.direct_s, "at_once": options.at_once}
+            run = daemons.connect_all(pairs, public, tls=options.tls, **limits)
             outcomes = asyncio.run(run)
     for pair, outcome in outcomes.items():
         print(f"{pair.title}: {outcome}")
+    print(f"linked: {_spread(outcome.linked_s for outcome in outcomes.values())}")
     print(f"relayed: {_spread(outcome.relayed_s for outcome in outcomes.values())}")
     print(f"direct: {_spread(outcome.direct_s for outcome in outcomes.values())}")
 

@@ -11,6 +11,7 @@ from typing import Final
 
 from tests.daemon.harness import Stage
 from tests.daemon.process import DaemonProcess, Status
+from tests.daemon.tls import listen_for_tls
 from tests.faults.talk import Talk, Voice, prepare
 from tests.natlab.laboratory import Laboratory, Place
 from tests.natlab.pairs import Pair
@@ -28,8 +29,10 @@ _POLL_S: Final = 0.05
 class Outcome:
     """What a pair did. Times in seconds from when both daemons had reached the relay; None for never."""
 
+    linked_s: float | None = None
+    """Until each has received a frame of the other; from when both daemons had started."""
     relayed_s: float | None = None
-    """Until each has received a frame of the other."""
+    """The same, from when both had reached the relay."""
     direct_s: float | None = None
     """Until both send along a direct path."""
     direct_to: str = ""
@@ -46,9 +49,9 @@ class Ends:
 
 
 async def connect_all(
-    pairs: Sequence[Pair], public: Place, *, direct_limit_s: float, at_once: int
+    pairs: Sequence[Pair], public: Place, *, direct_limit_s: float, at_once: int, tls: bool = False
 ) -> dict[Pair, Outcome]:
-    """Run a relay on a public host, and two daemons for each pair."""
+    """Run a relay on a public host, and two daemons for each pair. ``tls``: they may reach it by TLS too."""
     turn = asyncio.Semaphore(at_once)
 
     async def connect(ends: Ends) -> Outcome:
@@ -58,6 +61,10 @@ async def connect_all(
     async with Stage() as stage:
         relay = make_relay(stage, public)
         ends = [make_ends(stage, relay, pair.places, PORT + number) for number, pair in enumerate(pairs)]
+        if tls:
+            url = listen_for_tls(relay, public.address, 443)
+            for daemon in (daemon for one in ends for daemon in one.daemons):
+                daemon.config["relay"][0]["addresses"] = [*daemon.config["relay"][0]["addresses"], url]
         await stage.start(relay, linked=False)
         return dict(zip(pairs, await asyncio.gather(*map(connect, ends)), strict=True))
 
@@ -131,6 +138,8 @@ async def _connect(ends: Ends, direct_limit_s: float) -> Outcome:
         try:
             for daemon in ends.daemons:
                 await daemon.ready()
+            ready_at = monotonic()
+            for daemon in ends.daemons:
                 await daemon.until_logged("relay_up", timeout_s=NEVER_S)
             reached_at = monotonic()
             async with asyncio.timeout(NEVER_S):
@@ -144,6 +153,7 @@ async def _connect(ends: Ends, direct_limit_s: float) -> Outcome:
         end = monotonic()
         await ends.talk.back(end)
         return Outcome(
+            max(0.0, first_at - ready_at),
             max(0.0, first_at - reached_at),
             None if direct_at is None else max(0.0, direct_at - reached_at),
             "" if direct_at is None else peer["path"],

@@ -173,10 +173,17 @@ class WebRelay:
 
     async def _connect(self, owner: WebRelay | None) -> WebStream:
         # Imported only if configured: a daemon on UDP starts faster and stays smaller.
-        from uavlinkd.endpoints import web_connect  # noqa: PLC0415
+        from websockets.uri import parse_uri  # noqa: PLC0415
 
-        attempt = _Attempt(owner)
-        stream = await web_connect.connect(self.path.host, attempt, self._stall)
+        from uavlinkd.endpoints.tls_channel import client_tls  # noqa: PLC0415
+        from uavlinkd.endpoints.web_connect import open_socket  # noqa: PLC0415
+        from uavlinkd.endpoints.web_stream import WebStream, client_protocol  # noqa: PLC0415
+
+        uri, (host, port) = parse_uri(self.path.host), (self.written.address.host, self.written.address.port)
+        attempt, tls = _Attempt(owner), client_tls(host)
+        sock = await open_socket(host, port, uri)
+        stream = WebStream(sock, client_protocol(uri), tls, attempt, self._stall, self.path.host)
+        stream.start()
         if reason := await attempt.opened:
             raise ConnectionError(reason)
         return stream
