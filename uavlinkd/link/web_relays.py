@@ -34,6 +34,7 @@ UDP_BACK_S: Final = 10.0
 LOOK_S: Final = 0.25
 RETRY_S: Final = 1.0, 15.0
 """After a failure, the first wait; each further one is twice as long, up to the second value."""
+UDP_WORKS: Final = "udp_works"
 WAIT_S: Final = 0.01
 """Frames look so often whether a connection takes them again."""
 
@@ -167,7 +168,7 @@ class WebRelay:
         try:
             stream = await self._connect(None)
         except OSError as error:
-            return str(error)
+            return str(error) or type(error).__name__
         stream.lose("probed")
         return ""
 
@@ -196,7 +197,10 @@ class WebRelay:
             try:
                 stream = await self._connect(self)
             except OSError as error:
-                self._fail(str(error))
+                self.error = str(error) or type(error).__name__
+                if (omitted := self._take_line()) is not None:
+                    url = self.path.host
+                    self._log.warning("relay_not_connected", address=url, reason=self.error, **omitted)
             else:
                 wait_s = RETRY_S[0]
                 self._open(stream)
@@ -221,7 +225,7 @@ class WebRelay:
             back.cancel()
             ended.cancel()
         if self._stream is not None:
-            self._stream.lose("UDP works again")
+            self._stream.lose(UDP_WORKS)
 
     @property
     def _has_udp(self) -> bool:
@@ -236,19 +240,15 @@ class WebRelay:
     def _open(self, stream: WebStream) -> None:
         self._stream, self.error = stream, ""
         self._node.set_socket_state(self.number, monotonic(), is_up=True)
-        self._write("info", "relay_connected")
+        if (omitted := self._take_line()) is not None:
+            self._log.info("relay_connected", address=self.path.host, **omitted)
         self._on_change()
 
-    def _fail(self, reason: str) -> None:
-        self.error = reason
-        self._write("warning", "relay_not_connected", reason=reason)
-
-    def _write(self, level: str, event: str, **facts: str) -> None:
+    def _take_line(self) -> dict[str, int] | None:
         omitted = self._limits.take("web", self.path.host, monotonic())
         if omitted is None:
             self._limits.omit("web", self.path.host)
-        else:
-            getattr(self._log, level)(event, address=self.path.host, **facts, **omitted)
+        return omitted
 
     # Of the connection.
 
@@ -262,5 +262,8 @@ class WebRelay:
         self._stream = None
         self._ended.set()
         self._node.set_socket_state(self.number, monotonic(), is_up=False)
-        self._fail(reason)
-        self._on_change()
+        self.error = "" if reason == UDP_WORKS else reason
+        if self._task is not None:
+            if (omitted := self._take_line()) is not None:
+                self._log.info("relay_disconnected", address=self.path.host, reason=reason, **omitted)
+            self._on_change()
