@@ -285,7 +285,7 @@ def family_of(host: str) -> socket.AddressFamily:
 
 _REMEDIES = {
     errno.EADDRINUSE: "end the process that listens there (`ss -lntup` names it), or write another port",
-    errno.EACCES: "write a port of 1024 or more: lower ones need root",
+    errno.EACCES: "write a port of 1024 or more: lower ones need root, or CAP_NET_BIND_SERVICE in the unit",
 }
 
 

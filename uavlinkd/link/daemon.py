@@ -88,7 +88,8 @@ class Daemon:
         """Bind every socket, then start to read. Raises BindError or ControlError if one of them cannot be opened."""
         parts, config = self.parts, self.parts.config
         try:
-            parts.peer_sockets.open(config.listen, config.networks)
+            relay = config.relay_server
+            parts.peer_sockets.open(config.listen, config.networks, relay.https if relay is not None else None)
             parts.local.open(config.endpoints)
             if config.metrics is not None:
                 from uavlinkd.ops.metrics_server import serve_metrics  # noqa: PLC0415  only if configured

@@ -9,11 +9,11 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from structlog.typing import FilteringBoundLogger
 
-from uavlinkd.config.model import NetworkConfig, PeerAddress
+from uavlinkd.config.model import HttpsServer, NetworkConfig, PeerAddress
 from uavlinkd.core.node import Node
 from uavlinkd.core.path import Path, SocketAddress, relay_name
 from uavlinkd.endpoints.ports import failure_name
@@ -39,6 +39,9 @@ from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.resolver import Resolved
 from uavlinkd.system.stall import StallWatch
+
+if TYPE_CHECKING:
+    from uavlinkd.link.web_listener import WebListener
 
 _EPHEMERAL = (Address("0.0.0.0", 0), Address("::", 0))
 """Without a listen address the daemon only connects to peers, from any port."""
@@ -93,6 +96,8 @@ class PeerSockets:
         self.serial = SerialNetworks((), 0, node, stall, log)
         self.web: dict[PeerAddress, WebRelay] = {}
         """Those of relays that are reached by TLS, by address in the configuration."""
+        self.listener: WebListener | None = None
+        """Where members reach this relay by TLS."""
         self.handles = RelayHandles()
         """Those that relays assigned to this daemon."""
         self.budgets: dict[int, NetworkBudget] = {}
@@ -171,7 +176,12 @@ class PeerSockets:
         """The host names of a peer that have no address now."""
         return self._names[name].unresolved if name in self._names else set()
 
-    def open(self, addresses: Sequence[Address], networks: Sequence[NetworkConfig] = ()) -> None:
+    def open(
+        self,
+        addresses: Sequence[Address],
+        networks: Sequence[NetworkConfig] = (),
+        https: HttpsServer | None = None,
+    ) -> None:
         """Bind a socket to each address, or ephemeral ones without any; with networks, bind those of each network.
 
         Raises:
@@ -194,6 +204,11 @@ class PeerSockets:
         self.serial = SerialNetworks(lines, len(self._slots), self._node, self._stall, self._log)
         for line in self.serial.networks:
             self._slots.append(_Slot(line.number, socket.AF_UNSPEC, line.send))
+        if https is not None:
+            from uavlinkd.link.web_listener import WebListener  # noqa: PLC0415  only if configured
+
+            self.listener = WebListener(https, len(self._slots), self._node, self._stall, self._drops)
+            self._slots.append(_Slot(self.listener.number, socket.AF_UNSPEC, self.listener.send))
         self._add_budgets(monotonic())
 
     def _add_budgets(self, now: float) -> None:
@@ -242,6 +257,8 @@ class PeerSockets:
         for slot in self._slots:
             self._read(slot)
         self.serial.start(receive, on_change)
+        if self.listener is not None:
+            self.listener.start(receive)
         for names in self._names.values():
             self._start_web(names.link)
         if self.networks.networks:
@@ -263,6 +280,8 @@ class PeerSockets:
                 slot.reports.renew()
         self.check_networks()
         self.serial.do_housekeeping()
+        if self.listener is not None:
+            self.listener.do_housekeeping()
 
     def check_networks(self) -> None:
         """Open and close the sockets of the networks that changed, and resolve names again."""
@@ -281,6 +300,8 @@ class PeerSockets:
             line.line.close()
         for web in self.web.values():
             web.stop()
+        if self.listener is not None:
+            self.listener.close()
         for slot in self._slots:
             self.put(slot.number, None)
 

@@ -73,6 +73,7 @@ def daemon_status(daemon: DaemonParts, now: float) -> dict[str, object]:
         else {
             "members": {one.settings.name: _member_status(relay, one, now) for one in relay.members.values()},
             "connections": relay.bindings.connections,
+            "https": None if (listener := daemon.peer_sockets.listener) is None else listener.status(),
             "dropped": _counts(relay.forwarding.dropped),
         },
         "recording": None

@@ -1,0 +1,348 @@
+"""Where members reach this relay by TLS: one socket that listens, and the connections that it accepted.
+
+To the rest of the daemon they are one socket of UDP: a datagram comes from the address of a connection, and goes back
+to it. Any machine may connect to such a port. A connection belongs to a stranger until a peer has answered a question
+of the core along it. Strangers are limited, and do not stay.
+
+Without a certificate, a web server on this machine has it, and says who connected to it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import resource
+import socket
+from collections import Counter
+from contextlib import suppress
+from ipaddress import IPv6Address, ip_address
+from typing import Final
+
+from uavlinkd.config.model import HttpsServer
+from uavlinkd.config.tls_files import TlsFileError, load_tls
+from uavlinkd.core.limits import TokenBucket
+from uavlinkd.core.node import Node
+from uavlinkd.core.path import SocketAddress
+from uavlinkd.endpoints.ports import failure_name
+from uavlinkd.endpoints.sockets import BindError
+from uavlinkd.endpoints.tcp import tcp_listener
+from uavlinkd.endpoints.tls_channel import TlsFactory, server_tls
+from uavlinkd.endpoints.web_stream import WebStream, server_protocol
+from uavlinkd.link.drop_summary import DropSummary
+from uavlinkd.link.networks import Receive
+from uavlinkd.system.addresses import Address, numeric_host
+from uavlinkd.system.clock import monotonic
+from uavlinkd.system.stall import Backlog, StallWatch
+
+CONNECTIONS: Final = 4096
+STRANGERS: Final = 256
+"""Connections that no member has proved. One more displaces the oldest: a member needs a second, or less."""
+STRANGERS_OF_PREFIX: Final = 32
+"""Of them, from one IPv4 /24 or IPv6 /48."""
+STRANGER_S: Final = 5.0
+"""So long a stranger may stay."""
+ACCEPTED_S: Final = 200.0
+"""New connections a second: each costs a handshake of TLS. The others wait in the kernel."""
+ACCEPTED_AT_ONCE: Final = 20
+PAUSE_S: Final = 0.05
+"""Until the next connections are accepted,"""
+EXHAUSTED_S: Final = 1.0
+"""and without a file descriptor."""
+LOOK_AGAIN_S: Final = 0.1
+"""While there are too many strangers, they are looked at this often at most."""
+FILES: Final = CONNECTIONS + 512
+"""File descriptors that the daemon asks for, with those of everything else."""
+SENDER: Final = "members by TLS"
+"""The name of their stale datagrams."""
+_BACKLOG: Final = 1024
+_KEEPALIVE: Final = (("TCP_KEEPIDLE", 30), ("TCP_KEEPINTVL", 10), ("TCP_KEEPCNT", 3))
+"""The kernel notices a member that is gone without a word."""
+_EXHAUSTED: Final = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
+
+
+class _Connection:
+    """One connection, the handler of its stream. ``since``: when it became a stranger's."""
+
+    __slots__ = ("_listener", "address", "prefix", "since", "stream")
+
+    def __init__(self, listener: WebListener, address: SocketAddress, prefix: object, now: float) -> None:
+        self._listener = listener
+        self.address = address
+        self.prefix = prefix
+        self.since = now
+        self.stream: WebStream
+
+    def on_open(self) -> None:
+        self._listener.on_open(self)
+
+    def on_datagrams(self, datagrams: list[bytes], now: float, epoch: int) -> None:
+        self._listener.on_datagrams(self, datagrams, now, epoch)
+
+    def on_lost(self, reason: str) -> None:
+        self._listener.on_lost(self, reason)
+
+    def on_writable(self) -> None:
+        """A relay keeps no queue of a member's datagrams."""
+
+
+class WebListener:
+    """``number``: that of the socket, for the core."""
+
+    def __init__(self, config: HttpsServer, number: int, node: Node, stall: StallWatch, drops: DropSummary) -> None:
+        """Listen. Raises BindError if the address or the certificate cannot be used."""
+        self.number = number
+        self.refused = Counter[str]()
+        """Connections that were not accepted, or ended before a member proved them, by reason."""
+        self.lost = Counter[str]()
+        """Connections of members that ended, by reason."""
+        self._tls = _tls_of(config)
+        self._node = node
+        self._stall = stall
+        self._drops = drops
+        self._receive: Receive = lambda *_: None
+        self._every = set[_Connection]()
+        self._strangers: dict[_Connection, None] = {}  # the oldest first
+        self._strangers_of = Counter[object]()  # by prefix
+        self._by_address: dict[SocketAddress, _Connection] = {}  # the open ones
+        self._dropped = 0  # datagrams, of connections that ended
+        self._accepted = TokenBucket(ACCEPTED_S, ACCEPTED_AT_ONCE, monotonic())
+        self._looked_at = 0.0
+        self._resume: asyncio.TimerHandle | None = None
+        try:
+            self._sock = tcp_listener(config.listen)
+        except BindError as error:
+            raise BindError(f"relay_server.https: {error}") from None
+        self._sock.listen(_BACKLOG)
+        self._backlog = Backlog(stall, self._sock.fileno(), lambda: _BACKLOG + 1)
+        _raise_file_limit()
+        node.facts.streams.add(number)
+        node.facts.metered.add(number)
+
+    @property
+    def address(self) -> Address:
+        return Address(*self._sock.getsockname()[:2])
+
+    def start(self, receive: Receive) -> None:
+        """Accept connections."""
+        self._receive = receive
+        asyncio.get_running_loop().add_reader(self._sock.fileno(), self._on_acceptable)
+
+    def close(self) -> None:
+        """End every connection, and do not listen any more."""
+        if self._resume is not None:
+            self._resume.cancel()
+        asyncio.get_running_loop().remove_reader(self._sock.fileno())
+        self._sock.close()
+        for connection in list(self._every):
+            connection.stream.lose("closed")
+
+    def send(self, datagram: bytes, address: SocketAddress) -> int:
+        """As a socket's ``sendto``."""
+        connection = self._by_address.get(address)
+        if connection is None:
+            raise OSError(errno.ENOTCONN, "the connection has ended")
+        connection.stream.send(datagram)
+        return len(datagram)
+
+    def do_housekeeping(self) -> None:
+        """End the connections of strangers that stayed too long. Call it once a second."""
+        now = monotonic()
+        if self._every:
+            self._look(now)
+        for connection in [one for one in self._strangers if now - one.since >= STRANGER_S]:
+            connection.stream.lose("unproven")
+
+    def status(self) -> dict[str, object]:
+        """As plain values."""
+        return {
+            "address": str(self.address),
+            "is_plain": self._tls is None,
+            "connections": len(self._every),
+            "strangers": len(self._strangers),
+            "refused": dict(self.refused),
+            "lost": dict(self.lost),
+            "datagrams_dropped": self._dropped + sum(one.stream.dropped for one in self._every),
+        }
+
+    # Accepting.
+
+    def _on_acceptable(self) -> None:
+        now = monotonic()
+        epoch = self._backlog.begin(now)
+        while self._accepted.has(now):
+            try:
+                sock, sockaddr = self._sock.accept()
+            except BlockingIOError:
+                self._backlog.end(0, is_empty=True)
+                return
+            except OSError as error:
+                if error.errno in _EXHAUSTED:  # else this one is gone already
+                    self._refuse(failure_name(error), now)
+                    self._pause(EXHAUSTED_S)
+                    return
+                continue
+            self._accepted.take(now)
+            self._backlog.end(1, is_empty=False)
+            self._accept(sock, (numeric_host(sockaddr), sockaddr[1]), epoch, now)
+        self._pause(PAUSE_S)
+
+    def _pause(self, seconds: float) -> None:
+        loop = asyncio.get_running_loop()
+        loop.remove_reader(self._sock.fileno())
+        self._resume = loop.call_later(seconds, self.start, self._receive)
+
+    def _accept(self, sock: socket.socket, address: SocketAddress, epoch: int, now: float) -> None:
+        prefix = None if self._tls is None else _prefix_of(address[0])  # a web server's connections are not its own
+        if reason := self._make_place(prefix, now):
+            self._refuse(reason, now)
+            sock.close()
+            return
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        for name, value in _KEEPALIVE:
+            with suppress(OSError, AttributeError):
+                sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
+        connection = _Connection(self, address, prefix, now)
+        connection.stream = WebStream(sock, server_protocol(), self._tls, connection, self._stall, SENDER, epoch)
+        self._every.add(connection)
+        self._add_stranger(connection)
+        connection.stream.start()
+
+    def _make_place(self, prefix: object, now: float) -> str:
+        """For a stranger. Returns why there is none."""
+        if len(self._every) >= CONNECTIONS:
+            return "too_many_connections"
+        if self._is_full(prefix, now):
+            return "prefix_full"
+        if len(self._strangers) >= STRANGERS:
+            self._look_again(now)
+        if len(self._strangers) >= STRANGERS:
+            self._drops.add("connections_failed", "displaced", "", 1, now)
+            next(iter(self._strangers)).stream.lose("displaced")
+        return ""
+
+    def _is_full(self, prefix: object, now: float) -> bool:
+        if self._strangers_of[prefix] >= STRANGERS_OF_PREFIX:
+            self._look_again(now)
+        return self._strangers_of[prefix] >= STRANGERS_OF_PREFIX
+
+    def _refuse(self, reason: str, now: float) -> None:
+        self.refused[reason] += 1
+        self._drops.add("connections_failed", reason, "", 1, now)
+
+    # Strangers.
+
+    def _look_again(self, now: float) -> None:
+        if now - self._looked_at >= LOOK_AGAIN_S:
+            self._look(now)
+
+    def _look(self, now: float) -> None:
+        """Whose connection is it? A peer's, as long as the core has a path there that was proved."""
+        self._looked_at = now
+        proved = {
+            path.address
+            for peer in self._node.peers.values()
+            for path, state in peer.paths.by_path.items()
+            if path.socket == self.number and state.is_validated
+        }
+        for connection in self._every:
+            is_stranger = connection in self._strangers
+            if connection.address in proved:
+                self._remove_stranger(connection)
+            elif not is_stranger:
+                connection.since = now
+                self._add_stranger(connection)
+
+    def _add_stranger(self, connection: _Connection) -> None:
+        self._strangers[connection] = None
+        if connection.prefix is not None:
+            self._strangers_of[connection.prefix] += 1
+
+    def _remove_stranger(self, connection: _Connection) -> bool:
+        """Returns whether it was one."""
+        if connection not in self._strangers:
+            return False
+        del self._strangers[connection]
+        if connection.prefix is not None:
+            self._strangers_of[connection.prefix] -= 1
+            if not self._strangers_of[connection.prefix]:
+                del self._strangers_of[connection.prefix]
+        return True
+
+    # As the owner of the connections.
+
+    def on_open(self, connection: _Connection) -> None:
+        """Datagrams may be sent. Behind a web server, now it is known who connected."""
+        if self._tls is None and not self._take_forwarded(connection, monotonic()):
+            return
+        if (before := self._by_address.get(connection.address)) is not None:
+            before.stream.lose("replaced")
+        self._by_address[connection.address] = connection
+
+    def _take_forwarded(self, connection: _Connection, now: float) -> bool:
+        """Take over the address that the web server wrote. Returns whether the connection may stay."""
+        request = connection.stream.request
+        assert request is not None, "it opened the stream"
+        hosts = request.headers.get_all("X-Forwarded-For") or [str(connection.address[0])]
+        host = _host_in(hosts[-1])
+        if host is None:
+            connection.stream.lose("forwarded_for")
+            return False
+        prefix = _prefix_of(host)
+        if self._is_full(prefix, now):
+            self._drops.add("connections_failed", "prefix_full", "", 1, now)
+            connection.stream.lose("prefix_full")
+            return False
+        self._remove_stranger(connection)
+        connection.address, connection.prefix = (host, connection.address[1]), prefix
+        self._add_stranger(connection)
+        return True
+
+    def on_datagrams(self, connection: _Connection, datagrams: list[bytes], now: float, epoch: int) -> None:
+        """Messages came in one read."""
+        address = connection.address
+        self._receive(self.number, [(datagram, address) for datagram in datagrams], now, epoch, 0.0)
+
+    def on_lost(self, connection: _Connection, reason: str) -> None:
+        """The connection ended."""
+        self._every.discard(connection)
+        if self._by_address.get(connection.address) is connection:
+            del self._by_address[connection.address]
+        ended = self.refused if self._remove_stranger(connection) else self.lost
+        ended[reason] += 1
+        self._dropped += connection.stream.dropped
+
+
+def _tls_of(config: HttpsServer) -> TlsFactory | None:
+    if config.certificate is None or config.key is None:
+        return None
+    try:
+        return server_tls(load_tls(config.certificate, config.key))
+    except TlsFileError as error:
+        raise BindError(f"relay_server.https: {error}") from None
+
+
+def _raise_file_limit() -> None:
+    """Each connection is a file. Services have 1,024, and may have more."""
+    least, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = FILES if most == resource.RLIM_INFINITY else min(FILES, most)
+    if least != resource.RLIM_INFINITY and least < wanted:
+        with suppress(OSError, ValueError):
+            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, most))
+
+
+def _prefix_of(host: str) -> object:
+    """The network from which a stranger may have all addresses."""
+    return IPv6Address(host).packed[:6] if ":" in host else host.rpartition(".")[0]
+
+
+def _host_in(forwarded: str) -> str | None:
+    """The last host of the header: the web server appended it, and the client may have written those before."""
+    try:
+        ip = ip_address(forwarded.rpartition(",")[2].strip())
+    except ValueError:
+        return None
+    if isinstance(ip, IPv6Address):
+        if ip.scope_id is not None:
+            return None
+        ip = ip.ipv4_mapped or ip
+    return str(ip)
