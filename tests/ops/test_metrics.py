@@ -100,6 +100,11 @@ STATUS: dict[str, Any] = {
     "relay": {
         **numbered("connections"),
         "dropped": numbered("relay_over_limit"),
+        "https": {
+            **numbered("connections", "strangers"),
+            "refused": numbered("prefix_full", "tls"),
+            "lost": numbered("closed"),
+        },
         "members": {"drone1": {"is_up": True, **MEMBER}},
     },
     "name": "drone0",

@@ -28,6 +28,8 @@ COUNTS: Mapping[str, int] = {
     "send_failures": 1,
     "recording.failures": 1,
     "relay.dropped": 1,
+    "relay.https.refused": 1,
+    "relay.https.lost": 1,
     "peers.*.drops": 1,
     "relays.*.drops": 1,
     "peers.*.malformed": 1,
@@ -56,6 +58,7 @@ ALSO = {
     "relays.*.paths[].network": "string",
     "endpoints.*.clients.*.last_received_s": "null",
     "recording": "null",
+    "relay.https": "null",
     "fleet.events.*": "number",
     "networks.*.serial.radio": "object",
     **{f"networks.*.serial.radio.{name}": "integer" for name in RADIO_FIGURES},
@@ -103,6 +106,7 @@ async def observed() -> dict[str, str]:
             {"name": "drone1", "public_key": b.public_key},
             {"name": "far", "public_key": far.public_key},
         ]
+        relay.config["relay_server"] = {"https": {"listen": f"127.0.0.1:{free_port()}"}}
         relay.add_peer(b, [b.address])
         b.add_peer(relay, [relay.address])
         b.config["relay"] = [{"name": "station", "public_key": relay.public_key, "addresses": []}]

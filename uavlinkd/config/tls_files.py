@@ -37,8 +37,7 @@ def find_tls_files(server: HttpsServer, folder: Path, environ: Mapping[str, str]
 
 def load_tls(certificate: Path, key: Path) -> SSLContext:
     """What a server of TLS needs. Raises TlsFileError if the files cannot be used."""
-    # Imported only if configured.
-    import ssl  # noqa: PLC0415
+    from uavlinkd.endpoints.tls_channel import server_context  # noqa: PLC0415  only if configured
 
     for what, path in (("certificate", certificate), ("key", key)):
         try:
@@ -48,20 +47,11 @@ def load_tls(certificate: Path, key: Path) -> SSLContext:
         except OSError as error:
             remedy = _MAKE if isinstance(error, FileNotFoundError) else "the daemon's user has to read it"
             raise TlsFileError(f"{what} {path} cannot be read: {error.strerror}: {remedy}") from None
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    context.minimum_version = ssl.TLSVersion.TLSv1_2
-    context.num_tickets = 0  # a member that comes again makes a new session
     try:
-        context.load_cert_chain(certificate, key, password=_no_passphrase)
+        return server_context(str(certificate), str(key))
     except (OSError, ValueError) as error:
         if getattr(error, "reason", "") == "KEY_VALUES_MISMATCH":
             text = f"key {key} is not that of the certificate {certificate}: write the two that were made together"
         else:
             text = f"{certificate} and {key} are not a certificate and its key, in PEM without a passphrase: {_MAKE}"
         raise TlsFileError(text) from None
-    return context
-
-
-def _no_passphrase() -> str:
-    """Otherwise OpenSSL asks for one on the terminal."""
-    return ""

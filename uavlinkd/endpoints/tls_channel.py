@@ -63,7 +63,7 @@ def server_context(certificate: str, key: str) -> ssl.SSLContext:
     """TLS of a relay, from two PEM files. Raises OSError (ssl.SSLError is one) if they cannot be used."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     _limit(context)
-    context.load_cert_chain(certificate, key)
+    context.load_cert_chain(certificate, key, password=lambda: "")  # otherwise OpenSSL asks on the terminal
     context.num_tickets = 0  # a session is not resumed: tickets would cost memory and bytes
     return context
 

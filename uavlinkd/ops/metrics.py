@@ -163,6 +163,12 @@ def _relay(status: Status) -> Iterator[Part]:
         yield (), relay | {"drops": {reason: relay["dropped"].get(reason, 0) for reason in _RELAY_REASONS}}
 
 
+def _relay_by_tls(status: Status) -> Iterator[Part]:
+    for _, relay in _relay(status):
+        if (https := relay["https"]) is not None:
+            yield (), https | {"refused": dict.fromkeys(_STRANGERS, 0) | https["refused"]}
+
+
 def _members(status: Status) -> Iterator[Part]:
     for _, relay in _relay(status):
         yield from (((name,), member) for name, member in relay["members"].items())
@@ -190,6 +196,7 @@ def _refusals(part: Status) -> dict[tuple[str, str], int]:
 
 _FINDING = ("cause", "severity", "subject", "name")
 _SESSION = ("suite", "mode", "tag_bits")
+_STRANGERS = ("prefix_full", "displaced", "too_many_connections", "unproven", "slow_handshake")
 _STATES = ("bound", "waiting", "unanswered")  # of a peer at a relay
 _BUILD = {"version": __version__, "python": platform.python_version()}
 _SCHEMAS = {"status": str(STATUS_SCHEMA), "log": str(LOG_SCHEMA), "metrics": str(METRICS_SCHEMA)}
@@ -204,6 +211,7 @@ _PARTS: Mapping[str, Callable[[Status], Iterator[Part]]] = {
     "endpoint": _endpoints,
     "fleet": _fleet,
     "relay": _relay,
+    "relay by TLS": _relay_by_tls,
     "member": _members,
     "used relay": _used_relays,
     "recording": _recording,

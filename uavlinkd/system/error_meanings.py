@@ -37,6 +37,11 @@ ERROR_MEANINGS: Final[Mapping[str, str]] = {
     ' The socket works as soon as an interface has it. "0.0.0.0" stands for every address',
     "relay_handle_gone": "a relay no longer forwards to the peer, for example after its restart: the daemon asks it"
     " again by itself",
+    # Connections to a relay by TLS.
+    "too_many_connections": "this relay has as many connections by TLS as it may: run several relays",
+    "prefix_full": "too many connections from one network that no member has proved: a scan or an attack, or many"
+    " members of that network start at once",
+    "displaced": "too many connections that no member has proved: new ones displace the oldest",
     # Files and devices.
     "ENOENT": "there is no such file or device now: plug it in, or correct its name",
     "ENXIO": "the device has gone: plug it in again",
