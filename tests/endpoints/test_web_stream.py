@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import fcntl
 import socket
 import ssl
 import struct
+from array import array
 from collections.abc import AsyncIterator
 from contextlib import closing
 from pathlib import Path
@@ -16,9 +18,9 @@ import uvloop
 
 from tests.endpoints.web_streams import REQUEST, Loopback, frame
 from tests.waiting import until
-from uavlinkd.endpoints import send_window, web_stream
-from uavlinkd.endpoints.tls_channel import server_context
-from uavlinkd.endpoints.web_stream import GATHER_BYTES, MAX_MESSAGE, PAGE
+from uavlinkd.endpoints import send_window, tls_channel, web_stream
+from uavlinkd.endpoints.tls_channel import TlsChannel, server_context
+from uavlinkd.endpoints.web_stream import GATHER_BYTES, MAX_MESSAGE, PAGE, QUEUE_BYTES
 from uavlinkd.system.clock import monotonic
 
 DATAGRAM = bytes(range(200))
@@ -90,6 +92,60 @@ async def test_an_owner_that_waits_for_room_loses_no_datagram(loopback: Loopback
     await until(lambda: len(relay.datagrams) == sent)
     assert member.stream.dropped == 0
     assert (member.reasons, relay.reasons) == ([], [])
+
+
+def unsent_bytes(sock: socket.socket) -> int:
+    count = array("i", [0])
+    fcntl.ioctl(sock, tls_channel._SIOCOUTQNSD, count)
+    return count[0]
+
+
+async def test_a_receiver_that_does_not_read(loopback: Loopback, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The kernel holds a segment, old datagrams are dropped, and the loop sleeps until there is room again."""
+    for limit in ("FIRST_BYTES", "LEAST_BYTES"):
+        monkeypatch.setattr(send_window, limit, 1 << 30)
+    wake_ups = 0
+    on_writable = TlsChannel._on_writable
+
+    def counted(channel: TlsChannel) -> None:
+        nonlocal wake_ups
+        wake_ups += 1
+        on_writable(channel)
+
+    monkeypatch.setattr(TlsChannel, "_on_writable", counted)
+    loopback.listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    sock = await loopback.raw()
+    member, relay = loopback.member(sock), loopback.relay(await loopback.accepted())
+    await until(lambda: bool(member.opened and relay.opened))
+    loop, fd = asyncio.get_running_loop(), relay.stream._channel._fd
+    loop.remove_reader(fd)
+    before, sent = -1, 0
+    while before < wake_ups or unsent_bytes(sock) < tls_channel.UNSENT_BYTES:  # the kernel paces what it sends
+        before = wake_ups
+        sent += member.fill(DATAGRAM)
+        await asyncio.sleep(0.1)
+    assert unsent_bytes(sock) < tls_channel.UNSENT_BYTES + 2 * GATHER_BYTES
+    before = wake_ups
+    await turns()
+    assert wake_ups <= before + 1
+
+    while not member.stream.dropped:
+        member.stream.send(DATAGRAM)
+        sent += 1
+        await asyncio.sleep(0.01)
+    assert member.stream._queued_bytes < QUEUE_BYTES / 2, "dropped by age"
+    for _ in range(2 * QUEUE_BYTES // len(DATAGRAM)):
+        member.stream.send(DATAGRAM)
+        sent += 1
+    assert sum(len(datagram) for datagram, _ in member.stream._queue) <= QUEUE_BYTES
+
+    assert member.stream.room(monotonic()) == 0
+    member.writable = 0
+    loop.add_reader(fd, relay.stream._channel._on_readable)
+    await until(lambda: member.writable == 1)
+    member.stream.send(b"last")
+    await until(lambda: relay.datagrams[-1:] == [b"last"])
+    assert len(relay.datagrams) + member.stream.dropped == sent + 1
 
 
 async def test_sending_ends_with_the_stream(plain: Loopback) -> None:
