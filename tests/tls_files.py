@@ -9,7 +9,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
-CERTIFICATE, TLS_KEY = "relay.pem", "relay-tls.key"
+CERTIFICATE, TLS_KEY = "tls.crt", "tls.key"
 
 
 def write_tls_files(

@@ -93,7 +93,7 @@ def test_files_that_cannot_be_used_are_a_problem(tmp_path: Path, break_it: Break
         ('{ listen = "relay.example.org:443" }', "listen must be a numeric address"),
         ("{ listen = 443 }", "listen must be text"),
         ('{ listen = "127.0.0.1:1", key = "" }', "key must name a file"),
-        ('{ listen = "127.0.0.1:1", key = "relay-tls.key" }', "only one of certificate and key"),
+        ('{ listen = "127.0.0.1:1", key = "tls.key" }', "only one of certificate and key"),
         ('{ listen = "0.0.0.0:443" }', "only a web server on this machine"),
         ('{ listen = "[::]:443" }', "only a web server on this machine"),
     ],

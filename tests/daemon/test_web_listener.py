@@ -15,12 +15,12 @@ from websockets.asyncio.client import ClientConnection, connect
 from tests.daemon.harness import Stage
 from tests.daemon.process import DaemonProcess
 from tests.tls_files import CERTIFICATE, TLS_KEY, write_tls_files
-from tests.waiting import Stopwatch
+from tests.waiting import Stopwatch, until
 from uavlinkd.config import keys
 from uavlinkd.core import constants as c
 from uavlinkd.core.crypto import Secret
 from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import Output, Transmit
+from uavlinkd.core.outputs import Output, PeerClosed, Transmit
 from uavlinkd.core.path import Path
 from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.core.suites import X25519
@@ -39,6 +39,8 @@ class RawMember:
         private = keys.generate_private_key()
         self.public_key = keys.public_key_text(private)
         self.received: list[bytes] = []
+        self.is_closed = False
+        """Whether the relay ended the session."""
         self._node = Node(Secret(b64decode(private)), os.urandom, monotonic())
         settings = PeerSettings(
             "relay", b64decode(relay.public_key), None, Link((X25519,), features=c.FEATURE_RECORDS)
@@ -61,7 +63,9 @@ class RawMember:
         async for message in socket:
             assert isinstance(message, bytes)
             self.received.append(message)
-            await _send(socket, self._node.receive(message, _AT, monotonic()))
+            outputs = self._node.receive(message, _AT, monotonic())
+            self.is_closed |= any(isinstance(output, PeerClosed) for output in outputs)
+            await _send(socket, outputs)
 
     async def _tick(self, socket: ClientConnection) -> None:
         while True:
@@ -181,6 +185,16 @@ async def test_web_server_here_says_who_connects(stage: Stage) -> None:
         await socket.wait_closed()
     status = await relay.until(lambda status: _https(status)["connections"] == 0)
     assert _https(status)["refused"] == {"forwarded_for": 1}
+
+
+async def test_members_hear_of_the_end(stage: Stage) -> None:
+    """The close of the session leaves before the connection ends."""
+    relay, member, port = _relay(stage)
+    await stage.start(relay)
+    async with _websocket(port) as socket, member.over(socket):
+        await relay.until(lambda status: bool(status["relay"]["members"]["drone1"]["addresses"]))
+        await relay.stop()
+        await until(lambda: member.is_closed)
 
 
 async def test_port_of_another_process_is_named(stage: Stage) -> None:

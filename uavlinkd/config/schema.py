@@ -35,7 +35,7 @@ _INTERFACE = re.compile(r"[^\s/:]{1,15}")  # as dev_valid_name() of Linux
 _LIKE_A_KEY = re.compile(r"[A-Za-z0-9+/_-]{40,}={0,2}")
 _RESOURCE = re.compile(r"[A-Za-z0-9._~/-]{0,64}")  # of a URL, behind its first slash
 _SMALL_GROUP = re.compile(r"(?:modp|ffdhe?|dhe?)?[-_ ]?(?:512|768|1024)")
-_HTTPS = '{ listen = "0.0.0.0:443", certificate = "relay.pem", key = "relay-tls.key" }'
+_HTTPS = '{ listen = "0.0.0.0:443", certificate = "tls.crt", key = "tls.key" }'
 ENROLL_AGAIN = "run `uavlinkd enroll --finish` again with the line of `uavlinkd fleet sign`"
 LEAST_BUDGET = 1000
 _LEAST_AIR = 1000

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 _MAKE = (
     "`openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes -days 3650 -subj /CN=relay"
-    " -keyout relay-tls.key -out relay.pem` makes both, and members accept that"
+    " -keyout tls.key -out tls.crt` makes both, and members accept that"
 )
 
 

@@ -146,6 +146,12 @@ class WebStream:
         self._queued_bytes = 0
         self._handler.on_lost(reason)
 
+    def finish(self) -> None:
+        """Send what waits, as far as there is room, and close the connection."""
+        if self.is_open:
+            self._flush()
+        self.lose("finished")
+
     # Sending.
 
     def send(self, datagram: bytes) -> None:

@@ -134,7 +134,7 @@ class WebListener:
         asyncio.get_running_loop().remove_reader(self._sock.fileno())
         self._sock.close()
         for connection in list(self._every):
-            connection.stream.lose("closed")
+            connection.stream.finish()  # the sessions of the members have just been closed
 
     def send(self, datagram: bytes, address: SocketAddress) -> int:
         """As a socket's ``sendto``."""

@@ -144,7 +144,7 @@ class WebRelay:
             self._task.cancel()
             self._task = None
         if self._stream is not None:
-            self._stream.lose("closed")
+            self._stream.finish()  # the session has just been closed
 
     def send(self, datagram: bytes, _address: SocketAddress) -> int:
         """As a socket's ``sendto``."""

@@ -1,0 +1,262 @@
+"""The port where members reach a relay by TLS: who may connect, who is displaced, and whom a proved path protects."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import socket
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager, suppress
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from tests.link.socket_states import SocketStateLog
+from tests.link.test_drop_summary import Recorder
+from tests.waiting import Stopwatch, until
+from uavlinkd.config.model import HttpsServer
+from uavlinkd.core.path import Path, SocketAddress
+from uavlinkd.endpoints.sockets import BindError
+from uavlinkd.lab.sim.loopback_ports import free_port
+from uavlinkd.link import web_listener as module
+from uavlinkd.link.drop_summary import DropSummary
+from uavlinkd.link.web_listener import WebListener
+from uavlinkd.system.addresses import Address
+from uavlinkd.system.clock import monotonic
+from uavlinkd.system.stall import StallWatch
+
+NUMBER = 3
+REQUEST = (
+    "GET /uavlink HTTP/1.1\r\nHost: relay\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n{}\r\n"
+)
+
+
+class Port:
+    """A listener without TLS, as behind a web server, and what connects to it."""
+
+    def __init__(self) -> None:
+        self.node = SocketStateLog()
+        self.node.peers = {}
+        self.log = Recorder()
+        config = HttpsServer(Address("127.0.0.1", free_port()))
+        stall = StallWatch(monotonic(), lambda seconds: None)
+        self.listener = WebListener(config, NUMBER, self.node, stall, DropSummary(cast(Any, self.log)))
+        self.received: list[tuple[bytes, SocketAddress]] = []
+        self._clients: list[socket.socket] = []
+
+    def start(self) -> None:
+        def receive(number: int, datagrams: list[tuple[bytes, Any]], now: float, epoch: int, waited_s: float) -> None:
+            assert (number, waited_s) == (NUMBER, 0.0)
+            self.received += datagrams
+
+        self.listener.start(cast(Any, receive))
+
+    def prove(self, *addresses: SocketAddress) -> None:
+        """A peer has answered along these, and is at another address too."""
+        paths = {Path(NUMBER, address): SimpleNamespace(is_validated=True) for address in addresses}
+        others = {Path(NUMBER, ("192.0.2.1", 1)): SimpleNamespace(is_validated=False)}
+        peer = SimpleNamespace(paths=SimpleNamespace(by_path=paths | others))
+        self.node.peers = cast(Any, {"drone1": peer})
+
+    async def connect(self, start: SocketAddress = ("127.0.0.1", 0)) -> socket.socket:
+        """Another connection."""
+        client = socket.socket()
+        self._clients.append(client)
+        client.setblocking(False)
+        client.bind(start)
+        address = self.listener.address
+        await asyncio.get_running_loop().sock_connect(client, (address.host, address.port))
+        return client
+
+    async def open(self, forwarded: str = "", start: SocketAddress = ("127.0.0.1", 0)) -> socket.socket:
+        """A connection for messages, which a web server forwards."""
+        client = await self.connect(start)
+        header = f"X-Forwarded-For: {forwarded}\r\n" if forwarded else ""
+        client.send(REQUEST.format(header).encode())
+        return client
+
+    @property
+    def refused(self) -> dict[str, int]:
+        return dict(self.listener.refused)
+
+    @property
+    def counts(self) -> tuple[Any, Any]:
+        """Connections, and those of strangers."""
+        status = self.listener.status()
+        return status["connections"], status["strangers"]
+
+    def end(self) -> None:
+        self.listener.close()
+        for client in self._clients:
+            client.close()
+
+
+@asynccontextmanager
+async def port() -> AsyncIterator[Port]:
+    one = Port()
+    one.start()
+    try:
+        yield one
+    finally:
+        one.end()
+
+
+async def is_ended(client: socket.socket) -> bool:
+    """Wait for the end of a connection."""
+    loop = asyncio.get_running_loop()
+    with suppress(ConnectionResetError):
+        while await loop.sock_recv(client, 4096):
+            pass
+    return True
+
+
+async def test_newest_stranger_displaces_the_oldest_that_is_not_proved(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A flood of strangers keeps no member away, before or after it is proved."""
+    monkeypatch.setattr(module, "STRANGERS", 2)
+    monkeypatch.setattr(module, "LOOK_AGAIN_S", 0.0)
+    async with port() as relay:
+        member, stranger = await relay.open(), await relay.connect()
+        await until(lambda: relay.counts == (2, 2))
+        relay.prove(member.getsockname())
+        await relay.connect()
+        await until(lambda: relay.counts == (3, 2))
+        assert relay.refused == {}
+        await relay.connect()
+        assert await is_ended(stranger)
+        assert relay.counts == (3, 2)
+        assert relay.refused == {"displaced": 1}
+        assert [line[1]["reason"] for line in relay.log.lines] == ["displaced"]
+
+
+async def test_connections_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also those of members."""
+    monkeypatch.setattr(module, "CONNECTIONS", 1)
+    async with port() as relay:
+        member = await relay.connect()
+        await until(lambda: relay.counts == (1, 1))
+        assert await is_ended(await relay.connect())
+        assert relay.refused == {"too_many_connections": 1}
+        member.close()
+        await until(lambda: relay.counts == (0, 0))
+        assert relay.refused == {"too_many_connections": 1, "closed": 1}
+
+
+async def test_new_connections_wait_in_the_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
+    """None is refused."""
+    monkeypatch.setattr(module, "ACCEPTED_S", 40.0)
+    monkeypatch.setattr(module, "ACCEPTED_AT_ONCE", 2)
+    watch = Stopwatch()
+    async with port() as relay:
+        for _ in range(12):
+            await relay.connect()
+        await until(lambda: relay.counts == (12, 12))
+    assert watch.elapsed_s > 10 / 40
+
+
+async def test_networks_have_shares_of_the_strangers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As the web server names them. Those of members do not count, those that fail do not stay."""
+    monkeypatch.setattr(module, "STRANGERS_OF_PREFIX", 1)
+    monkeypatch.setattr(module, "LOOK_AGAIN_S", 0.0)
+    async with port() as relay:
+        one = await relay.open("198.51.100.1")
+        await until(lambda: _sends(relay, ("198.51.100.1", one.getsockname()[1])))
+        assert await is_ended(await relay.open("198.51.100.2"))
+        await relay.open("198.51.101.2")
+        await relay.open("2001:db8:1:2::3")
+        assert await is_ended(await relay.open("2001:db8:1:9::9"))
+        assert relay.refused == {"prefix_full": 2}
+        relay.prove(("198.51.100.1", one.getsockname()[1]))
+        await relay.open("198.51.100.2")
+        await until(lambda: relay.counts == (4, 3))
+        assert await is_ended(await relay.open("a.example.org"))
+        assert relay.refused == {"prefix_full": 2, "forwarded_for": 1}
+
+
+async def test_connection_without_its_proof_is_a_strangers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Such as that of a member that was revoked."""
+    monkeypatch.setattr(module, "STRANGER_S", 0.0)
+    async with port() as relay:
+        member = await relay.open()
+        await until(lambda: relay.counts == (1, 1))
+        relay.prove(member.getsockname())
+        relay.listener.do_housekeeping()
+        assert relay.counts == (1, 0)
+        relay.node.peers = {}
+        relay.listener.do_housekeeping()
+        assert await is_ended(member)
+        assert relay.refused == {"unproven": 1}
+        assert relay.counts == (0, 0)
+
+
+async def test_datagram_finds_its_connection() -> None:
+    """By the address that the core knows. The newer of two with one address has it."""
+    async with port() as relay:
+        first = await relay.open("198.51.100.7")
+        address = "198.51.100.7", first.getsockname()[1]
+        await until(lambda: relay.counts == (1, 1) and bool(_sends(relay, address)))
+        first.send(b"\x82\x82\0\0\0\0up")
+        await until(lambda: relay.received == [(b"up", address)])
+        second = await relay.open("198.51.100.7", ("127.0.0.2", address[1]))
+        assert await is_ended(first)
+        assert relay.refused == {"replaced": 1}
+        assert _sends(relay, address)
+        second.close()
+        await until(lambda: relay.counts == (0, 0))
+        assert not _sends(relay, address)
+
+
+def _sends(relay: Port, address: SocketAddress) -> bool:
+    """Whether there is a connection of this address."""
+    with suppress(OSError):  # ENOTCONN
+        return relay.listener.send(b"down", address) == 4
+    return False
+
+
+async def test_listener_without_file_descriptors_tries_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The connection waits in the kernel meanwhile."""
+    monkeypatch.setattr(module, "EXHAUSTED_S", 0.01)
+    async with port() as relay:
+        listening = relay.listener._sock
+        relay.listener._sock = cast(Any, Exhausted(listening))
+        await relay.connect()
+        await until(lambda: relay.refused.get("EMFILE", 0) > 1)
+        relay.listener._sock = listening
+        await until(lambda: relay.counts == (1, 1))
+
+
+class Exhausted:
+    """A socket of a process that has no file descriptor left."""
+
+    def __init__(self, sock: socket.socket) -> None:
+        self.fileno: Callable[[], int] = sock.fileno
+        self.getsockname, self.close = sock.getsockname, sock.close
+
+    def accept(self) -> None:
+        raise OSError(errno.EMFILE, "none left")
+
+
+def test_certificate_that_vanished_is_a_problem_at_the_start(tmp_path: Any) -> None:
+    """It was there when the file was read."""
+    config = HttpsServer(Address("127.0.0.1", free_port()), tmp_path / "tls.crt", tmp_path / "tls.key")
+    with pytest.raises(BindError, match=r"relay_server\.https: certificate .* cannot be read"):
+        WebListener(config, 0, SocketStateLog(), StallWatch(0.0, lambda _: None), DropSummary(cast(Any, Recorder())))
+
+
+@pytest.mark.parametrize(
+    ("header", "host"),
+    [
+        ("198.51.100.7", "198.51.100.7"),
+        ("10.0.0.1, 198.51.100.7 ", "198.51.100.7"),
+        ("2001:DB8::1", "2001:db8::1"),
+        ("::ffff:198.51.100.7", "198.51.100.7"),
+        ("fe80::1%eth0", None),
+        ("198.51.100.7:443", None),
+        ("unknown", None),
+        ("", None),
+    ],
+)
+def test_last_host_of_the_header_counts(header: str, host: str | None) -> None:
+    """In the form that the rest of the daemon has."""
+    assert module._host_in(header) == host
