@@ -17,7 +17,7 @@ from uavlinkd.core import certificates, counters, handshake, path_state, probe, 
 from uavlinkd.core import node as core_node
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.outputs import Transmit
-from uavlinkd.endpoints import line_framing
+from uavlinkd.endpoints import line_framing, web_stream
 from uavlinkd.lab.mitm import anatomy
 from uavlinkd.lab.mitm import proxy_settings as mitm_settings
 from uavlinkd.lab.sim import tlog
@@ -194,6 +194,7 @@ PLANTS: Final = {
         "frames", frames, "_length_of_frame", lambda right: lambda data, position: right(data, position) + 1
     ),
     "more is held than a datagram": Plant("line", line_framing.LineDecoder, "_keep", _keeps_the_line),
+    "a fragment is a datagram": Plant("messages", web_stream, "_fault_of", lambda _: lambda frame: ""),
     "every client may send as system 3": Plant(
         "gate",
         gate.Gate,

@@ -306,6 +306,8 @@ class WebStream:
         """Prepare the response. Returns a fault, if any."""
         protocol = self._protocol
         assert isinstance(protocol, ServerProtocol), "a member receives no request"
+        if fault := self._fault_of_protocol():
+            return fault  # of bytes behind the request: the library cannot respond any more
         if request.path == "/":
             response, fault = protocol.reject(200, PAGE), "page"
         elif request.path != PATH:
