@@ -58,6 +58,7 @@ class Daemon(Scene):
             networks=SimpleNamespace(networks=[]),
             is_own=lambda address: False,
             serial=SimpleNamespace(networks=[]),
+            web=SimpleNamespace(states=lambda addresses: {}),
         )
         self.history = History(0.0)
         self.router = Router[Any]()

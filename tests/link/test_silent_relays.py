@@ -77,6 +77,12 @@ def test_one_relay_alone_shows_only_possibilities(member: Member) -> None:
     assert "`nc -zvw3 203.0.113.1 22`" in finding.remedy
 
 
+def test_relay_that_does_not_answer_by_tls_either(member: Member) -> None:
+    member.add_relay("one", FIRST)
+    member.parts.peer_sockets.web.states = lambda addresses: {"wss://one:443/uavlink": "ECONNREFUSED"}
+    assert ": by TLS (wss://one:443/uavlink) ECONNREFUSED; by UDP it is off" in member.only().text
+
+
 @pytest.mark.parametrize("is_far", [True, False])
 def test_relays_on_two_hosts_show_that_udp_is_probably_blocked(member: Member, is_far: bool) -> None:
     """Once for the peer. Two relays on one host say no more than one."""

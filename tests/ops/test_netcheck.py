@@ -113,6 +113,23 @@ def test_report_fits_80_columns(state: str) -> None:
     assert not [line for line in rest if line.startswith(" ")]
 
 
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        ("", "connects"),
+        ("http_404", "a web server answers there, but not for this path"),
+        ("http_403", "a web server or proxy answers there and refuses the WebSocket"),
+        ("tls", "something answers there that does not speak TLS"),
+        ("proxy_407", "proxy_407"),
+        ("ECONNREFUSED", "ECONNREFUSED"),
+    ],
+)
+def test_each_url_of_a_relay_is_tried(error: str, line: str) -> None:
+    lines = list(report({**answer(), "web": {"wss://one:443/uavlink": error}}))
+    (found,) = [text for text in lines if text.startswith("TLS ")]
+    assert found.startswith(f"TLS          wss://one:443/uavlink: {line}")
+
+
 def silent(at: str, icmp: str = "", *, host_answers: bool = False) -> dict[str, Any]:
     """An address of a relay without an answer."""
     return {"address": at, "icmp": icmp, "host_answers": host_answers}

@@ -17,7 +17,16 @@ from uavlinkd.ops import STATUS_SCHEMA
 from uavlinkd.ops.findings import Finding, Severity, Subject
 
 MAPS = (
-    *("peers", "relays", "relays.*.peers", "endpoints", "endpoints.*.clients", "networks", "relay.members"),
+    *(
+        "peers",
+        "relays",
+        "relays.*.peers",
+        "relays.*.tls",
+        "endpoints",
+        "endpoints.*.clients",
+        "networks",
+        "relay.members",
+    ),
     *("fleet.held", "fleet.bulletins", "fleet.events"),
 )
 """Objects whose keys are names of the configuration or addresses."""
@@ -100,7 +109,8 @@ async def observed() -> dict[str, str]:
         statuses.append(await roaming.status())
         relay = stage.daemon("relay0")
         far = stage.daemon("far", [])
-        far.config["relay"] = [{"name": "vps", "public_key": relay.public_key, "addresses": [relay.address]}]
+        urls = [relay.address, f"wss://127.0.0.1:{free_port()}"]
+        far.config["relay"] = [{"name": "vps", "public_key": relay.public_key, "addresses": urls}]
         far.add_peer(a, [])
         relay.config["member"] = [
             {"name": "drone1", "public_key": b.public_key},

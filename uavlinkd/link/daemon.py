@@ -169,11 +169,9 @@ class Daemon:
                 tests = parts.relays.filter_tests
                 tests.begin(parts.relays.by_name.values(), monotonic())
                 self.carrier.arm()
-                web = list(parts.peer_sockets.web.values())
-                errors = await asyncio.gather(*(one.probe() for one in web))
+                web = await parts.peer_sockets.web.probe()
                 await tests.ended.wait()
-                urls = {one.path.host: error for one, error in zip(web, errors, strict=True)}
-                return {**netcheck(parts, monotonic()), "web": urls}
+                return {**netcheck(parts, monotonic()), "web": web}
             case ("bulletin", "", "") if parts.fleet is not None:
                 return {"bulletin": to_base64(parts.fleet.trust.bulletin_bytes)}
             case ("publish", " ", signed) if parts.fleet is not None:

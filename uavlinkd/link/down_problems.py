@@ -157,7 +157,8 @@ def silent_relays(
         yield fault_or_warning(
             "udp_blocked",
             f"UDP is probably blocked here: none of {len(names)} relays on different hosts answers ({listed(names)})",
-            "try another network, or let UDP to the ports of the relays, and back, through the firewalls here."
+            "try another network, or let UDP to the ports of the relays, and back, through the firewalls here, or let"
+            ' members reach a relay by TLS (uavlinkd/relay/README.md, "Where UDP does not pass").'
             f" {IS_REACHABLE.format(min(hosts_of(relays[0])))}. If this daemon is new to a relay, it must be"
             f" {admitted}: `uavlinkd status` there shows what arrives",
         )
@@ -169,6 +170,8 @@ def silent_relays(
             f"{_ASK_THERE.format(name)}; else open its firewall. `uavlinkd pubkey` there must print the public_key of"
             f" the [[relay]] here, and this daemon must be {admitted}"
         )
+        for url, state in moment.daemon.peer_sockets.web.states(relay.config.addresses).items():
+            text += f"by TLS ({url}) {state}; by UDP "
         error, path = moment.reported(relay) or ("", None)
         if path is not None and error in UNREACHABLE:
             text += f"the network reports that {shown(path.address)} is not reachable ({error}, ICMP)"

@@ -34,7 +34,7 @@ from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.peer_names import PeerNames
 from uavlinkd.link.relay_link import RelayHandles, RelayLink
 from uavlinkd.link.serial_networks import SerialNetwork, SerialNetworks
-from uavlinkd.link.web_relays import WebRelay
+from uavlinkd.link.web_relays import WebRelay, WebRelays
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.resolver import Resolved
@@ -94,8 +94,8 @@ class PeerSockets:
         self.networks = Networks((), (), self.put, self.open_sockets, node, log)
         """Those of interfaces and addresses."""
         self.serial = SerialNetworks((), 0, node, stall, log)
-        self.web: dict[PeerAddress, WebRelay] = {}
-        """Those of relays that are reached by TLS, by address in the configuration."""
+        self.web = WebRelays(node, stall, log, self._add_web)
+        """Those of relays that are reached by TLS."""
         self.listener: WebListener | None = None
         """Where members reach this relay by TLS."""
         self.handles = RelayHandles()
@@ -259,8 +259,9 @@ class PeerSockets:
         self.serial.start(receive, on_change)
         if self.listener is not None:
             self.listener.start(receive)
+        self.web.start(receive, on_change)
         for names in self._names.values():
-            self._start_web(names.link)
+            self.web.follow(names.link.peer, names.link.config.addresses)
         if self.networks.networks:
             self.check_networks()
 
@@ -298,8 +299,7 @@ class PeerSockets:
             self.stop_following(name)
         for line in self.serial.networks:
             line.line.close()
-        for web in self.web.values():
-            web.stop()
+        self.web.close()
         if self.listener is not None:
             self.listener.close()
         for slot in self._slots:
@@ -379,21 +379,13 @@ class PeerSockets:
         names = self._names[link.name] = PeerNames(link, self._set_paths, self._log)
         self._set_paths(names)
         if self._is_started:
-            self._start_web(link)
+            self.web.follow(link.peer, link.config.addresses)
 
-    def _start_web(self, link: PeerLink | RelayLink) -> None:
-        for written in link.config.addresses:
-            if written in self.web:
-                self.web[written].start(link.peer, self._receive, self._on_change)
-
-    def _web_relay(self, written: PeerAddress) -> WebRelay:
-        """The place of a relay that is reached by TLS. It keeps its number while the daemon runs."""
-        if (web := self.web.get(written)) is None:
-            web = WebRelay(written, len(self._slots), self._node, self._stall, self._log)
-            self.web[written] = web
-            self._slots.append(_Slot(web.number, socket.AF_UNSPEC, web.send))
-            self.budgets[web.number] = web.budget
-            self._choose_senders()
+    def _add_web(self, make: Callable[[int], WebRelay]) -> WebRelay:
+        web = make(len(self._slots))
+        self._slots.append(_Slot(web.number, socket.AF_UNSPEC, web.send))
+        self.budgets[web.number] = web.budget
+        self._choose_senders()
         return web
 
     def _set_paths(self, names: PeerNames) -> None:
@@ -417,8 +409,7 @@ class PeerSockets:
         self.networks.report_absent(now)
         for line in self.serial.networks:
             line.report_state()
-        for web in self.web.values():
-            web.report_state()
+        self.web.report_state()
 
     def _paths_to(self, written: PeerAddress, resolved: Resolved) -> Iterator[Path]:
         """The paths to an address of a peer."""
@@ -427,7 +418,7 @@ class PeerSockets:
                 yield path
             return
         if written.resource:
-            yield self._web_relay(written).path
+            yield self.web.path_to(written)
             return
         for family, sockaddr in resolved:
             for number in (slot.number for slot in self._slots if slot.family == family):
@@ -439,6 +430,4 @@ class PeerSockets:
         self.without_socket.discard(name)
         if (names := self._names.pop(name, None)) is not None:
             names.stop()
-            for written in names.link.config.addresses:
-                if written in self.web:
-                    self.web[written].stop()
+            self.web.unfollow(names.link.config.addresses)

@@ -200,7 +200,7 @@ def state_of(peer: Peer) -> str:
 def used_relay_status(relay: RelayLink, daemon: DaemonParts, now: float) -> dict[str, object]:
     """The status of a relay. ``peer``: the peer that it is too, or None. ``peers``: those that use it, each with
     ``bound``, ``waiting`` for the peer to ask too, or ``unanswered``. ``seen_as``: this daemon's addresses as the
-    relay sees them.
+    relay sees them. ``tls``: by URL whether there is a connection, or why not.
     """
     peer = relay.peer
     return {
@@ -208,6 +208,7 @@ def used_relay_status(relay: RelayLink, daemon: DaemonParts, now: float) -> dict
         "peer": relay.config.peer,
         "public_key": encode_key(peer.settings.public_key),
         "addresses": [str(written) for written in relay.config.addresses],
+        "tls": daemon.peer_sockets.web.states(relay.config.addresses),
         "seen_as": [str(seen) for _, seen in relay.views()],
         "last_received_s": _age(peer.received_at, now),
         "handshake_s": _age(peer.established_at, now),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import errno
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Final
 
 from structlog.typing import FilteringBoundLogger
@@ -17,6 +17,7 @@ from uavlinkd.config.model import PeerAddress
 from uavlinkd.core.node import Node
 from uavlinkd.core.path import Path, SocketAddress
 from uavlinkd.core.peer import Peer
+from uavlinkd.endpoints.ports import failure_name
 from uavlinkd.link.conditions import LineLimits
 from uavlinkd.link.networks import NetworkBudget, Receive
 from uavlinkd.mavlink.egress.bucket import Bucket
@@ -39,7 +40,7 @@ WAIT_S: Final = 0.01
 """Frames look so often whether a connection takes them again."""
 
 
-class Gate(Bucket):
+class WebGate(Bucket):
     """Lets frames out when a connection sends them at once: they wait here, where newer ones replace them."""
 
     __slots__ = ("_room",)
@@ -65,7 +66,7 @@ class WebBudget(NetworkBudget):
     def __init__(self, room: Callable[[], float]) -> None:
         self.bits_s = 0
         self.core_bits_s = 0.0
-        self.all = self.copies = Gate(room)
+        self.all = self.copies = WebGate(room)
 
     def charge(self, datagram: bytes, path: Path, now: float) -> None:
         """Nothing is charged."""
@@ -112,8 +113,7 @@ class WebRelay:
         self.number = number
         self.path = Path(number, (str(written), 0))
         self.budget = WebBudget(self._room)
-        self.error = ""
-        """Why the last try to connect failed, or the connection ended."""
+        self._error = ""
         self._node = node
         self._stall = stall
         self._log = log
@@ -128,9 +128,9 @@ class WebRelay:
         node.facts.metered.add(number)
 
     @property
-    def is_open(self) -> bool:
-        """Whether datagrams can be sent."""
-        return self._stream is not None
+    def state(self) -> str:
+        """``connected``, ``not connected``, or why the last try failed."""
+        return "connected" if self._stream is not None else self._error or "not connected"
 
     def start(self, peer: Peer, receive: Receive, on_change: Callable[[], None]) -> None:
         """Connect whenever this relay does not answer by UDP."""
@@ -155,7 +155,7 @@ class WebRelay:
 
     def report_state(self) -> None:
         """Tell the core whether there is a connection."""
-        if not self.is_open:
+        if self._stream is None:
             self._node.set_socket_state(self.number, monotonic(), is_up=False)
 
     def _room(self) -> float:
@@ -168,7 +168,7 @@ class WebRelay:
         try:
             stream = await self._connect(None)
         except OSError as error:
-            return str(error) or type(error).__name__
+            return _name(error)
         stream.lose("probed")
         return ""
 
@@ -197,10 +197,10 @@ class WebRelay:
             try:
                 stream = await self._connect(self)
             except OSError as error:
-                self.error = str(error) or type(error).__name__
+                self._error = _name(error)
                 if (omitted := self._take_line()) is not None:
                     url = self.path.host
-                    self._log.warning("relay_not_connected", address=url, reason=self.error, **omitted)
+                    self._log.warning("relay_not_connected", address=url, reason=self._error, **omitted)
             else:
                 wait_s = RETRY_S[0]
                 self._open(stream)
@@ -238,7 +238,7 @@ class WebRelay:
         return self._peer.is_up and any(state.works and state.path.is_udp for state in self._peer.paths.states)
 
     def _open(self, stream: WebStream) -> None:
-        self._stream, self.error = stream, ""
+        self._stream, self._error = stream, ""
         self._node.set_socket_state(self.number, monotonic(), is_up=True)
         if (omitted := self._take_line()) is not None:
             self._log.info("relay_connected", address=self.path.host, **omitted)
@@ -262,8 +262,71 @@ class WebRelay:
         self._stream = None
         self._ended.set()
         self._node.set_socket_state(self.number, monotonic(), is_up=False)
-        self.error = "" if reason == UDP_WORKS else reason
+        self._error = "" if reason == UDP_WORKS else reason
         if self._task is not None:
             if (omitted := self._take_line()) is not None:
                 self._log.info("relay_disconnected", address=self.path.host, reason=reason, **omitted)
             self._on_change()
+
+
+class WebRelays:
+    """All URLs of relays. ``add`` makes one with the number of a new socket, which it keeps while the daemon runs."""
+
+    def __init__(
+        self,
+        node: Node,
+        stall: StallWatch,
+        log: FilteringBoundLogger,
+        add: Callable[[Callable[[int], WebRelay]], WebRelay],
+    ) -> None:
+        self._relays: dict[PeerAddress, WebRelay] = {}
+        self._add = add
+        self._shell = node, stall, log
+        self._receive: Receive = lambda *_: None
+        self._on_change: Callable[[], None] = lambda: None
+
+    def path_to(self, written: PeerAddress) -> Path:
+        """The path to a URL."""
+        if written not in self._relays:
+            self._relays[written] = self._add(lambda number: WebRelay(written, number, *self._shell))
+        return self._relays[written].path
+
+    def start(self, receive: Receive, on_change: Callable[[], None]) -> None:
+        """Where datagrams go from now on. ``on_change`` is called after the core got another state of a path."""
+        self._receive, self._on_change = receive, on_change
+
+    def follow(self, peer: Peer, addresses: Iterable[PeerAddress]) -> None:
+        """Connect to these URLs of a relay, whenever it does not answer by UDP."""
+        for relay in self._of(addresses):
+            relay.start(peer, self._receive, self._on_change)
+
+    def unfollow(self, addresses: Iterable[PeerAddress]) -> None:
+        """Do not connect to these any more."""
+        for relay in self._of(addresses):
+            relay.stop()
+
+    def close(self) -> None:
+        """End all connections."""
+        self.unfollow(self._relays)
+
+    def report_state(self) -> None:
+        """Tell the core which connections there are. Call it after other paths were set."""
+        for relay in self._relays.values():
+            relay.report_state()
+
+    def states(self, addresses: Iterable[PeerAddress]) -> dict[str, str]:
+        """By URL: ``connected``, ``not connected``, or why that failed."""
+        return {relay.path.host: relay.state for relay in self._of(addresses)}
+
+    async def probe(self) -> dict[str, str]:
+        """Connect once more to each URL. Why that is not possible; empty if it is."""
+        relays = list(self._relays.values())
+        errors = await asyncio.gather(*(relay.probe() for relay in relays))
+        return {relay.path.host: error for relay, error in zip(relays, errors, strict=True)}
+
+    def _of(self, addresses: Iterable[PeerAddress]) -> list[WebRelay]:
+        return [self._relays[written] for written in addresses if written in self._relays]
+
+
+def _name(error: OSError) -> str:
+    return str(error) if error.errno is None and str(error) else failure_name(error)
