@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from uavlinkd.ops.netcheck import (
+    BY_TLS,
     BLOCKED,
     INTERVAL_S,
     NO_RELAY,
@@ -43,6 +44,7 @@ def answer(*views: dict[str, Any], state: str = "up", filtering: tuple[dict[str,
             "round_trip_s": 0.0234,
             "addresses": [f"{name}.example.org:5790"],
             "unresolved": [],
+            "is_udp": state == "up",
             "silent": [],
         }
         for name in ("one", "two")
@@ -189,7 +191,7 @@ def test_headline_and_advice_name_the_case(
     """UDP at all, the relays, one relay, one port: in the headline, and in the advice at the end."""
     result = answer() | facts
     for name in down.split():
-        result["relays"][name]["state"] = "waiting"
+        result["relays"][name] |= {"state": "waiting", "is_udp": False}
     for name, addresses in silences.items():
         result["relays"][name]["silent"] = addresses
     lines = list(report(result))
@@ -203,10 +205,20 @@ def test_headline_and_advice_name_the_case(
     assert max(len(part) for line in lines for part in folded(line).splitlines()) <= 80
 
 
+def test_relays_that_answer_by_tls_alone() -> None:
+    result = answer()
+    for relay in result["relays"].values():
+        relay["is_udp"] = False
+    lines = list(report(result))
+    assert lines[0] == "UDP          gets no answer: 0 of 2 relays answer"
+    assert "relay        one: up by TLS, 23 ms" in lines
+    assert lines[-1] == BY_TLS
+
+
 def test_a_name_without_an_address_is_no_relay_that_is_off() -> None:
     """Its line names the cause. Advice about firewalls would contradict it."""
     result = answer()
-    result["relays"]["one"] |= {"state": "waiting", "unresolved": ["one.example.org"]}
+    result["relays"]["one"] |= {"state": "waiting", "is_udp": False, "unresolved": ["one.example.org"]}
     lines = list(report(result))
     assert (
         "relay        one: waiting; one.example.org has no address now: see `getent hosts one.example.org`" in lines

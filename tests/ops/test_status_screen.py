@@ -115,7 +115,14 @@ FLEET = {
     "number": 5,
     "bulletins": {"ground": 5, "v2": 4, "v3": None},
 }
-USED = {"state": "up", "peer": None, "round_trip_s": 0.0123, "peers": {"drone1": "bound", "drone2": "waiting"}}
+USED = {
+    "state": "up",
+    "peer": None,
+    "round_trip_s": 0.0123,
+    "peers": {"drone1": "bound", "drone2": "waiting"},
+    "paths": [{"network": None}],
+}
+BY_TLS = {**USED, "paths": [{"network": "TLS"}]}
 
 
 @pytest.mark.parametrize(
@@ -142,6 +149,7 @@ USED = {"state": "up", "peer": None, "round_trip_s": 0.0123, "peers": {"drone1":
         ),
         ({"fleet": FLEET}, {}, "fleet k7qd2m4x: v1, vehicle, serial 3; bulletin 5, but v2 has 4 "),
         ({"relays": {"vps": USED}}, {}, "relay vps: up, 12 ms; drone1 bound, drone2 waiting"),
+        ({"relays": {"vps": BY_TLS}}, {}, "relay vps: up by TLS, 12 ms; drone1 bound, drone2 waiting"),
     ],
 )
 def test_what_is_wrong_is_in_plain_words(facts: dict[str, Any], of_peer: dict[str, Any], shown: str) -> None:

@@ -303,6 +303,7 @@ def netcheck(parts: DaemonParts, now: float) -> dict[str, object]:
         "relays": {
             name: {
                 "state": state_of(relay.peer),
+                "is_udp": bool(moment.working(relay)),
                 "round_trip_s": relay.peer.round_trip_s,
                 "addresses": [str(written) for written in relay.config.addresses],
                 "unresolved": sorted(sockets.unresolved(relay.name if relay.link is None else relay.link.name)),

@@ -34,7 +34,7 @@ from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.peer_names import PeerNames
 from uavlinkd.link.relay_link import RelayHandles, RelayLink
 from uavlinkd.link.serial_networks import SerialNetwork, SerialNetworks
-from uavlinkd.link.web_relays import WebRelay, WebRelays
+from uavlinkd.link.web_relays import WEB_NETWORK, WebRelay, WebRelays
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.resolver import Resolved
@@ -151,7 +151,9 @@ class PeerSockets:
         )
 
     def network_name(self, number: int) -> str | None:
-        """The network of a socket; None if the configuration names no networks."""
+        """The network of a socket, or ``TLS``; None if the configuration names no networks."""
+        if self.web.has(number):
+            return WEB_NETWORK
         network = self.serial.of_number.get(number) or self.networks.of_number.get(number)
         return None if network is None else network.config.name
 

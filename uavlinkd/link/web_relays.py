@@ -28,6 +28,8 @@ from uavlinkd.system.tasks import keep_running
 if TYPE_CHECKING:
     from uavlinkd.endpoints.web_stream import WebStream
 
+WEB_NETWORK: Final = "TLS"
+"""What people see as the network of a connection."""
 UDP_SILENT_S: Final = 1.0
 """Four times as long as RFC 8305 lets an address try alone: a mobile network that sleeps answers late."""
 UDP_BACK_S: Final = 10.0
@@ -290,6 +292,10 @@ class WebRelays:
         if written not in self._relays:
             self._relays[written] = self._add(lambda number: WebRelay(written, number, *self._shell))
         return self._relays[written].path
+
+    def has(self, number: int) -> bool:
+        """Whether a socket is one of these."""
+        return any(relay.number == number for relay in self._relays.values())
 
     def start(self, receive: Receive, on_change: Callable[[], None]) -> None:
         """Where datagrams go from now on. ``on_change`` is called after the core got another state of a path."""

@@ -120,6 +120,10 @@ NO_RELAY = (
     "No relay answers: it is off, a firewall drops UDP here or there, or this daemon is neither its [[member]] nor of"
     " its fleet. Compare addresses and public_key. `uavlinkd status` here and there names the cause"
 )
+BY_TLS = (
+    "TLS works where UDP does not: a firewall drops it, or the address for UDP is wrong. TCP delivers late what UDP"
+    " would lose, so let UDP through where you can"
+)
 ONE_RELAY = (
     "UDP gets out, so the cause is at the silent relay or close to it: it is off, its address or public_key is wrong,"
     " it has no [[member]] for this daemon, which is not of its fleet or revoked, or a firewall there drops UDP."
@@ -156,8 +160,8 @@ def report(answer: Answer) -> Iterator[str]:
         if answer["is_relay"]:
             yield "This daemon is a relay itself: run netcheck at its members"
         return
-    up = sum(relay["state"] == "up" for relay in relays.values())
-    down = [name for name, relay in relays.items() if relay["state"] != "up"]
+    down = [name for name, relay in relays.items() if not relay["is_udp"]]
+    up = len(relays) - len(down)
     ports = [one["address"] for relay in relays.values() for one in relay["silent"] if one["host_answers"]]
     yield f"UDP          {_headline(answer, down, ports)}"
     for name, relay in relays.items():
@@ -175,6 +179,8 @@ def report(answer: Answer) -> Iterator[str]:
     yield f"candidates   {', '.join(answer['candidates']) or 'none'}"
     if answer["is_udp_blocked"]:
         yield BLOCKED
+    elif down and all(relays[name]["state"] == "up" for name in down):
+        yield BY_TLS
     elif any(not relays[name]["unresolved"] for name in down):
         yield ONE_RELAY if up or answer["other"] else NO_RELAY
     if ports:
@@ -214,7 +220,8 @@ def _about(relay: Answer) -> str:
     """How fast a relay answers; where it does not, and what ICMP messages report there."""
     about, silent = "", [one["address"] + _ICMP.get(one["icmp"], _UNREACHABLE) for one in relay["silent"]]
     if relay["state"] == "up":
-        about = f", {1000 * relay['round_trip_s']:.0f} ms" if relay["round_trip_s"] is not None else ""
+        about = "" if relay["is_udp"] else " by TLS"
+        about += f", {1000 * relay['round_trip_s']:.0f} ms" if relay["round_trip_s"] is not None else ""
     elif names := relay["unresolved"]:
         return f"; {', '.join(names)} has no address now: see `getent hosts {names[0]}`"
     else:

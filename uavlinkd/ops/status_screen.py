@@ -396,4 +396,6 @@ def _used_relay(name: str, relay: dict[str, Any]) -> Text:
     peers = ", ".join(f"{peer} {state}" for peer, state in relay["peers"].items()) or "no peer uses it"
     is_well = relay["state"] == "up" and "unanswered" not in relay["peers"].values()
     role = "" if relay["peer"] is None else f", also the peer {relay['peer']}"
-    return Text(f"relay {name}{role}: {relay['state']}{measured}; {peers}", style="" if is_well else "yellow")
+    is_by_tls = relay["state"] == "up" and relay["paths"][0]["network"] == "TLS"
+    by_tls = " by TLS" if is_by_tls else ""
+    return Text(f"relay {name}{role}: {relay['state']}{by_tls}{measured}; {peers}", style="" if is_well else "yellow")

@@ -124,6 +124,11 @@ def _identity(config: Config) -> Iterator[tuple[str, str | Text]]:
     if not config.is_only_relay:
         others = ", and from peer to peer" if config.relays_frames else " only"
         yield "routing", f"between peers and endpoints{others}"
+    if config.relay_server is not None and (https := config.relay_server.https) is not None:
+        yield (
+            "by TLS",
+            f"{https.listen}{'' if https.certificate else ' (without TLS, for a web server on this machine)'}",
+        )
     if config.metrics is not None:
         yield "metrics", f"http://{config.metrics}/metrics"
     if config.recording is not None:
