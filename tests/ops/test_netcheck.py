@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from uavlinkd.ops.netcheck import (
-    BY_TLS,
     BLOCKED,
+    BY_TLS,
     INTERVAL_S,
     NO_RELAY,
     ONE_PORT,
