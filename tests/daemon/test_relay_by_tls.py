@@ -5,9 +5,11 @@ from __future__ import annotations
 from tests.daemon.fleet import drone_and_ground, relay_for
 from tests.daemon.frames import heartbeat
 from tests.daemon.harness import Stage
+from tests.daemon.members import CertifiedFleet, is_up
 from tests.daemon.process import DaemonProcess
 from tests.daemon.tls import listen_for_tls
 from tests.daemon.udp import Client, Sockaddr
+from uavlinkd.core.certificates import MemberRole
 from uavlinkd.lab.sim.loopback_ports import free_port
 
 
@@ -90,3 +92,18 @@ async def test_relay_that_restarts(stage: Stage) -> None:
     await scene.relay.start()
     await scene.drone.until_linked()
     await scene.talk()
+
+
+async def test_members_of_a_fleet(stage: Stage) -> None:
+    """A vehicle that reaches the relay of its fleet by TLS alone learns of its ground station there."""
+    fleet = CertifiedFleet()
+    relay, ground, vehicle = stage.daemon("vps"), stage.daemon("ground"), stage.daemon("drone1")
+    fleet.join(relay, MemberRole.RELAY)
+    fleet.join(ground, MemberRole.OPERATOR, 255, relay)
+    fleet.join(vehicle, MemberRole.VEHICLE, 1)
+    url = listen_for_tls(relay)
+    fleet.add_contact(vehicle, relay, [f"127.0.0.1:{free_port()}", url])
+    await stage.start(relay, ground, vehicle, linked=False)
+    await vehicle.until(lambda status: is_up(status, "ground"))
+    await ground.until(lambda status: is_up(status, "drone1"))
+    assert await carrying(vehicle) == url
