@@ -27,7 +27,7 @@ MAX_SECTION: Final = 200_000  # characters of a section; of a longer one the end
 SERVICE_FILES: Final = Path("/etc/uavlinkd")
 _PACKAGES: Final = (
     *("cryptography", "fastcrc", "prometheus_client", "pydantic"),
-    *("rich", "serialx", "structlog", "uvloop"),
+    *("rich", "serialx", "structlog", "uvloop", "websockets"),
 )
 _INTRODUCTION: Final = """\
 uavlinkd report. Keys are replaced by key-1, …, the addresses of peers by
