@@ -54,7 +54,8 @@ FILES: Final = CONNECTIONS + 512
 """File descriptors that the daemon asks for, with those of everything else."""
 SENDER: Final = "members by TLS"
 """The name of their stale datagrams."""
-_BACKLOG: Final = 1024
+_BACKLOG: Final = 128
+"""So many wait in the kernel, for 0.64 s at most. In a longer queue, members would give up under a flood."""
 _KEEPALIVE: Final = (("TCP_KEEPIDLE", 30), ("TCP_KEEPINTVL", 10), ("TCP_KEEPCNT", 3))
 """The kernel notices a member that is gone without a word."""
 _EXHAUSTED: Final = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
