@@ -81,15 +81,25 @@ async def test_report_of_a_running_pair_has_no_secret(monkeypatch: pytest.Monkey
         a.config["listen"] = [f"0.0.0.0:{a.sockaddr[1]}"]
         a.config["network"] = [{"name": "loopback", "interface": "lo"}]
         a.config["peer"][0]["addresses"].append(exact)
+        url = "wss://relay1.invalid/uavlink"
+        a.config["relay"] = [{"name": "vps", "public_key": stage.daemon("vps").public_key, "addresses": [url]}]
         await stage.start(a, b)
         await a.until_logged("name_not_resolved")
+        await a.until_logged("relay_not_connected")
         monkeypatch.setattr(report, "_log", lambda: "\n".join(a.lines))
         with a.config_file.open("a") as file:
             file.write(f"\n# once was {KEY} at 198.51.100.1\n")
         text = await asyncio.to_thread(report.make_report, [a.config_file], [a.folder / "control.sock"])
         for secret in [*stage.secrets, a.public_key, b.public_key, KEY]:
             assert not any(form in text for form in secret_forms(secret))
-        for address in ("203.0.113.7", "203.0.113.99", "2001:db8::7", "drone1.invalid", "198.51.100.1"):
+        for address in (
+            "203.0.113.7",
+            "203.0.113.99",
+            "2001:db8::7",
+            "drone1.invalid",
+            "relay1.invalid",
+            "198.51.100.1",
+        ):
             assert address not in text
         titles = ("versions", "configuration", "check", "status", "log", "sockets", "network interfaces", "routes")
         assert all(f"## {title}" in text for title in titles)

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from uavlinkd import __version__
+from uavlinkd.core.path import WEB_HOST
 from uavlinkd.ops.control import ControlError, ask
 from uavlinkd.ops.redaction import Redactor
 from uavlinkd.system.terminal import CommandError, printable
@@ -41,7 +42,8 @@ def make_report(configs: Sequence[Path], sockets: Sequence[Path]) -> str:
     statuses = [_status(socket) for socket in sockets]
     log = _log()
     for address in _addresses_of_peers(configs, statuses, log):
-        redactor.add_peer(address.rpartition(":")[0] or address)
+        place = address.removeprefix(WEB_HOST).partition("/")[0]
+        redactor.add_peer(place.rpartition(":")[0] or place)
     sections = [
         ("versions", _versions()),
         *((f"configuration {path}", _without_comments(path)) for path in configs),
