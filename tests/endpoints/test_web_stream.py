@@ -12,6 +12,7 @@ from array import array
 from collections.abc import AsyncIterator
 from contextlib import closing
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 import uvloop
@@ -197,6 +198,9 @@ OPENED = [
     (frame(8, b"\x03\xe8"), "closed"),
     (frame(8, b"\x00"), "protocol"),
     (frame(9, b"") * 100, "pings"),
+    (frame(10, b"") * 100, "pings"),
+    (frame(2, b"") * 100, "pings"),
+    (frame(2, b"12 bytes, no") * 100, "pings"),
     (b"\xff" * 100, "protocol"),
 ]
 
@@ -216,6 +220,28 @@ async def test_hostile_messages_end_the_connection(plain: Loopback, data: bytes,
     assert reason == "pings" or len(relay.datagrams) == 1
     member.stream.send(b"goes on")
     await until(lambda: other.datagrams == [b"goes on"])
+
+
+async def test_fault_ends_a_read(plain: Loopback) -> None:
+    """What follows it costs no time, and is not delivered."""
+    sock = await plain.raw()
+    relay = plain.relay(await plain.accepted())
+    await asyncio.get_running_loop().sock_sendall(sock, REQUEST + frame(2, b"") * 2500)
+    await until(lambda: relay.reasons in (["pings"], ["protocol"]))
+    assert len(relay.datagrams) < 500
+
+
+async def test_tls_that_cannot_write_ends_the_connection(secure: Loopback) -> None:
+    """The other end began a handshake of TLS again, and waits."""
+
+    class Waiting:
+        def write(self, data: bytes) -> int:
+            raise ssl.SSLWantReadError
+
+    member, _ = await secure.pair()
+    member.stream._channel._tls = cast(Any, Waiting())
+    member.stream.send(DATAGRAM)
+    await until(lambda: member.reasons == ["tls"])
 
 
 @pytest.mark.parametrize(

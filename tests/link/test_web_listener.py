@@ -174,6 +174,53 @@ async def test_networks_have_shares_of_the_strangers(monkeypatch: pytest.MonkeyP
         assert relay.refused == {"prefix_full": 2, "forwarded_for": 1}
 
 
+async def test_newest_of_a_network_displaces_one_that_had_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A few silent connections keep no member of the same carrier's network away."""
+    monkeypatch.setattr(module, "STRANGERS_OF_PREFIX", 2)
+    monkeypatch.setattr(module, "DISPLACED_S", 0.0)
+    async with port() as relay:
+        one = await relay.open("198.51.100.1")
+        await until(lambda: _sends(relay, ("198.51.100.1", one.getsockname()[1])))
+        other = await relay.open("198.51.101.1")
+        await until(lambda: _sends(relay, ("198.51.101.1", other.getsockname()[1])))
+        two = await relay.open("198.51.100.2")
+        three = await relay.open("198.51.100.3")
+        assert await is_ended(one)
+        assert relay.refused == {"displaced": 1}
+        await until(lambda: _sends(relay, ("198.51.100.2", two.getsockname()[1])))
+        await until(lambda: _sends(relay, ("198.51.100.3", three.getsockname()[1])))
+        assert relay.counts == (3, 3)
+
+
+async def test_network_that_is_refused_keeps_no_other_one_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A connection that is refused costs less than one that is accepted."""
+    monkeypatch.setattr(module, "ACCEPTED_S", 0.1)
+    monkeypatch.setattr(module, "ACCEPTED_AT_ONCE", 3)
+    monkeypatch.setattr(module, "CONNECTIONS", 1)
+    async with port() as relay:
+        for _ in range(11):
+            await relay.connect()
+        await until(lambda: relay.refused == {"too_many_connections": 10})
+
+
+async def test_stranger_sends_few_messages(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A member may send more, and its connection is looked at before it ends."""
+    monkeypatch.setattr(module, "STRANGER_MESSAGES", 3)
+    async with port() as relay:
+        member, stranger = await relay.open(), await relay.open()
+        await until(lambda: _sends(relay, member.getsockname()) and _sends(relay, stranger.getsockname()))
+        relay.prove(member.getsockname())
+        for number in range(9):
+            for client in (member, stranger):
+                with suppress(OSError):
+                    client.send(b"\x82\x82\0\0\0\0%d0" % number)
+            await until(lambda: sum(at == member.getsockname() for _, at in relay.received) > number)  # noqa: B023
+        assert await is_ended(stranger)
+        assert relay.refused == {"flood": 1}
+        assert sum(at == stranger.getsockname() for _, at in relay.received) <= 3
+        assert [line[1]["reason"] for line in relay.log.lines] == ["flood"]
+
+
 async def test_connection_without_its_proof_is_a_strangers(monkeypatch: pytest.MonkeyPatch) -> None:
     """Such as that of a member that was revoked."""
     monkeypatch.setattr(module, "STRANGER_S", 0.0)

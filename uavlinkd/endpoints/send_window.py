@@ -66,11 +66,11 @@ class SendWindow:
         self._pings[self.sent] = now
         return self.sent.to_bytes(8, "big")
 
-    def note_pong(self, content: bytes, now: float) -> None:
-        """A Pong arrived. It answers its Ping and those before. Any other content is ignored, as RFC 6455 asks."""
+    def note_pong(self, content: bytes, now: float) -> bool:
+        """A Pong arrived. It answers its Ping and those before. Returns whether there was one."""
         count = int.from_bytes(content, "big")
         if count not in self._pings:
-            return
+            return False
         round_trip_s = now - self._pings[count]
         while self.arrived < count:
             self.arrived = next(iter(self._pings))
@@ -84,6 +84,7 @@ class SendWindow:
         if now > began_at:
             rate = self._rates.note((count - began) / (now - began_at), now)
             self.bytes = max(LEAST_BYTES, SEGMENT_BYTES + EXCESS * rate * least_s)
+        return True
 
     def is_stuck(self, now: float) -> bool:
         """Whether a Ping has waited too long for its Pong."""

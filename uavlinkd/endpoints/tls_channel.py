@@ -157,7 +157,11 @@ class TlsChannel:
         if self._tls is None:
             self._rest += data
         elif data:
-            self._tls.write(data)
+            try:
+                self._tls.write(data)
+            except ssl.SSLError:  # the other end began a handshake again, and did not end it
+                self._fail()
+                return
         self._pass_on()
 
     def _pass_on(self) -> None:

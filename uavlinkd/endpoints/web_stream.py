@@ -39,7 +39,9 @@ QUEUE_S: Final = 0.25  # a datagram that waited for longer is dropped
 QUEUE_BYTES: Final = 65_536
 OPEN_S: Final = 5.0  # for TLS and HTTP
 HEADER_BYTES: Final = 8192  # a longer HTTP request or response is refused
-PINGS: Final = 40  # the other end may send so many Pings at once,
+LEAST_MESSAGE: Final = 13  # no datagram is shorter
+PIECE_BYTES: Final = 2048  # a read is looked at in pieces, so that a fault ends it before the rest costs time
+PINGS: Final = 40  # the other end may send so many Pings, and other frames that carry nothing, at once,
 PINGS_S: Final = 20  # so many more each second,
 PING_BYTES: Final = 1000  # and one for so many bytes
 
@@ -79,7 +81,8 @@ class WebStream:
 
     Reasons of its end: ``closed`` (by the other end), ``tls``, ``not_websocket``, ``http_404`` (a status of the other
     end), ``page``, ``wrong_path``, ``long_header``, ``slow_handshake``, ``text``, ``fragment``, ``long_message``,
-    ``protocol``, ``pings`` (too many), ``no_pong``, ``not_reading``, or the kernel's error, such as ``ECONNRESET``.
+    ``protocol``, ``pings`` (too many, or too many other frames that carry nothing), ``no_pong``, ``not_reading``, or
+    the kernel's error, such as ``ECONNRESET``.
     """
 
     def __init__(  # noqa: PLR0913  all are of this one connection
@@ -240,10 +243,15 @@ class WebStream:
             self._answer()
 
     def on_bytes(self, data: bytes, now: float, epoch: int) -> None:
+        for start in range(0, len(data), PIECE_BYTES):
+            if not self.lost:
+                self._on_piece(data[start : start + PIECE_BYTES], now, epoch)
+
+    def _on_piece(self, data: bytes, now: float, epoch: int) -> None:
         protocol = self._protocol
         protocol.receive_data(data)
         datagrams: list[bytes] = []
-        pings = 0
+        pings = small = 0
         fault = ""
         for event in protocol.events_received():
             if isinstance(event, Request):
@@ -253,12 +261,13 @@ class WebStream:
             elif event.opcode is Opcode.PING:
                 pings += 1
             elif event.opcode is Opcode.PONG:
-                self._window.note_pong(bytes(event.data), now)
+                small += not self._window.note_pong(bytes(event.data), now)
             elif not (fault := _fault_of(event)):
                 datagrams.append(bytes(event.data))
+                small += len(event.data) < LEAST_MESSAGE
             if fault:
                 break
-        fault = fault or self._fault_of_protocol() or self._count_pings(pings, len(data), now)
+        fault = fault or self._fault_of_protocol() or self._count_small(pings + small, len(data), now)
         if not self.is_open and not fault:
             fault = self._note_opening(len(data), pings + len(datagrams))
         if self.is_open and datagrams:
@@ -319,10 +328,10 @@ class WebStream:
         protocol.send_response(response)
         return fault
 
-    def _count_pings(self, pings: int, count: int, now: float) -> str:
+    def _count_small(self, frames: int, count: int, now: float) -> str:
         """Returns a fault if there are too many."""
         allowed = self._pings_left + (now - self._pinged_at) * PINGS_S + count / PING_BYTES
-        self._pings_left = min(PINGS, allowed) - pings
+        self._pings_left = min(PINGS, allowed) - frames
         self._pinged_at = now
         return "pings" if self._pings_left < 0 else ""
 

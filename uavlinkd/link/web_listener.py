@@ -41,8 +41,15 @@ STRANGERS_OF_PREFIX: Final = 32
 """Of them, from one IPv4 /24 or IPv6 /48."""
 STRANGER_S: Final = 5.0
 """So long a stranger may stay."""
+STRANGER_MESSAGES: Final = 128
+"""So many messages it may send. A member needs two or three, and what it has to say until the relay's first question
+has its answer."""
+DISPLACED_S: Final = 1.0
+"""In a network that has its share, a new stranger displaces one that is so old."""
 ACCEPTED_S: Final = 200.0
 """New connections a second: each costs a handshake of TLS. The others wait in the kernel."""
+REFUSED: Final = 0.1
+"""What a refused connection costs, in accepted ones: so one network does not use up what all others need."""
 ACCEPTED_AT_ONCE: Final = 20
 PAUSE_S: Final = 0.05
 """Until the next connections are accepted,"""
@@ -62,15 +69,19 @@ _EXHAUSTED: Final = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.
 
 
 class _Connection:
-    """One connection, the handler of its stream. ``since``: when it became a stranger's."""
+    """One connection, the handler of its stream.
 
-    __slots__ = ("_listener", "address", "prefix", "since", "stream")
+    ``since``: when it became a stranger's. ``messages``: how many it sent since then.
+    """
+
+    __slots__ = ("_listener", "address", "messages", "prefix", "since", "stream")
 
     def __init__(self, listener: WebListener, address: SocketAddress, prefix: object, now: float) -> None:
         self._listener = listener
         self.address = address
         self.prefix = prefix
         self.since = now
+        self.messages = 0
         self.stream: WebStream
 
     def on_open(self) -> None:
@@ -181,10 +192,11 @@ class WebListener:
                     self._refuse(failure_name(error), now)
                     self._pause(EXHAUSTED_S)
                     return
+                self._accepted.take(now, REFUSED)
                 continue
-            self._accepted.take(now)
             self._backlog.end(1, is_empty=False)
-            self._accept(sock, (numeric_host(sockaddr), sockaddr[1]), epoch, now)
+            is_accepted = self._accept(sock, (numeric_host(sockaddr), sockaddr[1]), epoch, now)
+            self._accepted.take(now, 1.0 if is_accepted else REFUSED)
         self._pause(PAUSE_S)
 
     def _pause(self, seconds: float) -> None:
@@ -192,12 +204,13 @@ class WebListener:
         loop.remove_reader(self._sock.fileno())
         self._resume = loop.call_later(seconds, self.start, self._receive)
 
-    def _accept(self, sock: socket.socket, address: SocketAddress, epoch: int, now: float) -> None:
+    def _accept(self, sock: socket.socket, address: SocketAddress, epoch: int, now: float) -> bool:
+        """Returns whether there was a place."""
         prefix = None if self._tls is None else _prefix_of(address[0])  # a web server's connections are not its own
         if reason := self._make_place(prefix, now):
             self._refuse(reason, now)
             sock.close()
-            return
+            return False
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         for name, value in _KEEPALIVE:
             with suppress(OSError, AttributeError):
@@ -207,6 +220,7 @@ class WebListener:
         self._every.add(connection)
         self._add_stranger(connection)
         connection.stream.start()
+        return True
 
     def _make_place(self, prefix: object, now: float) -> str:
         """For a stranger. Returns why there is none."""
@@ -217,14 +231,23 @@ class WebListener:
         if len(self._strangers) >= STRANGERS:
             self._look_again(now)
         if len(self._strangers) >= STRANGERS:
-            self._drops.add("connections_failed", "displaced", "", 1, now)
-            next(iter(self._strangers)).stream.lose("displaced")
+            self._displace(next(iter(self._strangers)), now)
         return ""
 
     def _is_full(self, prefix: object, now: float) -> bool:
         if self._strangers_of[prefix] >= STRANGERS_OF_PREFIX:
             self._look_again(now)
-        return self._strangers_of[prefix] >= STRANGERS_OF_PREFIX
+        if self._strangers_of[prefix] < STRANGERS_OF_PREFIX:
+            return False
+        oldest = next(one for one in self._strangers if one.prefix == prefix)
+        if now - oldest.since < DISPLACED_S:
+            return True
+        self._displace(oldest, now)
+        return False
+
+    def _displace(self, stranger: _Connection, now: float) -> None:
+        self._drops.add("connections_failed", "displaced", "", 1, now)
+        stranger.stream.lose("displaced")
 
     def _refuse(self, reason: str, now: float) -> None:
         self.refused[reason] += 1
@@ -250,7 +273,7 @@ class WebListener:
             if connection.address in proved:
                 self._remove_stranger(connection)
             elif not is_stranger:
-                connection.since = now
+                connection.since, connection.messages = now, 0
                 self._add_stranger(connection)
 
     def _add_stranger(self, connection: _Connection) -> None:
@@ -301,7 +324,20 @@ class WebListener:
     def on_datagrams(self, connection: _Connection, datagrams: list[bytes], now: float, epoch: int) -> None:
         """Messages came in one read."""
         address = connection.address
+        if connection in self._strangers and not self._may_send(connection, len(datagrams), now):
+            return
         self._receive(self.number, [(datagram, address) for datagram in datagrams], now, epoch, 0.0)
+
+    def _may_send(self, stranger: _Connection, count: int, now: float) -> bool:
+        stranger.messages += count
+        if stranger.messages <= STRANGER_MESSAGES:
+            return True
+        self._look(now)
+        if stranger not in self._strangers:
+            return True
+        self._drops.add("connections_failed", "flood", "", 1, now)
+        stranger.stream.lose("flood")
+        return False
 
     def on_lost(self, connection: _Connection, reason: str) -> None:
         """The connection ended."""

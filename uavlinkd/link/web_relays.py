@@ -34,9 +34,12 @@ UDP_SILENT_S: Final = 1.0
 """Four times as long as RFC 8305 lets an address try alone: a mobile network that sleeps answers late."""
 UDP_BACK_S: Final = 10.0
 """So a network that passes UDP now and then does not cost a connection each time."""
+SILENT_S: Final = 15.0
+"""A connection along which the relay does not answer for so long is made again: a proxy may keep it open."""
 LOOK_S: Final = 0.25
 RETRY_S: Final = 1.0, 15.0
-"""After a failure, the first wait; each further one is twice as long, up to the second value."""
+"""After a failure, the first wait; each further one is twice as long, up to the second value. A connection that does
+not outlast the wait is a failure too."""
 UDP_WORKS: Final = "udp_works"
 WAIT_S: Final = 0.01
 """Frames look so often whether a connection takes them again."""
@@ -186,9 +189,13 @@ class WebRelay:
         attempt, tls = _Attempt(owner), client_tls(host)
         sock = await open_socket(host, port, uri)
         stream = WebStream(sock, client_protocol(uri), tls, attempt, self._stall, self.path.host)
-        stream.start()
-        if reason := await attempt.opened:
-            raise ConnectionError(reason)
+        try:
+            stream.start()
+            if reason := await attempt.opened or stream.lost:
+                raise ConnectionError(reason)
+        except BaseException:
+            stream.lose("closed")
+            raise
         return stream
 
     async def _keep(self) -> None:
@@ -204,9 +211,11 @@ class WebRelay:
                     url = self.path.host
                     self._log.warning("relay_not_connected", address=url, reason=self._error, **omitted)
             else:
-                wait_s = RETRY_S[0]
+                opened_at = monotonic()
                 self._open(stream)
                 await self._until_not_needed()
+                if monotonic() - opened_at > wait_s:
+                    wait_s = RETRY_S[0]
             await asyncio.sleep(wait_s)
             wait_s = min(2 * wait_s, RETRY_S[1])
 
@@ -220,14 +229,27 @@ class WebRelay:
 
     async def _until_not_needed(self) -> None:
         back = asyncio.ensure_future(self._until(UDP_BACK_S, works=True))
+        silent = asyncio.ensure_future(self._until_silent())
         ended = asyncio.ensure_future(self._ended.wait())
         try:
-            await asyncio.wait((back, ended), return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait((back, silent, ended), return_when=asyncio.FIRST_COMPLETED)
+            if self._stream is not None:
+                self._stream.lose(UDP_WORKS if back.done() else "silent")
         finally:
-            back.cancel()
-            ended.cancel()
-        if self._stream is not None:
-            self._stream.lose(UDP_WORKS)
+            for task in (back, silent, ended):
+                task.cancel()
+
+    async def _until_silent(self) -> None:
+        since = monotonic()
+        while monotonic() < since + SILENT_S:
+            await asyncio.sleep(LOOK_S)
+            if self._works:
+                since = monotonic()
+
+    @property
+    def _works(self) -> bool:
+        assert self._peer is not None, "started"
+        return any(state.works and state.path == self.path for state in self._peer.paths.states)
 
     @property
     def _has_udp(self) -> bool:
@@ -261,6 +283,8 @@ class WebRelay:
 
     def lost(self, reason: str) -> None:
         """It ended."""
+        if self._stream is None:  # before it was used
+            return
         self._stream = None
         self._ended.set()
         self._node.set_socket_state(self.number, monotonic(), is_up=False)

@@ -1,0 +1,144 @@
+"""Connections to relays by TLS that a hostile proxy or relay ends, or keeps open for nothing."""
+
+from __future__ import annotations
+
+import asyncio
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from tests.link.socket_states import SocketStateLog
+from tests.link.test_drop_summary import Recorder
+from tests.waiting import until
+from uavlinkd.config.model import PeerAddress
+from uavlinkd.endpoints import web_connect, web_stream
+from uavlinkd.link import web_relays as module
+from uavlinkd.link.web_relays import WebRelay
+from uavlinkd.system.addresses import Address
+from uavlinkd.system.clock import monotonic
+from uavlinkd.system.stall import StallWatch
+
+NUMBER = 3
+PEER = cast(Any, SimpleNamespace(is_up=False, paths=SimpleNamespace(states=[])))
+"""A relay that answers along no path."""
+
+
+class Stream:
+    """A connection that opens at once. ``ends``: and is lost at once."""
+
+    made: list[Stream]
+    ends = ""
+
+    def __init__(self, _sock: object, _protocol: object, _tls: object, handler: Any, *_: object) -> None:
+        self.lost = ""
+        self._handler = handler
+        self.made.append(self)
+
+    def start(self) -> None:
+        self._handler.on_open()
+        if self.ends:
+            self.lose(self.ends)
+
+    def finish(self) -> None:
+        self.lose("closed")
+
+    def lose(self, reason: str) -> None:
+        if not self.lost:
+            self.lost = reason
+            self._handler.on_lost(reason)
+
+
+@pytest.fixture
+def streams(monkeypatch: pytest.MonkeyPatch) -> list[Stream]:
+    """All that are made, in place of real ones."""
+
+    async def open_socket(*_: object) -> None:
+        await asyncio.sleep(0)
+
+    monkeypatch.setattr(Stream, "made", [], raising=False)
+    monkeypatch.setattr(web_connect, "open_socket", open_socket)
+    monkeypatch.setattr(web_stream, "WebStream", Stream)
+    return Stream.made
+
+
+def relay(port: int = 443) -> tuple[WebRelay, Recorder]:
+    log = Recorder()
+    written = PeerAddress(Address("127.0.0.1", port), resource="/uavlink")
+    stall = StallWatch(monotonic(), lambda seconds: None)
+    return WebRelay(written, NUMBER, SocketStateLog(), stall, cast(Any, log)), log
+
+
+async def test_connection_that_carries_nothing_ends(streams: list[Stream], monkeypatch: pytest.MonkeyPatch) -> None:
+    """A proxy keeps it open, and drops all. The member makes another one."""
+    monkeypatch.setattr(module, "SILENT_S", 0.05)
+    monkeypatch.setattr(module, "LOOK_S", 0.01)
+    monkeypatch.setattr(module, "RETRY_S", (0.01, 0.05))
+    web, _ = relay()
+    web.start(PEER, lambda *_: None, lambda: None)
+    await until(lambda: len(streams) > 2)
+    web.stop()
+    assert {stream.lost for stream in streams[:2]} == {"silent"}
+
+
+async def test_connection_that_works_stays(streams: list[Stream], monkeypatch: pytest.MonkeyPatch) -> None:
+    """For as long as the relay answers along it."""
+    monkeypatch.setattr(module, "SILENT_S", 0.05)
+    monkeypatch.setattr(module, "LOOK_S", 0.01)
+    web, _ = relay()
+    state = SimpleNamespace(works=True, path=web.path)
+    web.start(
+        cast(Any, SimpleNamespace(is_up=True, paths=SimpleNamespace(states=[state]))), lambda *_: None, lambda: None
+    )
+    await asyncio.sleep(0.2)
+    assert [stream.lost for stream in streams] == [""]
+    state.works = False
+    await until(lambda: streams[0].lost == "silent")
+    web.stop()
+
+
+@pytest.mark.parametrize("is_used", [False, True])
+async def test_connections_that_end_at_once_are_fewer_and_fewer(
+    streams: list[Stream], monkeypatch: pytest.MonkeyPatch, *, is_used: bool
+) -> None:
+    """Before the member used them, or after. A proxy that resets each does not keep the member busy."""
+    waits: list[float] = []
+    sleep = asyncio.sleep
+
+    async def record(seconds: float) -> None:
+        if seconds >= module.RETRY_S[0]:
+            waits.append(seconds)
+        await sleep(0)
+
+    monkeypatch.setattr(asyncio, "sleep", record)
+    monkeypatch.setattr(Stream, "ends", "" if is_used else "ECONNRESET")
+    web, _ = relay()
+    web.start(PEER, lambda *_: None, lambda: streams[-1].lose("ECONNRESET"))
+    while len(waits) < 7:
+        await sleep(0)
+    web.stop()
+    assert waits[:7] == [1, 2, 4, 8, 15, 15, 15]
+
+
+async def test_stop_ends_a_connection_that_is_not_open_yet() -> None:
+    """Otherwise the other end could open it later."""
+    ended: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
+    begun = asyncio.Event()
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.read(1)
+        begun.set()
+        while await reader.read(4096):
+            pass
+        ended.set_result(b"")
+        writer.close()
+
+    server = await asyncio.start_server(serve, "127.0.0.1", 0)
+    web, log = relay(server.sockets[0].getsockname()[1])
+    web.start(PEER, lambda *_: None, lambda: None)
+    await begun.wait()
+    web.stop()
+    async with asyncio.timeout(10):
+        await ended
+    server.close()
+    assert log.lines == []
