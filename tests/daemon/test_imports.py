@@ -7,9 +7,13 @@ import os
 import sys
 from pathlib import Path
 
+import pytest
+
 from tests.daemon import frames
+from tests.daemon.fleet import make_relay
 from tests.daemon.harness import Stage
 from tests.daemon.test_reload import reload
+from tests.daemon.tls import listen_for_tls
 from tests.waiting import PATIENCE_S
 from uavlinkd.lab.sim.loopback_ports import free_port
 
@@ -40,12 +44,26 @@ asyncio.SelectorEventLoop.add_signal_handler = refuse
 """Hides what Python has on Unix only, before a process starts. Windows has none of it."""
 
 
-def hooked(stage: Stage, source: str) -> tuple[Path, dict[str, str]]:
+OF_TLS = (
+    "websockets",
+    *(f"uavlinkd.endpoints.{name}" for name in ("web_stream", "web_connect", "tls_channel", "send_window")),
+    "uavlinkd.link.web_listener",
+)
+
+
+def hooked(stage: Stage, source: str, name: str = "hook") -> tuple[Path, dict[str, str]]:
     """A module that Python imports first, and the environment for that."""
-    hook = stage.folder / "hook" / "sitecustomize.py"
+    hook = stage.folder / f"{name}-hook" / "sitecustomize.py"
     hook.parent.mkdir()
     hook.write_text(source)
     return hook, {"PYTHONPATH": os.pathsep.join([str(hook.parent), *sys.path])}
+
+
+async def imported(hook: Path, *packages: str) -> list[str]:
+    """The modules of these packages that a daemon with :data:`HOOK` had imported at its end."""
+    modules = (await asyncio.to_thread(Path(f"{hook}.modules").read_text)).splitlines()
+    assert "uavlinkd.cli" in modules
+    return [name for name in modules if name.startswith(packages)]
 
 
 async def test_a_daemon_imports_no_laboratory(stage: Stage) -> None:
@@ -61,9 +79,23 @@ async def test_a_daemon_imports_no_laboratory(stage: Stage) -> None:
     await a.until_linked()
     assert await reload(a) == []
     assert await a.stop() == 0
-    modules = (await asyncio.to_thread(Path(f"{hook}.modules").read_text)).splitlines()
-    assert "uavlinkd.link.daemon" in modules
-    assert [name for name in modules if name.startswith(("uavlinkd.lab", "matplotlib", "pymavlink"))] == []
+    assert await imported(hook, "uavlinkd.lab", "matplotlib", "pymavlink", *OF_TLS) == []
+
+
+@pytest.mark.parametrize("has_tls", [False, True])
+async def test_tls_is_imported_where_it_is_used(stage: Stage, *, has_tls: bool) -> None:
+    """By a relay that listens for it and by a member with a URL. Others start faster and stay smaller."""
+    relay, member = stage.daemon("relay"), stage.daemon("member")
+    make_relay(relay, member)
+    if has_tls:
+        member.config["relay"][0]["addresses"] = [listen_for_tls(relay)]
+    hooks = [hooked(stage, HOOK, daemon.name) for daemon in (relay, member)]
+    for daemon, (_, environ) in zip((relay, member), hooks, strict=True):
+        await daemon.start(environ)
+    await member.until(lambda status: status["relays"]["relay"]["state"] == "up")
+    assert [await member.stop(), await relay.stop()] == [0, 0]
+    names = {name for hook, _ in hooks for name in await imported(hook, *OF_TLS)}
+    assert names >= set(OF_TLS) if has_tls else not names
 
 
 async def test_daemon_links_and_delivers_without_unix(stage: Stage) -> None:

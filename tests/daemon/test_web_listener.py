@@ -79,7 +79,7 @@ async def _send(socket: ClientConnection, outputs: list[Output]) -> None:
             await socket.send(output.datagram)
 
 
-def _unverified() -> ssl.SSLContext:
+def unverified() -> ssl.SSLContext:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname = False
     context.verify_mode = ssl.CERT_NONE
@@ -87,7 +87,7 @@ def _unverified() -> ssl.SSLContext:
 
 
 def _websocket(port: int) -> connect:
-    return connect(f"wss://127.0.0.1:{port}/uavlink", ssl=_unverified(), compression=None)
+    return connect(f"wss://127.0.0.1:{port}/uavlink", ssl=unverified(), compression=None)
 
 
 def _relay(stage: Stage, *, is_plain: bool = False) -> tuple[DaemonProcess, RawMember, int]:
@@ -110,7 +110,7 @@ def _https(status: Mapping[str, Any]) -> dict[str, Any]:
 
 async def _ask(port: int, request: str) -> bytes:
     """The whole answer of the relay to a request of HTTP by TLS."""
-    reader, writer = await asyncio.open_connection("127.0.0.1", port, ssl=_unverified())
+    reader, writer = await asyncio.open_connection("127.0.0.1", port, ssl=unverified())
     writer.write(f"{request}\r\nHost: relay\r\n\r\n".encode())
     answer = b""
     with suppress(OSError):
