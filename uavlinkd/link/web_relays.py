@@ -129,6 +129,7 @@ class WebRelay:
         self._ended = asyncio.Event()
         self._peer: Peer | None = None
         self._task: asyncio.Task[None] | None = None
+        self._udp_worked_at = 0.0  # or when it was tried first
         node.facts.streams.add(number)
         node.facts.metered.add(number)
 
@@ -140,6 +141,7 @@ class WebRelay:
     def start(self, peer: Peer, receive: Receive, on_change: Callable[[], None]) -> None:
         """Connect whenever this relay does not answer by UDP."""
         self._peer, self._receive, self._on_change = peer, receive, on_change
+        self._udp_worked_at = monotonic()
         if self._task is None:
             self._task = keep_running(self._keep(), f"the connection to {self.written}")
 
@@ -201,13 +203,13 @@ class WebRelay:
     async def _keep(self) -> None:
         wait_s = RETRY_S[0]
         while True:
-            await self._until(UDP_SILENT_S, works=False)
+            await self._until_udp_is_silent()
             self._ended.clear()
             try:
                 stream = await self._connect(self)
             except OSError as error:
-                self._error = _name(error)
-                if (omitted := self._take_line()) is not None:
+                before, self._error = self._error, _name(error)
+                if self._error != before and (omitted := self._take_line()) is not None:
                     url = self.path.host
                     self._log.warning("relay_not_connected", address=url, reason=self._error, **omitted)
             else:
@@ -215,20 +217,26 @@ class WebRelay:
                 self._open(stream)
                 await self._until_not_needed()
                 if monotonic() - opened_at > wait_s:
-                    wait_s = RETRY_S[0]
+                    wait_s = 0.0
             await asyncio.sleep(wait_s)
-            wait_s = min(2 * wait_s, RETRY_S[1])
+            wait_s = min(max(RETRY_S[0], 2 * wait_s), RETRY_S[1])
 
-    async def _until(self, seconds: float, *, works: bool) -> None:
-        """Until UDP works, or does not, for so long. A relay without an address for UDP needs no wait."""
-        since = monotonic()
-        while monotonic() < since + seconds and (works or self._has_udp):
+    async def _until_udp_is_silent(self) -> None:
+        """A relay without an address for UDP needs no wait."""
+        while self._has_udp and (self._udp_works or monotonic() < self._udp_worked_at + UDP_SILENT_S):
+            if self._udp_works:
+                self._udp_worked_at = monotonic()
             await asyncio.sleep(LOOK_S)
-            if self._udp_works is not works:
+
+    async def _until_udp_is_back(self) -> None:
+        since = monotonic()
+        while monotonic() < since + UDP_BACK_S:
+            await asyncio.sleep(LOOK_S)
+            if not self._udp_works:
                 since = monotonic()
 
     async def _until_not_needed(self) -> None:
-        back = asyncio.ensure_future(self._until(UDP_BACK_S, works=True))
+        back = asyncio.ensure_future(self._until_udp_is_back())
         silent = asyncio.ensure_future(self._until_silent())
         ended = asyncio.ensure_future(self._ended.wait())
         try:
