@@ -127,9 +127,11 @@ def test_report_fits_80_columns(state: str) -> None:
     ],
 )
 def test_each_url_of_a_relay_is_tried(error: str, line: str) -> None:
-    lines = list(report({**answer(), "web": {"wss://one:443/uavlink": error}}))
+    web = {"wss://one:443/uavlink": {"error": error, "proxy": "10.0.0.1:3128" if error == "proxy_407" else ""}}
+    lines = list(report({**answer(), "web": web}))
     (found,) = [text for text in lines if text.startswith("TLS ")]
-    assert found.startswith(f"TLS          wss://one:443/uavlink: {line}")
+    through = " through the proxy 10.0.0.1:3128" if error == "proxy_407" else ""
+    assert found.startswith(f"TLS          wss://one:443/uavlink{through}: {line}")
 
 
 def silent(at: str, icmp: str = "", *, host_answers: bool = False) -> dict[str, Any]:

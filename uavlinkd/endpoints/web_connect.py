@@ -46,6 +46,12 @@ async def open_socket(host: str, port: int, uri: WebSocketURI, threads: Threads 
         return sock
 
 
+def proxy_of(uri: WebSocketURI) -> str:
+    """The host and port of the proxy for a URL; empty without one. Raises WebConnectError if it cannot be used."""
+    proxy = _proxy_for(uri)
+    return "" if proxy is None else str(Address(proxy.host, proxy.port))
+
+
 def _proxy_for(uri: WebSocketURI) -> Proxy | None:
     """The proxy that the environment names (``https_proxy``, without the hosts in ``no_proxy``)."""
     try:

@@ -170,14 +170,19 @@ class WebRelay:
 
     # The connection.
 
-    async def probe(self) -> str:
-        """Connect once more. Returns why that is not possible; empty if it is."""
+    async def probe(self) -> dict[str, str]:
+        """Connect once more. ``error``: why that is not possible; ``proxy``: the one of the environment."""
+        from websockets.uri import parse_uri  # noqa: PLC0415
+
+        from uavlinkd.endpoints.web_connect import proxy_of  # noqa: PLC0415
+
+        proxy = error = ""
         try:
-            stream = await self._connect(None)
-        except OSError as error:
-            return _name(error)
-        stream.lose("probed")
-        return ""
+            proxy = proxy_of(parse_uri(self.path.host))
+            (await self._connect(None)).lose("probed")
+        except OSError as failure:
+            error = _name(failure)
+        return {"error": error, "proxy": proxy}
 
     async def _connect(self, owner: WebRelay | None) -> WebStream:
         # Imported only if configured: a daemon on UDP starts faster and stays smaller.
@@ -356,11 +361,11 @@ class WebRelays:
         """By URL: ``connected``, ``not connected``, or why that failed."""
         return {relay.path.host: relay.state for relay in self._of(addresses)}
 
-    async def probe(self) -> dict[str, str]:
-        """Connect once more to each URL. Why that is not possible; empty if it is."""
+    async def probe(self) -> dict[str, dict[str, str]]:
+        """Connect once more to each URL: :meth:`WebRelay.probe`."""
         relays = list(self._relays.values())
-        errors = await asyncio.gather(*(relay.probe() for relay in relays))
-        return {relay.path.host: error for relay, error in zip(relays, errors, strict=True)}
+        results = await asyncio.gather(*(relay.probe() for relay in relays))
+        return {relay.path.host: result for relay, result in zip(relays, results, strict=True)}
 
     def _of(self, addresses: Iterable[PeerAddress]) -> list[WebRelay]:
         return [self._relays[written] for written in addresses if written in self._relays]

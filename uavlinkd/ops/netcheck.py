@@ -166,8 +166,9 @@ def report(answer: Answer) -> Iterator[str]:
     yield f"UDP          {_headline(answer, down, ports)}"
     for name, relay in relays.items():
         yield f"relay        {name}: {relay['state']}{_about(relay)}"
-    for url, error in answer["web"].items():
-        yield f"TLS          {url}: {_meaning(error) if error else 'connects'}"
+    for url, result in answer["web"].items():
+        through = f" through the proxy {result['proxy']}" if result["proxy"] else ""
+        yield f"TLS          {url}{through}: {_meaning(result['error']) if result['error'] else 'connects'}"
     for view in answer["views"] if up else ():
         network = f" on {view['network']}" if view["network"] else ""
         yield f"seen as      {view['seen_as']} by {view['relay']} at {view['relay_address']}{network}"
