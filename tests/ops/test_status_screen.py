@@ -197,9 +197,11 @@ def test_relay_shows_its_members_those_that_are_down_first() -> None:
     member = {"is_up": True, "since_s": 3540.0, "addresses": ["203.0.113.255:65535"] * 2}
     member |= {"bound": 1, "waiting": 0, "datagrams": 1_234_567, "over_limit": 5}
     members = {"drone1": member, "ground-station": {**member, "is_up": False, "addresses": []}}
-    relay = {"members": members, "dropped": {"relay_unknown_handle": 7}}
+    https = {"address": "0.0.0.0:443", "connections": 1002, "strangers": 2}
+    relay = {"members": members, "dropped": {"relay_unknown_handle": 7}, "https": https}
     text = words(render_status(status_of({}, relay=relay)))
     assert "relay: 1 of 2 members up" in text
     assert text.index("ground-station down 59 min") < text.index("drone1 up 59 min 203.0.113.255:65535 1 0 1,234,567")
     assert "not forwarded: 7 of an unknown handle of a relay" in text
+    assert "by TLS at 0.0.0.0:443: 1,000 members, 2 strangers" in text
     assert "endpoint" not in text

@@ -79,6 +79,9 @@ def render_status(status: Status, width: int = 80) -> RenderableType:
         parts.append(_members(relay))
         if text := _listed(_by_count(relay["dropped"], DropReason, RelayReason)):
             parts.append(Text(f"not forwarded: {text}", style="yellow"))
+        if (https := relay["https"]) is not None:
+            members = https["connections"] - https["strangers"]
+            parts.append(Text(f"by TLS at {https['address']}: {members:,} members, {https['strangers']:,} strangers"))
     parts += [_used_relay(name, used) for name, used in status["relays"].items()]
     if status["networks"]:
         parts.append(_networks(status))
@@ -396,6 +399,5 @@ def _used_relay(name: str, relay: dict[str, Any]) -> Text:
     peers = ", ".join(f"{peer} {state}" for peer, state in relay["peers"].items()) or "no peer uses it"
     is_well = relay["state"] == "up" and "unanswered" not in relay["peers"].values()
     role = "" if relay["peer"] is None else f", also the peer {relay['peer']}"
-    is_by_tls = relay["state"] == "up" and relay["paths"][0]["network"] == "TLS"
-    by_tls = " by TLS" if is_by_tls else ""
+    by_tls = " by TLS" if relay["state"] == "up" and relay["paths"][0]["network"] == "TLS" else ""
     return Text(f"relay {name}{role}: {relay['state']}{by_tls}{measured}; {peers}", style="" if is_well else "yellow")
