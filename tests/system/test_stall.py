@@ -105,3 +105,23 @@ def test_device_opened_before_a_pause_is_stale(monkeypatch: pytest.MonkeyPatch, 
     assert not after.backlog.left
     before.close()
     after.close()
+
+
+def test_closed_queue_does_not_stand_for_the_next_one_with_its_number() -> None:
+    """The connection of a stranger ends, and its number is that of the next socket, which waits through a pause."""
+    watch = StallWatch(0.0, lambda _: None)
+    ended, other = socket.socketpair()
+    other.close()
+    backlog = Backlog(watch, ended.fileno(), lambda: ended.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF))
+    forgotten = Backlog(watch, ended.fileno(), lambda: ended.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF))
+    backlog.mark()
+    ended.close()
+    backlog.close()
+    ours, other = socket.socketpair()
+    with ours, other:
+        queue = Backlog(watch, ours.fileno(), lambda: 100)
+        assert ours.fileno() == backlog.fd
+        assert queue.left == 0
+        other.send(b"old")
+        watch.turn(10.0)
+        assert (queue.left, forgotten.left, backlog.left) == (100, 0, 0)

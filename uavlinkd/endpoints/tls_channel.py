@@ -134,6 +134,7 @@ class TlsChannel:
             if self._is_watching:
                 self._loop.remove_writer(self._fd)
             self._sock.close()
+            self._backlog.close()
             self._rest = b""
 
     # Sending.

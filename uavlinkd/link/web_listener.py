@@ -145,6 +145,7 @@ class WebListener:
             self._resume.cancel()
         asyncio.get_running_loop().remove_reader(self._sock.fileno())
         self._sock.close()
+        self._backlog.close()
         for connection in list(self._every):
             connection.stream.finish()  # the sessions of the members have just been closed
 

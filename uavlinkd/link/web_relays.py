@@ -38,8 +38,8 @@ SILENT_S: Final = 15.0
 """A connection along which the relay does not answer for so long is made again: a proxy may keep it open."""
 LOOK_S: Final = 0.25
 RETRY_S: Final = 1.0, 15.0
-"""After a failure, the first wait; each further one is twice as long, up to the second value. A connection that does
-not outlast the wait is a failure too."""
+"""After a failure, the first wait; each further one is twice as long, up to the second value. A connection that
+brought nothing is a failure too."""
 UDP_WORKS: Final = "udp_works"
 WAIT_S: Final = 0.01
 """Frames look so often whether a connection takes them again."""
@@ -119,6 +119,7 @@ class WebRelay:
         self.path = Path(number, (str(written), 0))
         self.budget = WebBudget(self._room)
         self._error = ""
+        self._is_used = False  # whether anything came along the connection
         self._node = node
         self._stall = stall
         self._log = log
@@ -221,8 +222,10 @@ class WebRelay:
                 opened_at = monotonic()
                 self._open(stream)
                 await self._until_not_needed()
-                if monotonic() - opened_at > wait_s:
+                if monotonic() - opened_at > RETRY_S[0]:
                     wait_s = 0.0
+                elif self._is_used:
+                    wait_s = RETRY_S[0]
             await asyncio.sleep(wait_s)
             wait_s = min(max(RETRY_S[0], 2 * wait_s), RETRY_S[1])
 
@@ -275,7 +278,7 @@ class WebRelay:
         return self._peer.is_up and any(state.works and state.path.is_udp for state in self._peer.paths.states)
 
     def _open(self, stream: WebStream) -> None:
-        self._stream, self._error = stream, ""
+        self._stream, self._error, self._is_used = stream, "", False
         self._node.set_socket_state(self.number, monotonic(), is_up=True)
         if (omitted := self._take_line()) is not None:
             self._log.info("relay_connected", address=self.path.host, **omitted)
@@ -291,7 +294,7 @@ class WebRelay:
 
     def receive(self, datagrams: list[bytes], now: float, epoch: int) -> None:
         """Messages came in one read."""
-        address = self.path.address
+        self._is_used, address = True, self.path.address
         self._receive(self.number, [(datagram, address) for datagram in datagrams], now, epoch, 0.0)
 
     def lost(self, reason: str) -> None:

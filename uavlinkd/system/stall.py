@@ -13,6 +13,7 @@ from __future__ import annotations
 import select
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from weakref import WeakSet
 
 from uavlinkd.system.clock import monotonic
@@ -61,7 +62,8 @@ class StallWatch:
         for fd, events in poll.poll(0):
             if not events & select.POLLNVAL:  # closed meanwhile
                 for backlog in by_fd[fd]:
-                    backlog.mark()
+                    with suppress(OSError):  # closed meanwhile, and the number is another one's
+                        backlog.mark()
 
 
 class Backlog:
@@ -90,6 +92,11 @@ class Backlog:
     def mark(self) -> None:
         """Everything in the queue may be from before now."""
         self.left = max(1, self._capacity())
+
+    def close(self) -> None:
+        """The queue is gone. The number of its file may be another one's soon."""
+        self.left = 0
+        self._watch.backlogs.discard(self)
 
     def begin(self, now: float) -> int:
         """The epoch of the next read: :data:`STALE`, or the present one."""

@@ -27,7 +27,7 @@ EVALUATIONS = {
     "flight": "let two aircraft exchange positions in flight under attack",
     "paths": "let radios between a vehicle and its station fail: two paths, one path, and duplicated frames",
 }
-STAGES = ("handshake", "data", "keys", "paper", "paths", "spoiled", "line", "relay", "fleet")
+STAGES = ("handshake", "data", "keys", "paper", "paths", "spoiled", "line", "relay", "web", "fleet")
 
 _Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
