@@ -22,7 +22,7 @@ from uavlinkd.config.model import HttpsServer
 from uavlinkd.config.tls_files import TlsFileError, load_tls
 from uavlinkd.core.limits import TokenBucket
 from uavlinkd.core.node import Node
-from uavlinkd.core.path import SocketAddress
+from uavlinkd.core.path import Path, SocketAddress
 from uavlinkd.endpoints.ports import failure_name
 from uavlinkd.endpoints.sockets import BindError
 from uavlinkd.endpoints.tcp import tcp_listener
@@ -277,6 +277,11 @@ class WebListener:
                 connection.since, connection.messages = now, 0
                 self._add_stranger(connection)
 
+    def _is_proved(self, address: SocketAddress) -> bool:
+        path = Path(self.number, address)
+        states = (peer.paths.by_path.get(path) for peer in self._node.peers.values())
+        return any(state is not None and state.is_validated for state in states)
+
     def _add_stranger(self, connection: _Connection) -> None:
         self._strangers[connection] = None
         if connection.prefix is not None:
@@ -333,8 +338,8 @@ class WebListener:
         stranger.messages += count
         if stranger.messages <= STRANGER_MESSAGES:
             return True
-        self._look(now)
-        if stranger not in self._strangers:
+        if self._is_proved(stranger.address):
+            self._remove_stranger(stranger)
             return True
         self._drops.add("connections_failed", "flood", "", 1, now)
         stranger.stream.lose("flood")
