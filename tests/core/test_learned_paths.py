@@ -292,3 +292,25 @@ def test_the_limit_of_a_path_of_an_idle_link_needs_few_long_probes() -> None:
     tests = [sent for sent in radios.envelopes(radios.a, 0.0) if len(sent.datagram) > 600 and sent.path.socket == 1]
     assert radios.state(radios.a, 1).envelope_limit.limit == c.SMALLER_LIMITS[0]
     assert len(tests) == c.LIMIT_TESTS
+
+
+def test_path_whose_connection_ended_carries_nothing_more() -> None:
+    """The next one takes over at once. When the peer connects again, its first envelope makes a new path."""
+    radios = Radios().run(3.0)
+    node, paths = radios.b.node, radios.b.peer.paths
+
+    def at() -> tuple[Path | None, set[Path]]:
+        best = paths.best.path if paths.best is not None else None
+        return best, {state.path for state in paths.states}
+
+    node.remove_path(at_a(7), radios.now)
+    assert at() == (at_a(0), {at_a(0), at_a(1)})
+    node.remove_path(at_a(0), radios.now)
+    radios.act(radios.b, radios.b.timeout(radios.now))
+    assert at() == (at_a(1), {at_a(1)})
+    node.remove_path(at_a(1), radios.now)
+    assert at() == (None, set())
+    radios.a.node.set_socket_state(0, radios.now, is_up=True)
+    radios.run(0.5)
+    assert at()[0] == at_a(0)
+    assert radios.b.peer.is_up

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from uavlinkd.core.node import Node
-from uavlinkd.core.path import SocketFacts
+from uavlinkd.core.path import Path, SocketFacts
 
 
 class SocketStateLog(Node):
@@ -15,10 +15,15 @@ class SocketStateLog(Node):
         self.states: list[tuple[int, bool]] = []
         self.metered: list[int] = []
         self.facts = SocketFacts()
+        self.removed: list[Path] = []
 
     def set_socket_state(self, socket: int, now: float, *, is_up: bool) -> None:
         """As the core's."""
         self.states.append((socket, is_up))
+
+    def remove_path(self, path: Path, now: float) -> None:
+        """As the core's."""
+        self.removed.append(path)
 
     def set_metered(self, sockets: Iterable[int], now: float) -> None:
         """As the core's."""

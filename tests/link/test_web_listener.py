@@ -249,8 +249,10 @@ async def test_datagram_finds_its_connection() -> None:
         assert await is_ended(first)
         assert relay.refused == {"replaced": 1}
         assert _sends(relay, address)
+        assert relay.node.removed == []
         second.close()
         await until(lambda: relay.counts == (0, 0))
+        assert relay.node.removed == [Path(NUMBER, address)]
         assert not _sends(relay, address)
 
 

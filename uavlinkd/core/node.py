@@ -201,6 +201,13 @@ class Node:
                 peer.initiator.hurry(socket, now)
             self._revise_paths(peer, now)
 
+    def remove_path(self, path: Path, now: float) -> None:
+        """The connection that carried this path has ended: nothing reaches its address any more."""
+        for peer in self.peers.values():
+            if (state := peer.paths.find(path)) is not None:
+                peer.paths.remove(state)
+                self._revise_paths(peer, now)
+
     def _revise_paths(self, peer: Peer, now: float) -> None:
         peer.paths.revise(now)
         if peer.is_up and not peer.paths.by_path and peer.unanswered_since is None:

@@ -260,7 +260,7 @@ class PeerSockets:
             self._read(slot)
         self.serial.start(receive, on_change)
         if self.listener is not None:
-            self.listener.start(receive)
+            self.listener.start(receive, on_change)
         self.web.start(receive, on_change)
         for names in self._names.values():
             self.web.follow(names.link.peer, names.link.config.addresses)

@@ -14,6 +14,7 @@ import errno
 import resource
 import socket
 from collections import Counter
+from collections.abc import Callable
 from contextlib import suppress
 from ipaddress import IPv6Address, ip_address
 from typing import Final
@@ -112,6 +113,7 @@ class WebListener:
         self._stall = stall
         self._drops = drops
         self._receive: Receive = lambda *_: None
+        self._on_change: Callable[[], None] = lambda: None
         self._every = set[_Connection]()
         self._strangers: dict[_Connection, None] = {}  # the oldest first
         self._strangers_of = Counter[object]()  # by prefix
@@ -134,9 +136,12 @@ class WebListener:
     def address(self) -> Address:
         return Address(*self._sock.getsockname()[:2])
 
-    def start(self, receive: Receive) -> None:
-        """Accept connections."""
-        self._receive = receive
+    def start(self, receive: Receive, on_change: Callable[[], None] = lambda: None) -> None:
+        """Accept connections. ``on_change`` is called after the core lost a path."""
+        self._receive, self._on_change = receive, on_change
+        self._watch()
+
+    def _watch(self) -> None:
         asyncio.get_running_loop().add_reader(self._sock.fileno(), self._on_acceptable)
 
     def close(self) -> None:
@@ -203,7 +208,7 @@ class WebListener:
     def _pause(self, seconds: float) -> None:
         loop = asyncio.get_running_loop()
         loop.remove_reader(self._sock.fileno())
-        self._resume = loop.call_later(seconds, self.start, self._receive)
+        self._resume = loop.call_later(seconds, self._watch)
 
     def _accept(self, sock: socket.socket, address: SocketAddress, epoch: int, now: float) -> bool:
         """Returns whether there was a place."""
@@ -304,9 +309,10 @@ class WebListener:
         """Datagrams may be sent. Behind a web server, now it is known who connected."""
         if self._tls is None and not self._take_forwarded(connection, monotonic()):
             return
-        if (before := self._by_address.get(connection.address)) is not None:
-            before.stream.lose("replaced")
+        before = self._by_address.get(connection.address)
         self._by_address[connection.address] = connection
+        if before is not None:
+            before.stream.lose("replaced")
 
     def _take_forwarded(self, connection: _Connection, now: float) -> bool:
         """Take over the address that the web server wrote. Returns whether the connection may stay."""
@@ -350,6 +356,8 @@ class WebListener:
         self._every.discard(connection)
         if self._by_address.get(connection.address) is connection:
             del self._by_address[connection.address]
+            self._node.remove_path(Path(self.number, connection.address), monotonic())
+            self._on_change()
         ended = self.refused if self._remove_stranger(connection) else self.lost
         ended[reason] += 1
         self._dropped += connection.stream.dropped
