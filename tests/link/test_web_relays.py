@@ -81,18 +81,23 @@ async def test_connection_that_carries_nothing_ends(streams: list[Stream], monke
     assert {stream.lost for stream in streams[:2]} == {"silent"}
 
 
-async def test_connection_that_works_stays(streams: list[Stream], monkeypatch: pytest.MonkeyPatch) -> None:
-    """For as long as the relay answers along it."""
+@pytest.mark.parametrize("is_lost", [False, True])
+async def test_connection_that_works_stays(
+    streams: list[Stream], monkeypatch: pytest.MonkeyPatch, *, is_lost: bool
+) -> None:
+    """For as long as the relay answers along it. A relay that is lost is not asked along any path."""
     monkeypatch.setattr(module, "SILENT_S", 0.05)
     monkeypatch.setattr(module, "LOOK_S", 0.01)
     web, _ = relay()
     state = SimpleNamespace(works=True, path=web.path)
-    web.start(
-        cast(Any, SimpleNamespace(is_up=True, paths=SimpleNamespace(states=[state]))), lambda *_: None, lambda: None
-    )
+    peer = SimpleNamespace(is_up=True, paths=SimpleNamespace(states=[state]))
+    web.start(cast(Any, peer), lambda *_: None, lambda: None)
     await asyncio.sleep(0.2)
     assert [stream.lost for stream in streams] == [""]
-    state.works = False
+    if is_lost:
+        peer.is_up = False
+    else:
+        state.works = False
     await until(lambda: streams[0].lost == "silent")
     web.stop()
 

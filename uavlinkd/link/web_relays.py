@@ -265,7 +265,8 @@ class WebRelay:
     @property
     def _works(self) -> bool:
         assert self._peer is not None, "started"
-        return any(state.works and state.path == self.path for state in self._peer.paths.states)
+        states = self._peer.paths.states
+        return self._peer.is_up and any(state.works and state.path == self.path for state in states)
 
     @property
     def _has_udp(self) -> bool:
