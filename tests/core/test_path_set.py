@@ -11,13 +11,14 @@ from tests.core.harness import Named
 from uavlinkd.core import constants as c
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.outputs import PathChanged, PathEvent, PathStateChanged
-from uavlinkd.core.path import Path, SocketAddress, SocketFacts
+from uavlinkd.core.path import SERIAL_HOST, Path, SocketAddress, SocketFacts, relayed
 from uavlinkd.core.path_state import PathCondition, PathState
 from uavlinkd.core.paths import PathSet
 from uavlinkd.core.probe import Probe
 from uavlinkd.core.settings import Class, Redundancy
 
 LTE, MESH, SIK = (Path(number, (f"192.0.2.{number + 1}", 5790)) for number in range(3))
+WEB = Path(3, ("wss://relay.example.org:443/uavlink", 0))
 PEER = Named("bravo")
 PLACES = [Path(0, (f"203.0.113.{number}", 4000)) for number in range(1, 9)]
 
@@ -27,10 +28,13 @@ def path_set(
     redundancy: Redundancy = Redundancy.CRITICAL,
     idle_probe_s: float = c.PROBE_IDLE_S,
     metered: AbstractSet[int] = frozenset(),
+    streams: AbstractSet[int] = frozenset(),
     known: Counter[SocketAddress] | None = None,
 ) -> PathSet:
     """A set with these configured paths."""
-    made = PathSet(redundancy, idle_probe_s, Counter() if known is None else known, SocketFacts(metered))
+    facts = SocketFacts(metered)
+    facts.streams.update(streams)
+    made = PathSet(redundancy, idle_probe_s, Counter() if known is None else known, facts)
     made.configure(paths, 0.0)
     return made
 
@@ -298,6 +302,19 @@ def test_metered_path_is_the_best_only_without_another() -> None:
     paths.facts.metered = {MESH.socket}
     paths.set_metered()
     assert paths.update(PEER, 65.0) == [PathChanged(PEER, LTE, MESH, "metered")]
+
+
+def test_path_by_tls_is_the_best_only_without_another() -> None:
+    """Also without a metered one, which replaces it at once when it works again."""
+    paths = path_set(WEB, LTE, metered={WEB.socket, LTE.socket}, streams={WEB.socket})
+    answer(paths, WEB, 1.0, 0.01)
+    assert paths.best is of(paths, WEB)
+    assert paths.role(of(paths, LTE)) == "metered"
+    assert answer(paths, LTE, 2.0, 0.5)[0] == PathChanged(PEER, LTE, WEB, "udp")
+    assert (LTE.is_udp, LTE.is_web) == (True, False)
+    assert (WEB.is_udp, WEB.is_web) == (False, True)
+    assert not relayed(WEB.socket, "vps", 7).is_udp
+    assert not Path(0, (SERIAL_HOST, 0)).is_udp
 
 
 def test_initiations_avoid_metered_paths_while_another_works() -> None:
