@@ -46,7 +46,7 @@ PINGS_S: Final = 20  # so many more each second,
 PING_BYTES: Final = 1000  # and one for so many bytes
 
 _MESSAGE_HEADER: Final = 8  # bytes of WebSocket for each datagram
-_QUIET: Final = logging.getLogger("uavlinkd.web_stream")  # the library's log would repeat our reasons
+_QUIET: Final = logging.Logger("uavlinkd.web_stream")  # not registered: the library's log would repeat our reasons
 _QUIET.disabled = True
 
 
