@@ -143,13 +143,17 @@ async def test_proxy_that_does_not_connect(secure: Loopback, proxy: HttpProxy, a
         ("https://127.0.0.1:1080", "proxy_not_http"),
         ("ftp://127.0.0.1", "proxy_not_understood"),
         ("http://127.0.0.1:x", "proxy_not_understood"),
+        ("http://user:secret@127.0.0.1:x", "proxy_not_understood"),
+        ("http://user:secret@/", "proxy_not_understood"),
+        ("socks5://user:secret@127.0.0.1:1", "proxy_not_http"),
     ],
 )
 async def test_other_kinds_of_proxy(secure: Loopback, monkeypatch: pytest.MonkeyPatch, url: str, name: str) -> None:
-    """Refused, instead of a connection around the proxy."""
+    """Refused, instead of a connection around the proxy. No log has its password."""
     monkeypatch.setenv("https_proxy", url)
-    with pytest.raises(WebConnectError, match=f"^{name}$"):
+    with pytest.raises(WebConnectError, match=f"^{name}$") as refused:
         await open_to(secure)
+    assert refused.value.__suppress_context__ or refused.value.__context__ is None
 
 
 async def test_proxy_that_is_silent(secure: Loopback, monkeypatch: pytest.MonkeyPatch) -> None:
