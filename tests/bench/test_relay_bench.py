@@ -22,7 +22,7 @@ def check(generator: Generator) -> None:
     """All datagrams of six hosts arrive, each after some time, and the relay works for them."""
     row = generator.run(RATE_S, SECONDS)
     assert row.lost == 0
-    assert generator.relay.hosts.received >= 2 * PAIRS * RATE_S * SECONDS / 2
+    assert generator.relay.hosts.received >= len(generator.relay.flows) * RATE_S * SECONDS / 2
     assert 0 < row.delay_ms <= row.slowest_ms
     assert resident_bytes(generator.relay.pid()) > 1e6
 
@@ -37,6 +37,21 @@ def test_members_are_bound_and_again_after_a_restart(tmp_path: Path) -> None:
         relay.find_again(generator)
         assert relay.flows != before
         check(generator)
+
+
+@pytest.mark.parametrize("senders", [slice(0, None, 2), slice(1, None, 2)])
+def test_members_by_tls_and_by_udp_reach_each_other(tmp_path: Path, senders: slice) -> None:
+    """In both directions."""
+    with members(tmp_path, PAIRS, slice(1, None, 2)) as (relay, generator):
+        relay.senders = senders
+        check(generator)
+
+
+def test_members_by_tls_are_bound_again(tmp_path: Path) -> None:
+    """They connect again after a restart."""
+    with crews(tmp_path, 2, 2, tls=slice(None)) as both:
+        both.do(Members.bind)
+        assert min(both.restart().after_s) > 0
 
 
 @pytest.mark.parametrize("has_fleet", [False, True])

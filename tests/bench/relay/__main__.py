@@ -28,10 +28,10 @@ PAIRS, RATES_S, SECONDS = 400, (5, 25, 50, 75), 10.0
 MEMBERS, CREWS, RESTARTS, AGAIN_S, HANDSHAKES = 1000, 2, 5, 2.0, 200
 
 
-def measure(generator: Generator) -> None:
+def measure(generator: Generator, what: str = "") -> None:
     """Print the figures of each rate."""
     relay = generator.relay
-    print(f"{relay.name}: {len(relay.flows)} hosts, {resident_bytes(relay.pid()) / 1e6:.0f} MB", flush=True)
+    print(f"{relay.name}{what}: {len(relay.flows)} hosts, {resident_bytes(relay.pid()) / 1e6:.0f} MB", flush=True)
     print("   offered/s     lost   delay p50       p99   CPU/datagram   fits one core")
     for rate_s in RATES_S:
         row = generator.run(rate_s, SECONDS)
@@ -64,13 +64,14 @@ def _datagrams(outputs: Sequence[Output]) -> list[bytes]:
     return [output.datagram for output in outputs if isinstance(output, Transmit)]
 
 
-def restart(folder: Path, *, has_fleet: bool) -> None:
+def restart(folder: Path, *, has_fleet: bool, has_tls: bool) -> None:
     """Print how long all members are without a relay that is killed and started.
 
     They share a core, which computes for all of them what in flight each computes alone.
     """
     print(f"the core of the relay needs {handshake_ms():.2f} ms for a handshake", flush=True)
-    with crews(folder, MEMBERS // 2, CREWS, has_fleet=has_fleet) as found:
+    tls = slice(None) if has_tls else None
+    with crews(folder, MEMBERS // 2, CREWS, has_fleet=has_fleet, tls=tls) as found:
         _print("first bind", found.do(Members.bind))
         print(f"{MEMBERS} members: {resident_bytes(found.relay.pid) / 1e6:.0f} MB", flush=True)
         for _ in range(RESTARTS):
@@ -95,16 +96,22 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--restarts-only", action="store_true", help="measure no rates")
     parser.add_argument("--certificates", action="store_true", help="restarts with members by certificate")
+    parser.add_argument("--tls", action="store_true", help="members by TLS: one of each pair, all for restarts")
     arguments = parser.parse_args()
     os.sched_setaffinity(0, {LOAD_CORE})
     if not arguments.restarts_only:
-        rates()
+        rates(has_tls=arguments.tls)
     with tempfile.TemporaryDirectory() as folder:
-        restart(Path(folder), has_fleet=arguments.certificates)
+        restart(Path(folder), has_fleet=arguments.certificates, has_tls=arguments.tls)
 
 
-def rates() -> None:
+def rates(*, has_tls: bool) -> None:
     with tempfile.TemporaryDirectory() as folder:
+        if has_tls:
+            with members(Path(folder), PAIRS, slice(1, None, 2)) as (relay, generator):
+                for relay.senders, what in ((slice(0, None, 2), "UDP to TLS"), (slice(1, None, 2), "TLS to UDP")):
+                    measure(generator, f", {what}")
+            return
         with members(Path(folder), PAIRS) as (_, generator):
             measure(generator)
         if turn.is_there():

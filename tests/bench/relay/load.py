@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple, Protocol
 
-from tests.bench.relay.volleys import Flow, Hosts, Load, Received
+from tests.bench.relay.volleys import Flow, Hosts, Received
 from uavlinkd.lab.evaluation.records import cpu_seconds
 
 PAYLOAD_BYTES: Final = 100
@@ -70,7 +70,7 @@ class Generator:
     def __init__(self, relay: Relayed) -> None:
         self.relay = relay
         self._poll = select.poll()
-        self._poll.register(relay.hosts.sock, select.POLLIN)
+        self._poll.register(relay.hosts.readable, select.POLLIN)
         self._timers_at = 0.0
 
     def turn(self, timeout_s: float) -> None:
@@ -94,7 +94,7 @@ class Generator:
     def run(self, rate_s: int, seconds: float) -> Measured:
         """Each host sends at this rate."""
         hosts, flows = self.relay.hosts, self.relay.flows
-        load = Load(hosts, flows, PAYLOAD_BYTES)
+        load = hosts.load(flows, PAYLOAD_BYTES)
         hosts.received, hosts.delays_ns = 0, []
         cpu_s, began, sent = cpu_seconds(self.relay.pid()), time.monotonic(), 0
         while (now := time.monotonic()) < began + seconds:

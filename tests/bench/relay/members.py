@@ -17,8 +17,10 @@ from typing import Final, NamedTuple
 
 from tests.authority.signing import AUTHORITY, FLEET, bulletin, signed
 from tests.bench.relay.load import RELAY_CORE, Generator, host
+from tests.bench.relay.streams import MixedHosts
 from tests.bench.relay.volleys import Flow, Hosts, Received
 from tests.daemon.toml import to_toml
+from tests.tls_files import CERTIFICATE, TLS_KEY, write_tls_files
 from uavlinkd.authority.exchange import BulletinExchange
 from uavlinkd.authority.trust import Trust
 from uavlinkd.config.build import TIMERS
@@ -63,6 +65,9 @@ class Member:
         settings = PeerSettings(RELAY_HOST + "relay", relay.key, None, LINK, is_certified=relay.has_fleet)
         self.link = RelayLink(RelayConfig(settings, ()), self.node, RelayHandles(), lambda keys, now: None, now)
         self.path = Path(0, self.relay)
+        if not hosts.is_udp(self.host):
+            self.node.facts.streams.add(self.path.socket)
+            self.node.facts.metered.add(self.path.socket)
         self.handle = 0
         self.bound_at = 0.0
         self.initiations = self.envelopes = 0
@@ -77,6 +82,14 @@ class Member:
         """Reach this key along the relay."""
         self.link.follow((other,))
         self.link.set_paths([self.path], time.monotonic())
+        if not self.hosts.is_udp(self.host):
+            self.set_state(is_up=self.hosts.is_open(self.host))
+
+    def set_state(self, *, is_up: bool) -> None:
+        """Of its connection by TLS."""
+        now = time.monotonic()
+        self.node.set_socket_state(self.path.socket, now, is_up=is_up)
+        self.do_timers(now)
 
     def ask(self) -> None:
         """Ask the relay whether it is there."""
@@ -131,10 +144,14 @@ class RelayProcess:
     """It can be killed and started again.
 
     With ``has_fleet`` its members are those with a certificate. They are relays: there are only 255 system ids.
+    ``tls``: which of the members reach it by TLS.
     """
 
-    def __init__(self, folder: FilePath, keys: Iterable[bytes], *, has_fleet: bool = False) -> None:
-        self.has_fleet = has_fleet
+    def __init__(
+        self, folder: FilePath, keys: Iterable[bytes], *, has_fleet: bool = False, tls: slice | None = None
+    ) -> None:
+        self.has_fleet, self.tls = has_fleet, tls
+        self.tls_address = "127.0.0.1", free_port()
         private = generate_private_key()
         self.address = "127.0.0.1", free_port()
         self.key = decode_key(public_key_text(private))
@@ -143,11 +160,12 @@ class RelayProcess:
         sections = [
             {"name": f"member{number}", "public_key": encode_key(key), **AMPLE} for number, key in enumerate(keys)
         ]
+        server: dict[str, object] = {**AMPLE}
         config: dict[str, object] = {
             "name": "relay",
             "private_key_file": "relay.key",
             "listen": [f"127.0.0.1:{self.address[1]}"],
-            "relay_server": AMPLE,
+            "relay_server": server,
             "log": {"level": "error"},
             "member": sections,
         }
@@ -155,8 +173,12 @@ class RelayProcess:
             own = signed(Certificate(FLEET, 1, MemberRole.RELAY, (0, 0), "relay"), self.key)
             parts = {"authority": AUTHORITY.public, "certificate": own, "bulletin": bulletin(1)}
             config["fleet"] = {name: b64encode(data).decode() for name, data in parts.items()}
-            config["relay_server"] = AMPLE | {f"member_{name}": value for name, value in AMPLE.items()}
+            server |= {f"member_{name}": value for name, value in AMPLE.items()}
             del config["member"]
+        if tls is not None:
+            write_tls_files(folder)
+            files = {"certificate": CERTIFICATE, "key": TLS_KEY}
+            server["https"] = {"listen": "{}:{}".format(*self.tls_address), **files}
         self._file.write_text(to_toml(config))
         self.start()
 
@@ -183,17 +205,23 @@ class Members:
 
     def __init__(self, relay: RelayProcess, privates: Sequence[bytes], first: int = 0) -> None:
         self.process = relay
-        self.hosts = Hosts()
-        numbered = enumerate(privates, first)
-        self.members = [Member(number, key, relay, self.hosts) for number, key in numbered]
+        numbers = range(first, first + len(privates))
+        by_tls = [host(number) for number in numbers][relay.tls] if relay.tls is not None else []
+        self.hosts = MixedHosts(relay.tls_address, by_tls, self._on_state) if by_tls else Hosts()
+        self.members = [Member(number, key, relay, self.hosts) for number, key in zip(numbers, privates, strict=True)]
+        self.senders = slice(None)
+        """Those that send datagrams of a load."""
         self._by_host = {member.host: member for member in self.members}
+
+    def _on_state(self, of: str, is_up: bool) -> None:
+        self._by_host[of].set_state(is_up=is_up)
 
     def pid(self) -> int:
         return self.process.pid
 
     @property
     def flows(self) -> Sequence[Flow]:
-        return [member.flow for member in self.members]
+        return [member.flow for member in self.members[self.senders]]
 
     def take(self, received: Received, now: float) -> None:
         self._by_host[received.host].receive(received.data, now)
@@ -229,10 +257,10 @@ class Members:
 
 
 @contextmanager
-def members(folder: FilePath, pairs: int) -> Iterator[tuple[Members, Generator]]:
+def members(folder: FilePath, pairs: int, tls: slice | None = None) -> Iterator[tuple[Members, Generator]]:
     """A relay with this many bound pairs."""
     privates = [os.urandom(c.KEY_BYTES) for _ in range(2 * pairs)]
-    relay = RelayProcess(folder, (KeyPair(private).public for private in privates))
+    relay = RelayProcess(folder, (KeyPair(private).public for private in privates), tls=tls)
     all_members = Members(relay, privates)
     generator = Generator(all_members)
     try:
@@ -279,10 +307,11 @@ def _run(orders: Connection, relay: RelayProcess, privates: Sequence[bytes], fir
 class Crews:
     """A relay, and pairs of members in several processes."""
 
-    def __init__(self, folder: FilePath, pairs: int, processes: int, *, has_fleet: bool) -> None:
+    def __init__(self, folder: FilePath, pairs: int, processes: int, *, has_fleet: bool, tls: slice | None) -> None:
         size = 2 * (pairs // processes)
         privates = [os.urandom(c.KEY_BYTES) for _ in range(size * processes)]
-        self.relay = RelayProcess(folder, [KeyPair(private).public for private in privates], has_fleet=has_fleet)
+        publics = [KeyPair(private).public for private in privates]
+        self.relay = RelayProcess(folder, publics, has_fleet=has_fleet, tls=tls)
         self._orders: list[Connection] = []
         self._processes: list[ForkProcess] = []
         for first in range(0, len(privates), size):
@@ -319,9 +348,11 @@ class Crews:
 
 
 @contextmanager
-def crews(folder: FilePath, pairs: int, processes: int, *, has_fleet: bool = False) -> Iterator[Crews]:
+def crews(
+    folder: FilePath, pairs: int, processes: int, *, has_fleet: bool = False, tls: slice | None = None
+) -> Iterator[Crews]:
     """A relay and pairs of members that do nothing yet."""
-    all_crews = Crews(folder, pairs, processes, has_fleet=has_fleet)
+    all_crews = Crews(folder, pairs, processes, has_fleet=has_fleet, tls=tls)
     try:
         yield all_crews
     finally:

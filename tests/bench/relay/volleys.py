@@ -10,6 +10,7 @@ from __future__ import annotations
 import ctypes
 import errno
 import os
+import select
 import socket
 import struct
 import time
@@ -29,7 +30,7 @@ STAMP_BYTES: Final = 8
 """At the end of each datagram of a load: when it was sent, in nanoseconds."""
 RECEIVED_AT_ONCE: Final = 256
 _SLOT_BYTES: Final = 2048
-_SAMPLED: Final = 16
+SAMPLED: Final = 16
 """The delay of one datagram in so many is noted."""
 
 
@@ -90,6 +91,8 @@ class Hosts:
         self.sock.setsockopt(socket.IPPROTO_IP, _IP_PKTINFO, 1)
         self.sock.bind(("0.0.0.0", 0))
         self.port: int = self.sock.getsockname()[1]
+        self.readable: socket.socket | select.epoll = self.sock
+        """For ``poll``."""
         self.received = 0
         """Datagrams of the load."""
         self.delays_ns: list[int] = []
@@ -112,6 +115,18 @@ class Hosts:
     def close(self) -> None:
         self.sock.close()
 
+    def is_udp(self, host: str) -> bool:
+        """Whether a host sends datagrams, and not by TLS."""
+        return True
+
+    def is_open(self, host: str) -> bool:
+        """Whether it can send."""
+        return True
+
+    def load(self, flows: Sequence[Flow], size: int) -> Load:
+        """For one or more rounds along these flows."""
+        return Load(self, flows, size)
+
     def send(self, host: str, data: bytes, to: Address) -> None:
         """One datagram that is not of the load."""
         info = struct.pack("@i4s4s", 0, socket.inet_aton(host), bytes(4))
@@ -130,7 +145,7 @@ class Hosts:
         others = [number for number in range(count) if starts[number] != start] if of_load < count else []
         first = self.received
         self.received += of_load
-        for number in range(-first % _SAMPLED, count, _SAMPLED):
+        for number in range(-first % SAMPLED, count, SAMPLED):
             if starts[number] == start:
                 end = number * _SLOT_BYTES + self._messages[number].size
                 self.delays_ns.append(now - int.from_bytes(data[end - STAMP_BYTES : end], "big"))
