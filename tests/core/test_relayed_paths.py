@@ -10,9 +10,10 @@ from tests.core.test_path_set import PEER, answer, fail, linked, of, path_set, r
 from uavlinkd.core import constants as c
 from uavlinkd.core import establish, probing, wire
 from uavlinkd.core.crypto import Secret
+from uavlinkd.core.drops import DropReason
 from uavlinkd.core.limits import prefix_of
 from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import Output, PathChanged, PathSuspected, PeerLost, Transmit
+from uavlinkd.core.outputs import Dropped, Output, PathChanged, PathSuspected, PeerLost, Transmit
 from uavlinkd.core.path import Path, relay_name, relayed
 from uavlinkd.core.probe import Probe
 from uavlinkd.core.settings import Class, Link, PeerSettings
@@ -217,9 +218,9 @@ def send_critical(pair: Pair, now: float, size: int = 20) -> bytes:
     return outputs_of(sent, Transmit)[0].datagram
 
 
-def test_new_relayed_path_carries_the_critical_envelopes_of_the_last_second(pair: Pair) -> None:
+def test_new_relayed_path_carries_recent_critical_envelopes(pair: Pair) -> None:
     """Once: the path that they went along may have failed."""
-    sent = [send_critical(pair, now) for now in (3.0, 4.0, 4.5)]
+    sent = [send_critical(pair, now) for now in (2.6, 4.0, 4.5)]
     pair.a.node.send(pair.a.peer, [b"\xfd" + bytes(20)], 4.6, Class.STREAM)
     assert resent(pair, LTE_A2, 4.7) == sent[1:]
     assert resent(pair, LTE_B, 4.8) == []
@@ -237,6 +238,48 @@ def test_no_other_envelope_is_sent_again_and_along_no_other_path(pair: Pair) -> 
     send_critical(pair, 1.7)
     pair.complete(datagrams(establish.initiate(pair.a.peer, 1.8), wire.INITIATION)[0], 1.8)
     assert resent(pair, LTE_B, 1.9) == []
+
+
+def test_new_handle_takes_the_place_of_the_only_one(pair: Pair) -> None:
+    """At once, and critical envelopes are sent again there: a member's connection by TLS was reset."""
+    peer, node = pair.a.peer, pair.a.node
+    assert peer.paths.is_multiple, "an envelope holds one class"
+    sent = send_critical(pair, 3.0)
+    node.set_paths(peer, [LTE_A2], 3.1)
+    pair.a.timeout(3.1)
+    assert peer.path == LTE_A2
+    meanwhile = outputs_of(node.send(peer, [b"\xfd" + bytes(20)], 3.2, Class.CRITICAL), Transmit)
+    assert [output.path for output in meanwhile] == [LTE_A2]
+    state = peer.paths.by_path[LTE_A2]
+    state.make_probe(7, 0, 3.2)
+    answered = probing.receive_probe(peer, pair.a.session, Probe(0, 7, 0, 0), state, 3.3)
+    assert [output.datagram for output in outputs_of(answered, Transmit)] == [sent, meanwhile[0].datagram]
+
+
+def test_critical_frames_wait_for_a_handle(pair: Pair) -> None:
+    """The relay ended the last one, because it noticed first that the peer's connection was reset."""
+    peer, node = pair.a.peer, pair.a.node
+    node.set_paths(peer, [], 3.0)
+    pair.a.timeout(3.0)
+    frame = b"\xfd" + bytes(20)
+    assert node.send(peer, [frame], 3.1, Class.CRITICAL) == []
+    too_long = node.send(peer, [b"\xfd" + bytes(c.MAX_ENVELOPE_LIMIT)], 3.1, Class.CRITICAL)
+    assert [output.reason for output in outputs_of(too_long, Dropped)] == [DropReason.TOO_LARGE]
+    dropped = node.send(peer, [frame], 3.1, Class.STREAM)
+    assert [output.reason for output in outputs_of(dropped, Dropped)] == [DropReason.NO_SESSION]
+    node.set_paths(peer, [LTE_A2], 3.2)
+    state = peer.paths.by_path[LTE_A2]
+    state.make_probe(7, 0, 3.2)
+    out = probing.receive_probe(peer, pair.a.session, Probe(0, 7, 0, 0), state, 3.3)
+    assert len(outputs_of(out, Transmit)) == 1
+
+
+def test_new_handle_does_not_replace_a_path_that_works() -> None:
+    paths = linked(LTE, LTE_A)
+    paths.best = of(paths, LTE_A)
+    paths.configure([LTE, LTE_A2], 2.0)
+    paths.update(PEER, 2.0)
+    assert paths.best is of(paths, LTE)
 
 
 def test_path_ends_with_its_handle(pair: Pair) -> None:

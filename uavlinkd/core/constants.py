@@ -343,9 +343,10 @@ RELAYED_COPIES = 2
 """From one socket, copies go through so many relays, and with so many handles of one relay."""
 COPIES_PER_SOCKET = 3
 """Paths from one socket along which copies go, if one of them leads through a relay."""
-RESENT_S = 1.0
-"""A new relayed path carries the critical envelopes of this time again: the former paths may have failed."""
-RESENT_ENVELOPES = 32
+RESENT_S = LATE_AFTER_S
+"""A new relayed path carries the critical envelopes of this time again: the former paths may have failed. A peer
+drops older ones as late."""
+RESENT_ENVELOPES = 64
 KEYS_PER_BIND = 16
 ENTRIES_PER_BOUND = 32
 """1,126 bytes of record: with everything around it, it fits an MTU of 1,280 bytes."""

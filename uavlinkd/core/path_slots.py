@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 from uavlinkd.core import constants as c
 from uavlinkd.core.path import Path, SocketAddress, SocketFacts
@@ -82,7 +82,12 @@ class PathSlots:
                 else:
                     self._drop(state)
                     if state is self.best:
-                        self.best = None
+                        self.best = self._successor(before)
+
+    def _successor(self, before: Mapping[Path, PathState]) -> PathState | None:
+        """A handle that came with the end of the best path's takes its place: frames need not wait for an answer."""
+        new = (state for path, state in self.by_path.items() if path.is_relayed and path not in before)
+        return None if any(state.works for state in self.by_path.values()) else next(new, None)
 
     def set_candidates(self, paths: Iterable[Path]) -> None:
         """The peer may be there too. The first :data:`c.CANDIDATES` count."""

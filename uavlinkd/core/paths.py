@@ -268,7 +268,7 @@ class PathSet(PathSlots):
     def _set_routes(self, now: float) -> None:
         best = self.best
         if best is None:
-            self.routes, self.is_multiple = _NO_ROUTES, False
+            self.routes, self.is_multiple = _NO_ROUTES, self.has_relayed
             self.stream_route = self.echo_route = ()
             return
         others = [
@@ -278,8 +278,8 @@ class PathSet(PathSlots):
         if relayed:
             self.has_relayed = True
             others = self._without_spares(best, others)
-        # Also before the first answer along a relayed path, which carries recent critical envelopes again then.
-        self.is_multiple = bool(others) or any(state is not best for state in relayed)
+        # Also with one path along a relay: the next one carries recent critical envelopes again.
+        self.is_multiple = bool(others or relayed)
         alone = (best,)
         critical = alone if self._redundancy is Redundancy.NONE else (best, *others)
         stream: Route = alone

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from uavlinkd.core import constants as c
 from uavlinkd.core import wire
@@ -24,8 +24,12 @@ def send_frames(peer: Peer, frames: Sequence[bytes], now: float, cls: Class) -> 
     """Put frames that are here together into as few envelopes as hold them, in their order."""
     session, paths = peer.sessions.current, peer.paths
     route = paths.stream_route if cls is Class.STREAM else paths.routes[cls]
-    if not route or session is None or now >= session.reject_at or session.send_counter >= c.SESSION_ENVELOPE_LIMIT:
+    keeps = not route and cls is Class.CRITICAL and paths.has_relayed
+    is_usable = session is not None and now < session.reject_at and session.send_counter < c.SESSION_ENVELOPE_LIMIT
+    if session is None or not is_usable or not (route or keeps):
         return peer.drop(DropReason.NO_SESSION, len(frames))
+    if keeps:
+        return _keep(peer, session, frames, now)
     if peer.timers.deadlines[Timer.PROBE] == NEVER and peer.durations.probe_interval_s:
         # On a slow network, a request about freshness measures the round trip too: it comes first if frames arrive.
         least_s = (1 + c.VERIFY_REPEAT_SHARE) * paths.pace.interval_s
@@ -58,9 +62,21 @@ def send_frames(peer: Peer, frames: Sequence[bytes], now: float, cls: Class) -> 
         out += seal(peer, session, payload, route, now)
     if cls is Class.CRITICAL and paths.has_relayed:
         sent = (output.datagram for output in out if isinstance(output, Transmit))
-        peer.recent += ((now, datagram) for datagram in dict.fromkeys(sent))
-        del peer.recent[: -c.RESENT_ENVELOPES]
+        _remember(peer, dict.fromkeys(sent), now)
     return out
+
+
+def _remember(peer: Peer, datagrams: Iterable[bytes], now: float) -> None:
+    peer.recent += ((now, datagram) for datagram in datagrams)
+    del peer.recent[: -c.RESENT_ENVELOPES]
+
+
+def _keep(peer: Peer, session: Session, frames: Sequence[bytes], now: float) -> list[Output]:
+    """The last handle has ended. The next one is perhaps on its way: it carries what is critical."""
+    left = c.SESSION_ENVELOPE_LIMIT - session.send_counter
+    fitting = [frame for frame in frames if len(frame) <= session.payload_limit][:left]
+    _remember(peer, [session.seal(frame, now) for frame in fitting], now)
+    return peer.drop(DropReason.TOO_LARGE, len(frames) - len(fitting)) if len(fitting) < len(frames) else []
 
 
 def resend(peer: Peer, state: PathState, now: float) -> list[Output]:
