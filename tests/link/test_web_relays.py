@@ -12,6 +12,7 @@ from tests.link.socket_states import SocketStateLog
 from tests.link.test_drop_summary import Recorder
 from tests.waiting import until
 from uavlinkd.config.model import PeerAddress
+from uavlinkd.core.path import Path
 from uavlinkd.endpoints import web_connect, web_stream
 from uavlinkd.link import web_relays as module
 from uavlinkd.link.web_relays import WebRelay
@@ -123,6 +124,50 @@ async def test_connections_that_end_at_once_are_fewer_and_fewer(
         await sleep(0)
     web.stop()
     assert waits[:7] == [1, 2, 4, 8, 15, 15, 15]
+
+
+def udp(*, works: bool = True, is_silent: bool = False) -> Any:
+    """A relay with one path by UDP."""
+    state = SimpleNamespace(works=works, is_silent=is_silent, path=Path(0, ("192.0.2.1", 5790)))
+    return cast(Any, SimpleNamespace(is_up=True, paths=SimpleNamespace(states=[state])))
+
+
+async def test_connects_soon_after_udp_became_silent(streams: list[Stream], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not only when the path is down: critical frames are sent again for 2 s."""
+    monkeypatch.setattr(module, "LOOK_S", 0.01)
+    monkeypatch.setattr(module, "UDP_SILENT_S", 0.1)
+    monkeypatch.setattr(module, "UDP_FIRST_S", 0.1)
+    web, _ = relay()
+    peer = udp()
+    web.start(peer, lambda *_: None, lambda: None)
+    await asyncio.sleep(0.3)
+    assert streams == []
+    peer.paths.states[0].is_silent = True
+    await until(lambda: bool(streams))
+    web.stop()
+
+
+async def test_connection_only_receives_before_it_ends(
+    streams: list[Stream], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """UDP works again. Peers notice that nothing comes along it, and no datagram to this member is lost."""
+    monkeypatch.setattr(module, "LOOK_S", 0.01)
+    monkeypatch.setattr(module, "UDP_BACK_S", 0.05)
+    monkeypatch.setattr(module, "LEAVE_S", 0.2)
+    web, _ = relay()
+    peer, sent = udp(works=False), list[bytes]()
+    monkeypatch.setattr(module, "UDP_FIRST_S", 0.0)
+    monkeypatch.setattr(Stream, "send", lambda _, datagram: sent.append(datagram), raising=False)
+    states = cast(Any, web)._node.states
+    web.start(peer, lambda *_: None, lambda: None)
+    await until(lambda: states[-1:] == [(NUMBER, True)])
+    web.send(b"1", web.path.address)
+    peer.paths.states[0].works = True
+    await until(lambda: states[-1:] == [(NUMBER, False)])
+    web.send(b"2", web.path.address)
+    assert (sent, streams[0].lost) == ([b"1"], "")
+    await until(lambda: streams[0].lost == module.UDP_WORKS)
+    web.stop()
 
 
 async def test_stop_ends_a_connection_that_is_not_open_yet() -> None:

@@ -30,10 +30,14 @@ if TYPE_CHECKING:
 
 WEB_NETWORK: Final = "TLS"
 """What people see as the network of a connection."""
-UDP_SILENT_S: Final = 1.0
+UDP_FIRST_S: Final = 1.0
 """Four times as long as RFC 8305 lets an address try alone: a mobile network that sleeps answers late."""
+UDP_SILENT_S: Final = 0.5
+"""After it worked, from when a question was not answered in time: with frames, about 1 s after the last datagram."""
 UDP_BACK_S: Final = 10.0
 """So a network that passes UDP now and then does not cost a connection each time."""
+LEAVE_S: Final = 2.5
+"""Before it is closed, a connection only receives for so long: peers notice that, and use UDP."""
 SILENT_S: Final = 15.0
 """A connection along which the relay does not answer for so long is made again: a proxy may keep it open."""
 LOOK_S: Final = 0.25
@@ -130,7 +134,8 @@ class WebRelay:
         self._ended = asyncio.Event()
         self._peer: Peer | None = None
         self._task: asyncio.Task[None] | None = None
-        self._udp_worked_at = 0.0  # or when it was tried first
+        self._is_leaving = False  # the connection only receives
+        self._udp_silent_at = 0.0  # it is silent from then on, if it does not work before
         node.facts.streams.add(number)
         node.facts.metered.add(number)
 
@@ -142,7 +147,7 @@ class WebRelay:
     def start(self, peer: Peer, receive: Receive, on_change: Callable[[], None]) -> None:
         """Connect whenever this relay does not answer by UDP."""
         self._peer, self._receive, self._on_change = peer, receive, on_change
-        self._udp_worked_at = monotonic()
+        self._udp_silent_at = monotonic() + UDP_FIRST_S
         if self._task is None:
             self._task = keep_running(self._keep(), f"the connection to {self.written}")
 
@@ -158,12 +163,13 @@ class WebRelay:
         """As a socket's ``sendto``."""
         if self._stream is None:
             raise OSError(errno.ENOTCONN, "there is no connection")
-        self._stream.send(datagram)
+        if not self._is_leaving:
+            self._stream.send(datagram)
         return len(datagram)
 
     def report_state(self) -> None:
         """Tell the core whether there is a connection."""
-        if self._stream is None:
+        if self._stream is None or self._is_leaving:
             self._node.set_socket_state(self.number, monotonic(), is_up=False)
 
     def _room(self) -> float:
@@ -231,9 +237,9 @@ class WebRelay:
 
     async def _until_udp_is_silent(self) -> None:
         """A relay without an address for UDP needs no wait."""
-        while self._has_udp and (self._udp_works or monotonic() < self._udp_worked_at + UDP_SILENT_S):
+        while self._has_udp and (self._udp_works or monotonic() < self._udp_silent_at):
             if self._udp_works:
-                self._udp_worked_at = monotonic()
+                self._udp_silent_at = monotonic() + UDP_SILENT_S
             await asyncio.sleep(LOOK_S)
 
     async def _until_udp_is_back(self) -> None:
@@ -249,6 +255,10 @@ class WebRelay:
         ended = asyncio.ensure_future(self._ended.wait())
         try:
             await asyncio.wait((back, silent, ended), return_when=asyncio.FIRST_COMPLETED)
+            if self._stream is not None and back.done():
+                self._is_leaving = True
+                self._node.set_socket_state(self.number, monotonic(), is_up=False)
+                await asyncio.wait((ended,), timeout=LEAVE_S)
             if self._stream is not None:
                 self._stream.lose(UDP_WORKS if back.done() else "silent")
         finally:
@@ -276,10 +286,11 @@ class WebRelay:
     @property
     def _udp_works(self) -> bool:
         assert self._peer is not None, "started"
-        return self._peer.is_up and any(state.works and state.path.is_udp for state in self._peer.paths.states)
+        states = self._peer.paths.states
+        return self._peer.is_up and any(state.path.is_udp and state.works and not state.is_silent for state in states)
 
     def _open(self, stream: WebStream) -> None:
-        self._stream, self._error, self._is_used = stream, "", False
+        self._stream, self._is_leaving, self._error, self._is_used = stream, False, "", False
         self._node.set_socket_state(self.number, monotonic(), is_up=True)
         if (omitted := self._take_line()) is not None:
             self._log.info("relay_connected", address=self.path.host, **omitted)
