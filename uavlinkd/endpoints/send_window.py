@@ -2,7 +2,8 @@
 
 The kernel's limit on unsent bytes ends at the first proxy. So the sender counts what the other end has received:
 a WebSocket Ping carries the count of bytes so far, and its Pong shows that they arrived. The window is the product of
-the best rate and the least round trip of the last seconds, and a bit more.
+the best rate and the least round trip of the last seconds, and more: TCP notices a lost segment by those behind it,
+so the window must not close before the segment is sent again.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ PING_BYTES: Final = 2000  # a Ping follows each so many bytes
 FIRST_BYTES: Final = 16_384  # the window before the first Pong
 LEAST_BYTES: Final = 4096
 SEGMENT_BYTES: Final = 1400
-EXCESS: Final = 1.5  # the window in products of rate and round trip: with 1.0 the rate could not rise
+EXCESS: Final = 2.0  # the window in products of rate and round trip
 RATE_S: Final = 3.0  # the best rate of at least this long counts
 ROUND_TRIP_S: Final = 10.0  # the least round trip of at least this long counts: routes change
 MEASURED_S: Final = 0.2  # a rate is measured over this time, or two round trips
