@@ -62,6 +62,8 @@ class DaemonProcess:
         self.command = "run"
         self.launcher: tuple[str, ...] = ()
         """The command that starts the daemon, such as ``ip netns exec NAME``. It execs the daemon: one process."""
+        self.code = ""
+        """Python that runs the daemon, if it is not the package as it is."""
         self.environ: dict[str, str] = {}
         """Additional variables of its environment, for every start."""
         self._process: asyncio.subprocess.Process | None = None
@@ -135,6 +137,8 @@ class DaemonProcess:
 
     def _executable(self) -> tuple[str, str]:
         """The daemon, as it is; every other one as if uvloop were not installed, so that both loops are tested."""
+        if self.code:
+            return "-c", self.code
         return ("-c", WITHOUT_UVLOOP) if self.name.endswith(ODD) else ("-m", "uavlinkd")
 
     async def ready(self) -> Status:

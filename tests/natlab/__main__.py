@@ -1,7 +1,8 @@
 """``python -m tests.natlab``: connect all pairs of kinds of NAT, and print how long it takes. As root.
 
 Daemons know only a relay on the internet. ``--faults`` lets NATs, networks and the relay fail instead. ``--members``
-makes a fleet with an authority, lets vehicles join it and revokes them.
+makes a fleet with an authority, lets vehicles join it and revokes them. ``--commands`` measures a relay by TLS beside
+UDP, and ``--tls-faults`` lets UDP and the connection fail.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from time import monotonic
 
 from tests.daemon.harness import Stage
 from tests.namespaces import why_not
-from tests.natlab import daemons, faults
+from tests.natlab import daemons, faults, latency
 from tests.natlab.kinds import KINDS, PAIRED
 from tests.natlab.laboratory import Laboratory
 from tests.natlab.members import Fleet, Joined, Revocation, Scenario, Spread
@@ -41,6 +42,9 @@ def main() -> int:
     parser.add_argument("--swarm", action="store_true", help="its vehicles call each other, not only the operator")
     parser.add_argument("--tries", type=int, default=20, help="vehicles that join it and are revoked")
     parser.add_argument("--idle-s", type=float, default=0, help="measure what it costs while idle, then pinned peers")
+    parser.add_argument("--commands", type=float, default=0, metavar="S", help="ages of commands beside telemetry")
+    parser.add_argument("--kbit-s", type=int, default=0, help="what the vehicle's line carries, with --commands")
+    parser.add_argument("--tls-faults", type=int, default=0, metavar="TRIES", help="the same, with a relay by TLS")
     options = parser.parse_args()
     reason = why_not("nft")
     if reason is not None:
@@ -49,6 +53,10 @@ def main() -> int:
     with interrupted_by_signals():
         if options.members:
             asyncio.run(_meet(options))
+        elif options.commands:
+            asyncio.run(_command(options))
+        elif options.tls_faults:
+            asyncio.run(_fail_by_tls(options))
         elif options.faults:
             asyncio.run(_fail(options.faults))
         else:
@@ -93,6 +101,28 @@ async def _fail(tries: int) -> None:
             f"{name}: back {_spread(outcome.back_s for outcome in outcomes)}; frames lost: {', '.join(lost)}",
             flush=True,
         )
+
+
+def _line(options: argparse.Namespace) -> latency.Line:
+    return latency.Line(options.delay_ms / 1000, options.loss_percent / 100, options.kbit_s)
+
+
+async def _command(options: argparse.Namespace) -> None:
+    for title, (by, is_endless) in latency.CARRIERS.items():
+        with redirect_stdout(StringIO()):
+            measured = await latency.measure(_line(options), by, options.commands, is_endless=is_endless)
+        for kind, ages in measured.items():
+            p50, p99, oldest = (1000 * ages.share(part) for part in (0.5, 0.99, 1))
+            times = f"p50 {p50:.0f} ms, p99 {p99:.0f} ms, oldest {oldest:.0f} ms"
+            print(f"{title}, {kind}: {times}, lost {ages.lost} of {ages.sent}", flush=True)
+
+
+async def _fail_by_tls(options: argparse.Namespace) -> None:
+    for name in latency.FAULTS:
+        for _ in range(options.tls_faults):
+            with redirect_stdout(StringIO()):
+                outcome = await latency.fail(name, _line(options))
+            print(f"{name}: {outcome}", flush=True)
 
 
 async def _meet(options: argparse.Namespace) -> None:

@@ -84,7 +84,7 @@ def make_ends(
     """Two members of a relay that are peers. A place has one in each of its pairs, so each pair has its own port."""
     daemons = []
     for side, place in zip("ab", places, strict=True):
-        daemon = _member(stage, relay, f"{side}{port}", _addresses(place, "0.0.0.0", "::", port), place)
+        daemon = make_member(stage, relay, f"{side}{port}", _addresses(place, "0.0.0.0", "::", port), place)
         daemons.append(daemon)
     one, other = daemons
     psk = stage.psk()
@@ -94,7 +94,7 @@ def make_ends(
     return Ends((one, other), prepare(one, other, namespaces, voice))
 
 
-def _member(stage: Stage, relay: DaemonProcess, name: str, listen: Sequence[str], place: Place) -> DaemonProcess:
+def make_member(stage: Stage, relay: DaemonProcess, name: str, listen: Sequence[str], place: Place) -> DaemonProcess:
     daemon = stage.daemon(name, listen)
     daemon.launcher = place.host.launcher
     addresses = relay.config["listen"] if place.ipv6 else [relay.address]
@@ -115,7 +115,7 @@ async def start_members(stage: Stage, laboratory: Laboratory, kinds: Sequence[st
     members = {}
     for kind in kinds:
         place = laboratory.place(kind)
-        daemon = _member(stage, relay, kind, [f"{place.address}:{PORT}"], place)
+        daemon = make_member(stage, relay, kind, [f"{place.address}:{PORT}"], place)
         daemon.config["relay"][0]["addresses"] = relay.config["listen"]
         daemon.add_peer(absent, [], stage.psk())
         members[kind] = daemon
