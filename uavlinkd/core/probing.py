@@ -27,13 +27,14 @@ def update(peer: Peer, now: float) -> list[Output]:
 def follow_paths(peer: Peer, now: float) -> None:
     """The paths have changed, or there is another session: set how long to wait for answers, and how often to ask.
 
-    Every session of a peer with several paths notes its arrivals: copies may overtake the envelopes of each.
+    Every session of a peer with several paths, or one along a relay, notes its arrivals: copies may overtake the
+    envelopes of each, and a new handle carries recent ones again.
     """
     peer.set_waits()
-    pace, has_several = peer.paths.pace, peer.paths.has_several
+    pace, has_copies = peer.paths.pace, peer.paths.has_several or peer.paths.has_relayed
     for session in peer.sessions.confirmed:
         session.set_pace(pace, peer.verify_interval_s, now)
-        if has_several and session.arrivals is None:
+        if has_copies and session.arrivals is None:
             session.arrivals = Arrivals(now)
 
 
