@@ -149,7 +149,9 @@ def _peer_address(value: Any) -> PeerAddress:
 def _web_address(text: str, network: str) -> PeerAddress:
     scheme, _, rest = text.partition("://")
     place, slash, resource = rest.partition("/")
-    if scheme != "wss" or network or not _RESOURCE.fullmatch(resource):
+    if network:
+        raise ValueError("has the URL of a relay with a network: write the URL alone, it uses any")
+    if scheme != "wss" or not _RESOURCE.fullmatch(resource):
         raise ValueError('is not the URL of a relay: write one such as "wss://relay.example.org:443/uavlink"')
     has_port = place.rpartition("]")[2].count(":") == 1
     address = parse_address(place if has_port else f"{place}:443", allow_names=True)

@@ -82,7 +82,7 @@ class SendWindow:
         while len(arrivals) > 2 and arrivals[1][0] < now - max(MEASURED_S, 2 * least_s):
             arrivals.popleft()
         began_at, began = arrivals[0]
-        if now > began_at:
+        if now - began_at >= MEASURED_S:
             rate = self._rates.note((count - began) / (now - began_at), now)
             self.bytes = max(LEAST_BYTES, SEGMENT_BYTES + EXCESS * rate * least_s)
         return True

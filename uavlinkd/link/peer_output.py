@@ -232,7 +232,9 @@ class PeerOutput:
         if self.repair.is_on or not all(frame.header.msgid in _STICKS for frame in frames):
             return False
         best = self._peer.paths.best
-        is_healthy = best is not None and best.condition is PathCondition.USABLE and best.loss_out < BEGIN_LOSS
+        if best is None:  # the core keeps critical frames for the next path, and these would be old then
+            return True
+        is_healthy = best.condition is PathCondition.USABLE and best.loss_out < BEGIN_LOSS
         flows = set(map(flow_key, frames))
         self._copied_at = {flow: at for flow, at in self._copied_at.items() if now < at + STICKS_COPIED_S}
         if is_healthy and flows <= self._copied_at.keys():

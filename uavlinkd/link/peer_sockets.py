@@ -402,7 +402,11 @@ class PeerSockets:
             self.without_socket.add(link.name)
             reason = "no network of its family" if self.networks.networks else "no listen address of its family"
             self._log.warning("peer_unreachable", peer=link.name, reason=reason)
-        link.set_paths([path for group in paths.values() for path in group], monotonic())
+        listed = [path for group in paths.values() for path in group]
+        listed.sort(
+            key=lambda path: not path.is_web
+        )  # the core takes a limited number, and this one must be among them
+        link.set_paths(listed, monotonic())
         self.report_absent(monotonic())
         self._on_change()
 

@@ -240,9 +240,10 @@ class Relays:
     def change(self, config: RelayConfig) -> None:
         """Its addresses changed."""
         relay = self.by_name[config.name]
+        if relay.link is None:
+            self._sockets.stop_following(relay.name)  # the addresses of before
         relay.config = config
         if relay.link is None:
-            self._sockets.stop_following(relay.name)
             self._sockets.follow(relay)
 
     def follow_links(self, now: float) -> None:

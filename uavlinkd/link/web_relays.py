@@ -41,10 +41,12 @@ LEAVE_S: Final = 2.5
 SILENT_S: Final = 15.0
 """A connection along which the relay does not answer for so long is made again: a proxy may keep it open."""
 LOOK_S: Final = 0.25
-RETRY_S: Final = 1.0, 15.0
+RETRY_S: Final = 1.0, 4.0
 """After a failure, the first wait; each further one is twice as long, up to the second value. A connection that
 brought nothing is a failure too."""
 UDP_WORKS: Final = "udp_works"
+PROBE_S: Final = 3.0
+"""The command that asks for a probe waits for 5 s."""
 WAIT_S: Final = 0.01
 """Frames look so often whether a connection takes them again."""
 
@@ -134,6 +136,7 @@ class WebRelay:
         self._ended = asyncio.Event()
         self._peer: Peer | None = None
         self._task: asyncio.Task[None] | None = None
+        self._has_udp = False
         self._is_leaving = False  # the connection only receives
         self._udp_silent_at = 0.0  # it is silent from then on, if it does not work before
         node.facts.streams.add(number)
@@ -144,8 +147,9 @@ class WebRelay:
         """``connected``, ``not connected``, or why the last try failed."""
         return "connected" if self._stream is not None else self._error or "not connected"
 
-    def start(self, peer: Peer, receive: Receive, on_change: Callable[[], None]) -> None:
-        """Connect whenever this relay does not answer by UDP."""
+    def start(self, peer: Peer, receive: Receive, on_change: Callable[[], None], *, has_udp: bool = False) -> None:
+        """Connect whenever this relay does not answer by UDP. ``has_udp``: it has an address for that."""
+        self._has_udp = has_udp
         self._peer, self._receive, self._on_change = peer, receive, on_change
         self._udp_silent_at = monotonic() + UDP_FIRST_S
         if self._task is None:
@@ -186,8 +190,9 @@ class WebRelay:
         proxy = error = ""
         try:
             proxy = proxy_of(parse_uri(self.path.host))
-            (await self._connect(None)).lose("probed")
-        except OSError as failure:
+            async with asyncio.timeout(PROBE_S):
+                (await self._connect(None)).lose("probed")
+        except OSError as failure:  # TimeoutError too
             error = _name(failure)
         return {"error": error, "proxy": proxy}
 
@@ -279,11 +284,6 @@ class WebRelay:
         return self._peer.is_up and any(state.works and state.path == self.path for state in states)
 
     @property
-    def _has_udp(self) -> bool:
-        assert self._peer is not None, "started"
-        return any(state.path.is_udp for state in self._peer.paths.states)
-
-    @property
     def _udp_works(self) -> bool:
         assert self._peer is not None, "started"
         states = self._peer.paths.states
@@ -355,8 +355,10 @@ class WebRelays:
 
     def follow(self, peer: Peer, addresses: Iterable[PeerAddress]) -> None:
         """Connect to these URLs of a relay, whenever it does not answer by UDP."""
+        addresses = list(addresses)
+        has_udp = any(not (written.resource or written.is_serial) for written in addresses)
         for relay in self._of(addresses):
-            relay.start(peer, self._receive, self._on_change)
+            relay.start(peer, self._receive, self._on_change, has_udp=has_udp)
 
     def unfollow(self, addresses: Iterable[PeerAddress]) -> None:
         """Do not connect to these any more."""

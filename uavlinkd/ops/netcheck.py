@@ -143,6 +143,7 @@ _WEB_ERRORS: Final = (
         "a web server or proxy answers there and refuses the WebSocket: see uavlinkd/relay/README.md",
     ),
     ("tls", "something answers there that does not speak TLS"),
+    ("TimeoutError", "no answer within 3 s: a firewall drops TCP too, or a name has no address"),
     ("slow_handshake", "something accepts the connection and does not answer"),
 )
 """By how the reason begins."""
