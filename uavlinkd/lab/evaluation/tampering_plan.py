@@ -401,7 +401,7 @@ proxy keeps the connection and drops everything | blackout,seconds=60
 proxy puts garbage between messages | web-garbage,rate_per_s=1 | least_s=3 -targeted needs=relay_connected
 proxy splits messages | web-fragment,rate_per_s=1 | least_s=3 -targeted needs=relay_connected
 proxy floods with pings | web-pings,rate_per_s=1 | least_s=3 -targeted needs=relay_connected
-proxy resets connections | web-reset,rate_per_s=1 | least_s=3 -targeted needs=relay_connected
+proxy resets connections | web-reset,rate_per_s=1 | least_s=3 -targeted needs=envelopes_missing
 """,
     takes_away=True,
 )
