@@ -166,7 +166,7 @@ async def test_strangers_are_few(stage: Stage) -> None:
         most = max(most, https["strangers"])
         await asyncio.sleep(0.02)
     assert most <= STRANGERS_OF_PREFIX
-    assert https["refused"].keys() <= {"prefix_full", "displaced", "slow_handshake"}
+    assert https["refused"].keys() <= {"prefix_full", "displaced", "slow_handshake", "unproven"}
     assert https["refused"].keys() & {"prefix_full", "displaced"}
     assert await relay.until_logged("connections_failed")
     for _, writer in opened:
