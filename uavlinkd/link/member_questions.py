@@ -11,10 +11,8 @@ from uavlinkd.core.constants import NEVER
 from uavlinkd.core.relay_records import Who
 
 WHO_AGAIN_S: Final = 0.1
-"""Between two questions of a round, at least, and as long as an answer takes."""
-
-WHO_ROUND_S: Final = 0.5
-"""Between two rounds, at least: others may still be on their way to the relay."""
+"""Between two questions of a round, and between rounds while they find members: at least, and as long as an answer
+takes."""
 
 WHO_TRIES: Final = 2
 """A round ends after so many questions without an answer: one may be lost."""
@@ -74,8 +72,7 @@ class MemberQuestions:
                 yield relay, Who(roles, asking.after)
                 asking.tries, asking.received = asking.tries + 1, 0
                 asking.is_resting = asking.tries == WHO_TRIES and asking.rounds >= WHO_ROUNDS
-                least_s = WHO_ROUND_S if asking.tries == WHO_TRIES else 0.0
-                asking.due_at = now + (WHO_INTERVAL_S if asking.is_resting else max(least_s, self._soon_s(relay)))
+                asking.due_at = now + (WHO_INTERVAL_S if asking.is_resting else self._soon_s(relay))
 
     def note(self, relay: bytes, serial: int, now: float) -> None:
         """A relay sent the certificate with this serial. Ask for the others: at once if the answer was full.
