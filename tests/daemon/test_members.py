@@ -62,13 +62,13 @@ async def test_station_that_relays(swarm: Swarm) -> None:
 async def test_member_gets_a_new_key(stage: Stage, swarm: Swarm) -> None:
     """The same name and ids with a higher serial: all accept the new key, and the old one is revoked."""
     fleet, ground, one, two = swarm
-    contacts = one.config["contact"]
+    contacts, call = one.config["contact"], one.config["fleet"]["call"]
     await one.stop()
     old = fleet.certificates.pop("v1")
     new = stage.daemon("new", [])
     new.name = new.config["name"] = "v1"
     fleet.join(new, MemberRole.VEHICLE, 1, ground)
-    new.config["contact"] = contacts
+    new.config["contact"], new.config["fleet"]["call"] = contacts, call
     new.add_endpoint("autopilot")
     fleet.certificates["old"] = old
     await ground.ask(fleet.revoke("old"))
