@@ -33,7 +33,8 @@ def path_set(
 ) -> PathSet:
     """A set with these configured paths."""
     facts = SocketFacts(metered)
-    facts.streams.update(streams)
+    for number in streams:
+        facts.add_stream(number)
     made = PathSet(redundancy, idle_probe_s, Counter() if known is None else known, facts)
     made.configure(paths, 0.0)
     return made
@@ -306,7 +307,7 @@ def test_metered_path_is_the_best_only_without_another() -> None:
 
 def test_path_by_tls_is_the_best_only_without_another() -> None:
     """Also without a metered one, which replaces it at once when it works again."""
-    paths = path_set(WEB, LTE, metered={WEB.socket, LTE.socket}, streams={WEB.socket})
+    paths = path_set(WEB, LTE, metered={LTE.socket}, streams={WEB.socket})
     answer(paths, WEB, 1.0, 0.01)
     assert paths.best is of(paths, WEB)
     assert paths.role(of(paths, LTE)) == "metered"

@@ -114,6 +114,11 @@ class SocketFacts:
         self.peer_at: dict[int, Hashable | None] = {}
         """The peer at the other end of each point-to-point network; None during a change."""
 
+    def add_stream(self, socket: int) -> None:
+        """The datagrams of this socket travel in TCP connections. Call it before there is a path along it."""
+        self.streams.add(socket)
+        self.metered.add(socket)
+
     # Budgets.
 
     def set_budgets(self, budgets: Mapping[int, float]) -> None:

@@ -129,8 +129,7 @@ class WebListener:
         self._sock.listen(_BACKLOG)
         self._backlog = Backlog(stall, self._sock.fileno(), lambda: _BACKLOG + 1)
         _raise_file_limit()
-        node.facts.streams.add(number)
-        node.facts.metered.add(number)
+        node.facts.add_stream(number)
 
     @property
     def address(self) -> Address:

@@ -139,8 +139,7 @@ class WebRelay:
         self._has_udp = False
         self._is_leaving = False  # the connection only receives
         self._udp_silent_at = 0.0  # it is silent from then on, if it does not work before
-        node.facts.streams.add(number)
-        node.facts.metered.add(number)
+        node.facts.add_stream(number)
 
     @property
     def state(self) -> str:

@@ -66,8 +66,7 @@ class Member:
         self.link = RelayLink(RelayConfig(settings, ()), self.node, RelayHandles(), lambda keys, now: None, now)
         self.path = Path(0, self.relay)
         if not hosts.is_udp(self.host):
-            self.node.facts.streams.add(self.path.socket)
-            self.node.facts.metered.add(self.path.socket)
+            self.node.facts.add_stream(self.path.socket)
         self.handle = 0
         self.bound_at = 0.0
         self.initiations = self.envelopes = 0
