@@ -246,16 +246,9 @@ class WebRelay:
                 self._udp_silent_at = monotonic() + UDP_SILENT_S
             await asyncio.sleep(LOOK_S)
 
-    async def _until_udp_is_back(self) -> None:
-        since = monotonic()
-        while monotonic() < since + UDP_BACK_S:
-            await asyncio.sleep(LOOK_S)
-            if not self._udp_works:
-                since = monotonic()
-
     async def _until_not_needed(self) -> None:
-        back = asyncio.ensure_future(self._until_udp_is_back())
-        silent = asyncio.ensure_future(self._until_silent())
+        back = asyncio.ensure_future(_until_held(lambda: self._udp_works, UDP_BACK_S))
+        silent = asyncio.ensure_future(_until_held(lambda: not self._works, SILENT_S))
         ended = asyncio.ensure_future(self._ended.wait())
         try:
             await asyncio.wait((back, silent, ended), return_when=asyncio.FIRST_COMPLETED)
@@ -268,13 +261,6 @@ class WebRelay:
         finally:
             for task in (back, silent, ended):
                 task.cancel()
-
-    async def _until_silent(self) -> None:
-        since = monotonic()
-        while monotonic() < since + SILENT_S:
-            await asyncio.sleep(LOOK_S)
-            if self._works:
-                since = monotonic()
 
     @property
     def _works(self) -> bool:
@@ -385,6 +371,15 @@ class WebRelays:
 
     def _of(self, addresses: Iterable[PeerAddress]) -> list[WebRelay]:
         return [self._relays[written] for written in addresses if written in self._relays]
+
+
+async def _until_held(is_so: Callable[[], bool], seconds: float) -> None:
+    """Until something was so for this long, at each look."""
+    since = monotonic()
+    while monotonic() < since + seconds:
+        await asyncio.sleep(LOOK_S)
+        if not is_so():
+            since = monotonic()
 
 
 def _name(error: OSError) -> str:
