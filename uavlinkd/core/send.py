@@ -24,12 +24,11 @@ def send_frames(peer: Peer, frames: Sequence[bytes], now: float, cls: Class) -> 
     """Put frames that are here together into as few envelopes as hold them, in their order."""
     session, paths = peer.sessions.current, peer.paths
     route = paths.stream_route if cls is Class.STREAM else paths.routes[cls]
-    keeps = not route and cls is Class.CRITICAL and paths.has_relayed
-    is_usable = session is not None and now < session.reject_at and session.send_counter < c.SESSION_ENVELOPE_LIMIT
-    if session is None or not is_usable or not (route or keeps):
+    keeps = cls is Class.CRITICAL and paths.has_relayed  # also without a route
+    if session is None or now >= session.reject_at or session.send_counter >= c.SESSION_ENVELOPE_LIMIT:
         return peer.drop(DropReason.NO_SESSION, len(frames))
-    if keeps:
-        return _keep(peer, session, frames, now)
+    if not route:
+        return _keep(peer, session, frames, now) if keeps else peer.drop(DropReason.NO_SESSION, len(frames))
     if peer.timers.deadlines[Timer.PROBE] == NEVER and peer.durations.probe_interval_s:
         # On a slow network, a request about freshness measures the round trip too: it comes first if frames arrive.
         least_s = (1 + c.VERIFY_REPEAT_SHARE) * paths.pace.interval_s
@@ -60,7 +59,7 @@ def send_frames(peer: Peer, frames: Sequence[bytes], now: float, cls: Class) -> 
         if now >= asks_at:
             payload = _ask_too(peer, session, route[0], payload, limit, now)
         out += seal(peer, session, payload, route, now)
-    if cls is Class.CRITICAL and paths.has_relayed:
+    if keeps:
         sent = (output.datagram for output in out if isinstance(output, Transmit))
         _remember(peer, dict.fromkeys(sent), now)
     return out
