@@ -13,16 +13,22 @@ CERTIFICATE, TLS_KEY = "tls.crt", "tls.key"
 
 
 def write_tls_files(
-    folder: Path, certificate: str = CERTIFICATE, key: str = TLS_KEY, passphrase: bytes = b""
+    folder: Path,
+    certificate: str = CERTIFICATE,
+    key: str = TLS_KEY,
+    passphrase: bytes = b"",
+    *,
+    is_valid: bool = False,
 ) -> None:
-    """A certificate that has expired, and its key."""
+    """A certificate and its key. It has expired unless ``is_valid``: web servers may refuse that, members do not."""
     private = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "relay")])
     then = datetime.now(UTC) - timedelta(days=9)
+    until = datetime.now(UTC) + timedelta(days=1) if is_valid else then + timedelta(days=1)
     signed = (
         x509.CertificateBuilder(name, name, private.public_key(), x509.random_serial_number())
         .not_valid_before(then)
-        .not_valid_after(then + timedelta(days=1))
+        .not_valid_after(until)
         .sign(private, hashes.SHA256())
     )
     protection = serialization.BestAvailableEncryption(passphrase) if passphrase else serialization.NoEncryption()

@@ -13,8 +13,8 @@ from pathlib import Path
 from time import monotonic
 from typing import Final
 
-from tests.daemon.tls import write_certificate
 from tests.needs import need
+from tests.tls_files import write_tls_files
 from tests.waiting import PATIENCE_S
 from uavlinkd.lab.child_processes import end_with_parent, stop_child
 from uavlinkd.lab.sim.loopback_ports import free_port
@@ -133,7 +133,7 @@ def nginx(folder: Path, relay_port: int) -> WebServer:
         ("127.0.0.1:5443", f"127.0.0.1:{relay_port}"),
     )
     _write(folder, nginx_conf=_NGINX.format(folder=folder), site_conf=site)
-    write_certificate(folder)
+    write_tls_files(folder, is_valid=True)
     return server
 
 

@@ -1,18 +1,14 @@
-"""Both ends of WebSocket streams on loopback, a certificate for them, and hostile bytes in place of one end."""
+"""Both ends of WebSocket streams on loopback, and hostile bytes in place of one end."""
 
 from __future__ import annotations
 
 import asyncio
-import datetime
 import socket
 from pathlib import Path
 
-from cryptography import x509
-from cryptography.hazmat.primitives import hashes, serialization
-from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.x509.oid import NameOID
 from websockets.uri import parse_uri
 
+from tests.tls_files import CERTIFICATE, TLS_KEY, write_tls_files
 from tests.waiting import until
 from uavlinkd.endpoints.tls_channel import TlsFactory, client_tls, server_context, server_tls
 from uavlinkd.endpoints.web_stream import WebStream, client_protocol, server_protocol
@@ -24,26 +20,6 @@ REQUEST = (
     b"GET /uavlink HTTP/1.1\r\nHost: relay.example.org\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
     b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
 )
-
-
-def certificate(folder: Path) -> tuple[str, str]:
-    """A self-signed certificate and its key, as PEM files."""
-    key = ec.generate_private_key(ec.SECP256R1())
-    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "relay.example.org")])
-    now = datetime.datetime.now(datetime.UTC)
-    made = (
-        x509.CertificateBuilder(name, name, key.public_key(), x509.random_serial_number())
-        .not_valid_before(now - datetime.timedelta(days=1))
-        .not_valid_after(now + datetime.timedelta(days=1))
-        .sign(key, hashes.SHA256())
-    )
-    files = folder / "cert.pem", folder / "key.pem"
-    files[0].write_bytes(made.public_bytes(serialization.Encoding.PEM))
-    private = serialization.PrivateFormat.PKCS8
-    files[1].write_bytes(
-        key.private_bytes(serialization.Encoding.PEM, private, serialization.NoEncryption()),
-    )
-    return str(files[0]), str(files[1])
 
 
 def frame(opcode: int, payload: bytes, *, fin: bool = True, masked: bool = True) -> bytes:
@@ -100,7 +76,10 @@ class Loopback:
         self.listener = socket.create_server(("127.0.0.1", 0))
         self.listener.setblocking(False)
         self.port = self.listener.getsockname()[1]
-        self.context = None if folder is None else server_context(*certificate(folder))
+        self.context = None
+        if folder is not None:
+            write_tls_files(folder)
+            self.context = server_context(str(folder / CERTIFICATE), str(folder / TLS_KEY))
         self._sockets: list[socket.socket] = [self.listener]
         self._owners: list[Owner] = []
 

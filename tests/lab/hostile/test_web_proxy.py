@@ -11,7 +11,8 @@ from time import monotonic
 
 import pytest
 
-from tests.endpoints.web_streams import Loopback, Owner, certificate
+from tests.endpoints.web_streams import Loopback, Owner
+from tests.tls_files import CERTIFICATE, TLS_KEY, write_tls_files
 from tests.waiting import until
 from uavlinkd.core.relay_records import wrap
 from uavlinkd.lab.hostile.web_proxy import FORWARDED, SPOKEN, WEB_ATTACKS, WebContext, WebProxy
@@ -65,7 +66,8 @@ async def proxied(folder: Path) -> AsyncIterator[tuple[WebProxy, Middle, Owner, 
     loopback, middle, port = Loopback(folder), Middle(), free_port()
     web = WebProxy(port, loopback.port, (middle.ports[0], middle.ports[1]))
     middle.ends = [end.udp.getsockname()[1] for end in (web.to_member, web.to_relay)]
-    web.start(*certificate(folder))
+    write_tls_files(folder)
+    web.start(str(folder / CERTIFICATE), str(folder / TLS_KEY))
     sock = socket.socket()
     sock.setblocking(False)
     try:
