@@ -7,7 +7,7 @@ import socket
 import struct
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, Final, NamedTuple
 
 import structlog
@@ -295,3 +295,10 @@ def _cannot_listen(address: Address, error: OSError) -> BindError:
     bind_error = BindError(f"cannot listen on {address}: {error.strerror or error}{f': {remedy}' if remedy else ''}")
     bind_error.is_taken = error.errno == errno.EADDRINUSE
     return bind_error
+
+
+def set_options(sock: socket.socket, options: Iterable[tuple[int, str, int | bytes]]) -> None:
+    """Set options: level, name and value. One that the system does not have is left out."""
+    for level, name, value in options:
+        with suppress(OSError, AttributeError):
+            sock.setsockopt(level, getattr(socket, name), value)

@@ -16,7 +16,7 @@ from secrets import SystemRandom
 from typing import Any
 
 from uavlinkd.endpoints.ports import CLIENT_SILENT_S, CLIENTS_PER_ENDPOINT, PortHandler, failure_name
-from uavlinkd.endpoints.sockets import bind, new_socket
+from uavlinkd.endpoints.sockets import bind, new_socket, set_options
 from uavlinkd.endpoints.stream_endpoint import STALLED_S, StreamEndpoint
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic
@@ -226,7 +226,6 @@ async def _connected(family: socket.AddressFamily, sockaddr: tuple[Any, ...]) ->
 
 _EXHAUSTED = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
 
-# Level, name and value. An option that the system does not have is left out.
 _OPTIONS = (
     (socket.IPPROTO_TCP, "TCP_NODELAY", 1),
     (socket.SOL_SOCKET, "SO_SNDBUF", _SEND_BUFFER_BYTES),
@@ -243,6 +242,4 @@ _OPTIONS = (
 def _prepare(sock: socket.socket) -> None:
     """Configure a socket to hold few bytes, and to detect that the other side has gone."""
     sock.setblocking(False)
-    for level, name, value in _OPTIONS:
-        with suppress(OSError, AttributeError):
-            sock.setsockopt(level, getattr(socket, name), value)
+    set_options(sock, _OPTIONS)

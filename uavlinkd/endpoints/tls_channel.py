@@ -16,6 +16,7 @@ from contextlib import suppress
 from typing import Any, Final, Protocol
 
 from uavlinkd.endpoints.ports import failure_name
+from uavlinkd.endpoints.sockets import set_options
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.stall import Backlog, StallWatch
 
@@ -30,8 +31,7 @@ READ_BYTES: Final = 16_384
 MAX_REST_BYTES: Final = 32_768  # so many bytes of TLS's own messages may wait for an end that does not read
 
 _SIOCOUTQNSD: Final = 0x894B  # unsent bytes: linux/sockios.h
-# Level, name and value. An option that the system does not have is left out. The kernel reports a socket as writable
-# when its unsent bytes are below half of TCP_NOTSENT_LOWAT.
+# The kernel reports a socket as writable when its unsent bytes are below half of TCP_NOTSENT_LOWAT.
 _OPTIONS: Final[tuple[tuple[int, str, int | bytes], ...]] = (
     (socket.IPPROTO_TCP, "TCP_NODELAY", 1),
     (socket.IPPROTO_TCP, "TCP_NOTSENT_LOWAT", 2 * UNSENT_BYTES),
@@ -112,9 +112,7 @@ class TlsChannel:
         sock.setblocking(False)
         with suppress(OSError):
             self.peername = sock.getpeername()
-        for level, option, value in _OPTIONS:
-            with suppress(OSError, AttributeError):
-                sock.setsockopt(level, getattr(socket, option), value)
+        set_options(sock, _OPTIONS)
         self._backlog = Backlog(stall, self._fd, self._capacity, opened_in)
         self._in, self._out = ssl.MemoryBIO(), ssl.MemoryBIO()
         self._tls = tls(self._in, self._out) if tls is not None else None

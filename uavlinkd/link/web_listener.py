@@ -25,7 +25,7 @@ from uavlinkd.core.limits import TokenBucket
 from uavlinkd.core.node import Node
 from uavlinkd.core.path import Path, SocketAddress
 from uavlinkd.endpoints.ports import failure_name
-from uavlinkd.endpoints.sockets import BindError
+from uavlinkd.endpoints.sockets import BindError, set_options
 from uavlinkd.endpoints.tcp import tcp_listener
 from uavlinkd.endpoints.tls_channel import TlsFactory, server_tls
 from uavlinkd.endpoints.web_stream import WebStream, server_protocol
@@ -64,7 +64,12 @@ SENDER: Final = "members by TLS"
 """The name of their stale datagrams."""
 _BACKLOG: Final = 128
 """So many wait in the kernel, for 0.64 s at most. In a longer queue, members would give up under a flood."""
-_KEEPALIVE: Final = (("TCP_KEEPIDLE", 30), ("TCP_KEEPINTVL", 10), ("TCP_KEEPCNT", 3))
+_KEEPALIVE: Final = (
+    (socket.SOL_SOCKET, "SO_KEEPALIVE", 1),
+    (socket.IPPROTO_TCP, "TCP_KEEPIDLE", 30),
+    (socket.IPPROTO_TCP, "TCP_KEEPINTVL", 10),
+    (socket.IPPROTO_TCP, "TCP_KEEPCNT", 3),
+)
 """The kernel notices a member that is gone without a word."""
 _EXHAUSTED: Final = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
 
@@ -216,10 +221,7 @@ class WebListener:
             self._refuse(reason, now)
             sock.close()
             return False
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        for name, value in _KEEPALIVE:
-            with suppress(OSError, AttributeError):
-                sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
+        set_options(sock, _KEEPALIVE)
         connection = _Connection(self, address, prefix, now)
         connection.stream = WebStream(sock, server_protocol(), self._tls, connection, self._stall, SENDER, epoch)
         self._every.add(connection)
