@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import errno
-import os
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from itertools import chain
+from collections.abc import Sequence
 from typing import Any, Final
 
 from rich.box import SIMPLE_HEAD
@@ -14,34 +10,10 @@ from rich.console import Group, JustifyMethod, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from uavlinkd.core.drops import DropReason, Reason
-from uavlinkd.mavlink.egress.lanes import EgressDrop
-from uavlinkd.mavlink.frames import FrameFault
-from uavlinkd.mavlink.policy.gate import Refusal
-from uavlinkd.ops.findings import LinkProblem
+from uavlinkd.ops import status_words as words
 from uavlinkd.ops.netcheck import addresses
-from uavlinkd.relay.forwarding import RelayReason
-from uavlinkd.system.error_meanings import meaning_of
+from uavlinkd.ops.status_words import Status
 
-Status = dict[str, Any]
-_Count = tuple[str, int]  # a reason in plain words, and how often
-
-ENDPOINT_FAILURES: Final[Mapping[str, str]] = {
-    "unsent": "unsent frames",
-    "outgoing_full": "frames above the queue's limit",
-    "stale": "frames that waited too long",
-    "thinned": "frames replaced by newer ones",
-    "disconnected": "disconnected",
-    "stalled": "stalled connections",
-    "too_many_clients": "clients above the limit",
-    "displaced": "silent clients replaced",
-    "http": "web browsers",
-    "connect_timeout": "attempts without an answer",
-    "not_resolved": "attempts without an address",
-    "family_unavailable": "addresses of an unavailable family",
-    "stranger": "datagrams of another address",
-}
-"""Errors of an endpoint that the daemon names itself; the others are names of the kernel."""
 _STYLES: Final = {
     "up": "green",
     "lost": "bold red",
@@ -54,15 +26,9 @@ _STYLES: Final = {
     "fault": "bold yellow",
     "warning": "yellow",
 }
-_NOT_USABLE: Final = {"unanswered": "no answer", "loss": "loss", "network": "no network"}
-"""Why a path is not usable, in plain words."""
-_SHOWN_REASONS: Final = 3
 _SHOWN_FINDINGS: Final = 20
-_SHOWN_NAMES: Final = 8
 _SHOWN_MEMBERS: Final = 30
 _WIDE: Final = 100  # from so many columns on, the table of paths has lag and bytes too
-_COPIES: Final = frozenset[str]({DropReason.DUPLICATE, DropReason.LATE_COPY})
-"""What several paths cause all the time."""
 
 
 def render_status(status: Status, width: int = 80) -> RenderableType:
@@ -71,26 +37,19 @@ def render_status(status: Status, width: int = 80) -> RenderableType:
     if status["findings"]:
         parts.append(_findings(status["findings"]))
     if (fleet := status["fleet"]) is not None:
-        parts.append(_fleet(fleet))
+        parts.append(_said(words.fleet_line(fleet)))
     relay = status["relay"]
     if relay is None or status["peers"] or status["endpoints"]:
         parts += [*_peers(status, width), _endpoints(status)]
     if relay is not None:
         parts.append(_members(relay))
-        if text := _listed(_by_count(relay["dropped"], DropReason, RelayReason)):
-            parts.append(Text(f"not forwarded: {text}", style="yellow"))
         if (https := relay["https"]) is not None:
             members = https["connections"] - https["strangers"]
             parts.append(Text(f"by TLS at {https['address']}: {members:,} members, {https['strangers']:,} strangers"))
-    parts += [_used_relay(name, used) for name, used in status["relays"].items()]
+    parts += [_said(words.used_relay(name, used)) for name, used in status["relays"].items()]
     if status["networks"]:
         parts.append(_networks(status))
-    if dropped := _listed(_by_count(status["drops"], DropReason)):
-        parts.append(Text(f"dropped, from no known peer: {dropped}", style="yellow"))
-    for error, count in _ranked(list(status["send_failures"].items()))[:_SHOWN_REASONS]:
-        parts.append(Text(f"not sent: {count:,}, because {meaning_of(error) or error}", style="yellow"))
-    if stale := sum(status["stale"].values()):
-        parts.append(Text(f"dropped after a pause of the daemon: {stale:,} frames", style="yellow"))
+    parts += [Text(text, style="yellow") for text in words.other_losses(status)]
     return Group(*parts)
 
 
@@ -104,51 +63,23 @@ def render_peers(status: Status) -> RenderableType:
 
 
 def _headline(status: Status) -> Text:
-    peers = status["peers"].values()
-    up = sum(peer["state"] == "up" for peer in peers)
     text = Text(f"{status['name']}  ", style="bold")
-    relay = status["relay"]
-    counts = [f"{up} of {len(peers)} peers up"] if peers or relay is None else []
-    if relay is not None:
-        members = relay["members"].values()
-        counts.append(f"relay: {sum(member['is_up'] for member in members)} of {len(members)} members up")
-    text.append(", ".join(counts), style="bold green" if status["frames_pass"] else "bold red")
-    for blocked in status["blocked"]:
-        towards = "from" if blocked["direction"] == "in" else "to"
-        text.append(f", all frames {towards} {blocked['name']} are refused", style="bold red")
-    if status["has_no_client"]:
-        text.append(", no endpoint has a client", style="bold red")
-    for key, words in (
-        ("contested", "two machines use one key with"),
-        ("stopped_there", "frames stop, as reported by"),
-    ):
-        if status[key]:
-            text.append(f", {words} {_some(status[key])}", style="bold red")
+    for number, part in enumerate(words.headline(status)):
+        text.append(", " if number else "", style="bold red")
+        text.append(part.text, style="bold green" if part.is_good else "bold red")
     return text
 
 
-def _some(names: Sequence[str]) -> str:
-    more = f" and {len(names) - _SHOWN_NAMES} more" if len(names) > _SHOWN_NAMES else ""
-    return ", ".join(names[:_SHOWN_NAMES]) + more
-
-
 def _findings(findings: list[dict[str, str]]) -> Table:
-    """A line per problem with its cause and remedy. Security is first, and all of it is shown.
-
-    A problem of several peers, such as a relay that does not answer, is shown once.
-    """
-    several: dict[tuple[str, ...], list[str]] = {}
-    for finding in findings:
-        key = tuple(finding[field] for field in ("severity", "subject", "text", "remedy"))
-        several.setdefault(key, []).append(finding["name"])
+    """A line per problem with its cause and remedy. All of security is shown."""
     table = Table.grid(padding=(0, 1, 0, 0))
     table.add_column(no_wrap=True)
     table.add_column(overflow="fold")
-    shown = sum(label == "security" for label, *_ in several) + _SHOWN_FINDINGS
-    for (label, subject, text, remedy), names in list(several.items())[:shown]:
+    several = words.problems(findings)
+    shown = sum(problem.severity == "security" for problem in several) + _SHOWN_FINDINGS
+    for label, _, who, text, remedy in several[:shown]:
         style, is_security = _STYLES[label], label == "security"
-        listed = _some(names)
-        line = Text({"peer": f"{listed}: ", "endpoint": f"endpoint {listed}: "}.get(subject, ""), style="bold")
+        line = Text(f"{who}: " if who else "", style="bold")
         line.append(text, style=style if is_security else "not bold")
         line.append(f". Remedy: {remedy}", style="not bold")
         table.add_row(Text(label.upper() if is_security else label, style=style), line)
@@ -177,10 +108,8 @@ def _peers(status: Status, width: int) -> list[RenderableType]:
             _rate(peer["bytes_out_s"]),
         )
         if (repair := peer["repair"])["is_on"]:
-            kilobytes = f"{repair['bytes'] / 1000:,.0f} kB repeated so far"
-            times = f"sends critical frames {repair['transmissions']} times"
-            problems.append(Text(f"{name} repair: on for {_age(repair['on_s'])}, {times}; {kilobytes}"))
-        if dropped := _listed(_drops(peer)):
+            problems.append(Text(f"{name} repair: on for {_age(repair['on_s'])}, {words.repair_line(repair)}"))
+        if dropped := words.listed(words.peer_drops(peer)):
             problems.append(Text(f"{name} dropped: {dropped}"))
         session = peer["session"] or {}
         age = _age(peer["handshake_s"]) if session else "-"
@@ -199,11 +128,7 @@ def _endpoints(status: Status) -> Table:
         clients = endpoint["clients"].items()
         listed = ", ".join(f"{address} ({_age(client['last_received_s'])})" for address, client in clients)
         is_active = bool(clients) and endpoint["frames_received"] > 0
-        problems = _listed(
-            _by_count(endpoint["faults"], FrameFault)
-            + _by_count(endpoint["failures"])
-            + _by_count(_refused(endpoint), Refusal)
-        )
+        problems = words.listed(words.endpoint_drops(endpoint))
         table.add_row(
             Text(name, style="bold"),
             Text(listed or "no client", style="" if is_active else "bold yellow"),
@@ -219,67 +144,11 @@ def _networks(status: Status) -> Table:
     for name, network in status["networks"].items():
         line = network["serial"]
         leads_out = network["interface"] or network["address"] or f"{line['device']} at {line['baud']} baud"
-        here = Text(", ".join(network["addresses"]) if line is None else _line(line))
+        here = Text(", ".join(network["addresses"]) if line is None else words.radio_line(line))
         if not network["is_present"]:
             here = Text(f"absent: {network['absent_because']}", style="bold yellow")
         table.add_row(Text(name, style="bold"), Text(leads_out), "yes" if network["is_metered"] else "no", here)
     return table
-
-
-def _line(line: Status) -> str:
-    """What is known about the radio behind a serial device. Pairs of numbers are here/there."""
-    parts = [f"up to {line['rate_bits_s']:,} bits/s", f"{line['line_noise']:,} damaged"]
-    if (radio := line["radio"]) is not None:
-        parts += [
-            f"rssi {radio['rssi']}/{radio['remrssi']}",
-            f"noise {radio['noise']}/{radio['remnoise']}",
-            f"modem {100 - radio['txbuf']} % full" if radio["txbuf"] <= 100 else "modem's queue unknown",
-        ]
-    return ", ".join(parts)
-
-
-def _drops(peer: Status) -> list[_Count]:
-    """Missing envelopes are in the column of losses."""
-    return [
-        *_by_count({reason: count for reason, count in peer["drops"].items() if reason not in _COPIES}, DropReason),
-        *_by_count(peer["malformed"], FrameFault),
-        *_by_count(peer["waiting_dropped"], EgressDrop),
-        *_by_count(_refused(peer), Refusal),
-        *((problem.phrase, peer[problem]) for problem in LinkProblem if problem.phrase and peer[problem]),
-    ]
-
-
-def _refused(part: Status) -> dict[str, int]:
-    sums = Counter[str]()
-    for messages in part["refused"].values():
-        for reasons in messages.values():
-            sums.update(reasons)
-    return sums
-
-
-def phrase(code: str, *lists: Iterable[Reason]) -> str:
-    """A reason in plain words, for a count in front; an error of the kernel in the system's words."""
-    for reason in chain(*lists):
-        if reason == code:
-            return reason.phrase
-    if code in ENDPOINT_FAILURES:
-        return ENDPOINT_FAILURES[code]
-    return os.strerror(getattr(errno, code)).lower() if hasattr(errno, code) else code.replace("_", " ")
-
-
-def _by_count(counts: dict[str, int], *lists: Iterable[Reason]) -> list[_Count]:
-    return [(phrase(code, *lists), count) for code, count in counts.items() if count]
-
-
-def _ranked(counts: list[_Count]) -> list[_Count]:
-    """The most frequent reasons first, after hidden frames: a captured member could hide these by other refusals."""
-    return sorted(counts, key=lambda item: (item[0] != Refusal.HIDDEN_FRAME.phrase, -item[1]))
-
-
-def _listed(counts: list[_Count]) -> str:
-    ranked = _ranked(counts)
-    text = ", ".join(f"{count:,} {reason}" for reason, count in ranked[:_SHOWN_REASONS])
-    return text + (", …" if len(ranked) > _SHOWN_REASONS else "")
 
 
 def _loss(peer: Status) -> Text:
@@ -333,8 +202,8 @@ def _cells(path: Status, address: str) -> list[Text]:
         rtt = f"{_short(1000 * path['round_trip_s'])}±{_short(1000 * path['jitter_s'])}"
     return [
         Text(f" {where}", style="bold" if path["role"] == "best" else ""),
-        Text(_state(path), style=_STYLES[path["state"]]),
-        Text("all" if len(path["carries"]) == 3 else "+".join(path["carries"]) or "-"),
+        Text(words.path_state(path), style=_STYLES[path["state"]]),
+        Text(words.carried(path)),
         Text(rtt),
         Text(f"{100 * path['loss_in']:.0f}/{100 * path['loss_out']:.0f}"),
         Text(f"{_short(path['bytes_in_s'] / 1e3)}/{_short(path['bytes_out_s'] / 1e3)}"),
@@ -343,28 +212,12 @@ def _cells(path: Status, address: str) -> list[Text]:
     ]
 
 
-def _state(path: Status) -> str:
-    """The role of a usable path; of another one, what is wrong."""
-    if path["state"] == "usable":
-        return str(path["role"])
-    reason = _NOT_USABLE.get(path["reason"])
-    return f"{path['state']}: {reason}" if reason else str(path["state"])
-
-
 def _short(number: float) -> str:
     """One digit behind the point below ten, none above."""
     return f"{number:.1f}" if number < 9.95 else f"{number:.0f}"
 
 
-# Fleet and relays.
-
-
-def _fleet(fleet: Status) -> Text:
-    """A line about this daemon in its fleet, with the peers whose bulletin has another number."""
-    number, who = fleet["number"], f"{fleet['name']}, {fleet['role']}, serial {fleet['serial']}"
-    text = f"fleet {fleet['fleet']}: {who}; bulletin {number}"
-    other = [f"{name} has {its}" for name, its in fleet["bulletins"].items() if its not in (None, number)]
-    return Text(f"{text}, but {_some(other)}", style="yellow") if other else Text(text)
+# Relays.
 
 
 def _members(relay: dict[str, Any]) -> Table:
@@ -392,12 +245,5 @@ def _members(relay: dict[str, Any]) -> Table:
     return table
 
 
-def _used_relay(name: str, relay: dict[str, Any]) -> Text:
-    """A line about a relay that this daemon uses, with the state of each peer there."""
-    time_s = relay["round_trip_s"]
-    measured = "" if time_s is None else f", {1000 * time_s:.0f} ms"
-    peers = ", ".join(f"{peer} {state}" for peer, state in relay["peers"].items()) or "no peer uses it"
-    is_well = relay["state"] == "up" and "unanswered" not in relay["peers"].values()
-    role = "" if relay["peer"] is None else f", also the peer {relay['peer']}"
-    by_tls = " by TLS" if relay["state"] == "up" and relay["paths"][0]["network"] == "TLS" else ""
-    return Text(f"relay {name}{role}: {relay['state']}{by_tls}{measured}; {peers}", style="" if is_well else "yellow")
+def _said(phrase: words.Phrase) -> Text:
+    return Text(phrase.text, style="" if phrase.is_good else "yellow")

@@ -1,0 +1,224 @@
+"""A status in words: one source for the screen of ``uavlinkd status`` and for the page of ``uavlinkd web``."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import chain
+from typing import Any, Final, NamedTuple
+
+from uavlinkd.core.drops import DropReason, Reason
+from uavlinkd.mavlink.egress.lanes import EgressDrop
+from uavlinkd.mavlink.frames import FrameFault
+from uavlinkd.mavlink.policy.gate import Refusal
+from uavlinkd.ops.findings import LinkProblem
+from uavlinkd.relay.forwarding import RelayReason
+from uavlinkd.system.error_meanings import meaning_of
+
+Status = dict[str, Any]
+Count = tuple[str, int]
+"""A reason in plain words, and how often."""
+
+ENDPOINT_FAILURES: Final[Mapping[str, str]] = {
+    "unsent": "unsent frames",
+    "outgoing_full": "frames above the queue's limit",
+    "stale": "frames that waited too long",
+    "thinned": "frames replaced by newer ones",
+    "disconnected": "disconnected",
+    "stalled": "stalled connections",
+    "too_many_clients": "clients above the limit",
+    "displaced": "silent clients replaced",
+    "http": "web browsers",
+    "connect_timeout": "attempts without an answer",
+    "not_resolved": "attempts without an address",
+    "family_unavailable": "addresses of an unavailable family",
+    "stranger": "datagrams of another address",
+}
+"""Errors of an endpoint that the daemon names itself; the others are names of the kernel."""
+_NOT_USABLE: Final = {"unanswered": "no answer", "loss": "loss", "network": "no network"}
+"""Why a path is not usable, in plain words."""
+_COPIES: Final = frozenset[str]({DropReason.DUPLICATE, DropReason.LATE_COPY})
+"""What several paths cause all the time."""
+_SHOWN_REASONS: Final = 3
+_SHOWN_NAMES: Final = 8
+
+
+class Phrase(NamedTuple):
+    """A part of the headline."""
+
+    text: str
+    is_good: bool
+
+
+class ProblemLine(NamedTuple):
+    """One line: a cause and its remedy, of all that have the same problem."""
+
+    severity: str
+    names: list[str]
+    who: str
+    """The peers or endpoints, in words; empty for the daemon."""
+    text: str
+    remedy: str
+
+
+def headline(status: Status) -> Iterator[Phrase]:
+    """How many are up, and what stops frames although they are."""
+    peers = status["peers"].values()
+    relay = status["relay"]
+    counts = []
+    if peers or relay is None:
+        counts.append(f"{sum(peer['state'] == 'up' for peer in peers)} of {len(peers)} peers up")
+    if relay is not None:
+        members = relay["members"].values()
+        counts.append(f"relay: {sum(member['is_up'] for member in members)} of {len(members)} members up")
+    yield Phrase(", ".join(counts), status["frames_pass"])
+    for blocked in status["blocked"]:
+        towards = "from" if blocked["direction"] == "in" else "to"
+        yield Phrase(f"all frames {towards} {blocked['name']} are refused", False)
+    if status["has_no_client"]:
+        yield Phrase("no endpoint has a client", False)
+    for key, words in (
+        ("contested", "two machines use one key with"),
+        ("stopped_there", "frames stop, as reported by"),
+    ):
+        if status[key]:
+            yield Phrase(f"{words} {some(status[key])}", False)
+
+
+def problems(findings: Iterable[Mapping[str, str]]) -> list[ProblemLine]:
+    """A line per problem, security first. A problem of several, such as a silent relay, is one line."""
+    several: dict[tuple[str, ...], list[str]] = {}
+    for finding in findings:
+        key = tuple(finding[field] for field in ("severity", "subject", "text", "remedy"))
+        several.setdefault(key, []).append(finding["name"])
+    prefixes = {"peer": "", "endpoint": "endpoint "}
+    return [
+        ProblemLine(severity, names, prefixes[subject] + some(names) if subject in prefixes else "", text, remedy)
+        for (severity, subject, text, remedy), names in several.items()
+    ]
+
+
+def some(names: Sequence[str]) -> str:
+    more = f" and {len(names) - _SHOWN_NAMES} more" if len(names) > _SHOWN_NAMES else ""
+    return ", ".join(names[:_SHOWN_NAMES]) + more
+
+
+def fleet_line(fleet: Status) -> Phrase:
+    """This daemon in its fleet, with the peers whose bulletin has another number."""
+    number, who = fleet["number"], f"{fleet['name']}, {fleet['role']}, serial {fleet['serial']}"
+    text = f"fleet {fleet['fleet']}: {who}; bulletin {number}"
+    other = [f"{name} has {its}" for name, its in fleet["bulletins"].items() if its not in (None, number)]
+    return Phrase(f"{text}, but {some(other)}", False) if other else Phrase(text, True)
+
+
+def used_relay(name: str, relay: Status) -> Phrase:
+    """A relay that this daemon uses, with the state of each peer there."""
+    time_s = relay["round_trip_s"]
+    measured = "" if time_s is None else f", {1000 * time_s:.0f} ms"
+    peers = ", ".join(f"{peer} {state}" for peer, state in relay["peers"].items()) or "no peer uses it"
+    is_well = relay["state"] == "up" and "unanswered" not in relay["peers"].values()
+    role = "" if relay["peer"] is None else f", also the peer {relay['peer']}"
+    by_tls = " by TLS" if relay["state"] == "up" and relay["paths"][0]["network"] == "TLS" else ""
+    return Phrase(f"relay {name}{role}: {relay['state']}{by_tls}{measured}; {peers}", is_well)
+
+
+def other_losses(status: Status) -> Iterator[str]:
+    """What was dropped and is in no line of a peer or endpoint."""
+    relay = status["relay"]
+    if relay is not None and (text := listed(by_count(relay["dropped"], DropReason, RelayReason))):
+        yield f"not forwarded: {text}"
+    if dropped := listed(by_count(status["drops"], DropReason)):
+        yield f"dropped, from no known peer: {dropped}"
+    for error, count in ranked(list(status["send_failures"].items()))[:_SHOWN_REASONS]:
+        yield f"not sent: {count:,}, because {meaning_of(error) or error}"
+    if stale := sum(status["stale"].values()):
+        yield f"dropped after a pause of the daemon: {stale:,} frames"
+
+
+def path_state(path: Status) -> str:
+    """The role of a usable path; of another one, what is wrong."""
+    if path["state"] == "usable":
+        return str(path["role"])
+    reason = _NOT_USABLE.get(path["reason"])
+    return f"{path['state']}: {reason}" if reason else str(path["state"])
+
+
+def carried(path: Status) -> str:
+    """The classes of frames that go along a path now."""
+    return "all" if len(path["carries"]) == 3 else "+".join(path["carries"]) or "-"
+
+
+def repair_line(repair: Status) -> str:
+    """What the repair of a lossy link does. Its duration is in the status."""
+    kilobytes = f"{repair['bytes'] / 1000:,.0f} kB repeated so far"
+    return f"sends critical frames {repair['transmissions']} times; {kilobytes}"
+
+
+def radio_line(line: Status) -> str:
+    """What is known about the radio behind a serial device. Pairs of numbers are here/there."""
+    parts = [f"up to {line['rate_bits_s']:,} bits/s", f"{line['line_noise']:,} damaged"]
+    if (radio := line["radio"]) is not None:
+        parts += [
+            f"rssi {radio['rssi']}/{radio['remrssi']}",
+            f"noise {radio['noise']}/{radio['remnoise']}",
+            f"modem {100 - radio['txbuf']} % full" if radio["txbuf"] <= 100 else "modem's queue unknown",
+        ]
+    return ", ".join(parts)
+
+
+# What was dropped or refused.
+
+
+def peer_drops(peer: Status) -> list[Count]:
+    """All reasons of a peer. Missing envelopes are in its losses."""
+    return [
+        *by_count({reason: count for reason, count in peer["drops"].items() if reason not in _COPIES}, DropReason),
+        *by_count(peer["malformed"], FrameFault),
+        *by_count(peer["waiting_dropped"], EgressDrop),
+        *by_count(_refused(peer), Refusal),
+        *((problem.phrase, peer[problem]) for problem in LinkProblem if problem.phrase and peer[problem]),
+    ]
+
+
+def endpoint_drops(endpoint: Status) -> list[Count]:
+    """All reasons of a local endpoint."""
+    return (
+        by_count(endpoint["faults"], FrameFault)
+        + by_count(endpoint["failures"])
+        + by_count(_refused(endpoint), Refusal)
+    )
+
+
+def _refused(part: Status) -> dict[str, int]:
+    sums = Counter[str]()
+    for messages in part["refused"].values():
+        for reasons in messages.values():
+            sums.update(reasons)
+    return sums
+
+
+def phrase(code: str, *lists: Iterable[Reason]) -> str:
+    """A reason in plain words, for a count in front; an error of the kernel in the system's words."""
+    for reason in chain(*lists):
+        if reason == code:
+            return reason.phrase
+    if code in ENDPOINT_FAILURES:
+        return ENDPOINT_FAILURES[code]
+    return os.strerror(getattr(errno, code)).lower() if hasattr(errno, code) else code.replace("_", " ")
+
+
+def by_count(counts: Mapping[str, int], *lists: Iterable[Reason]) -> list[Count]:
+    return [(phrase(code, *lists), count) for code, count in counts.items() if count]
+
+
+def ranked(counts: list[Count]) -> list[Count]:
+    """The most frequent reasons first, after hidden frames: a captured member could hide these by other refusals."""
+    return sorted(counts, key=lambda item: (item[0] != Refusal.HIDDEN_FRAME.phrase, -item[1]))
+
+
+def listed(counts: list[Count]) -> str:
+    ordered = ranked(counts)
+    text = ", ".join(f"{count:,} {reason}" for reason, count in ordered[:_SHOWN_REASONS])
+    return text + (", …" if len(ordered) > _SHOWN_REASONS else "")
