@@ -157,6 +157,10 @@ class Conditions(Generic[K]):
     def __contains__(self, key: K) -> bool:
         return key in self._open
 
+    def logged(self) -> list[tuple[K, OpenCondition]]:
+        """The open conditions whose first line was written."""
+        return [(key, condition) for key, condition in self._open.items() if condition.is_logged]
+
     def note(self, key: K, now: float, count: int = 1) -> None:
         """The condition occurs now: ``count`` times, or still."""
         condition = self._open.get(key)

@@ -21,7 +21,7 @@ from uavlinkd.link.local_endpoints import PilotNotes
 from uavlinkd.link.own_problems import own_codes
 from uavlinkd.link.parts import DaemonParts
 from uavlinkd.link.peer_link import radio_figures
-from uavlinkd.link.status import daemon_status, paths_status, state_of
+from uavlinkd.link.status import daemon_status, overview, paths_status, state_of
 from uavlinkd.link.traffic_problems import has_no_client
 from uavlinkd.mavlink.own_frames import INTERVAL_S
 from uavlinkd.ops import LOG_SCHEMA
@@ -159,6 +159,10 @@ class Daemon:
         match request.partition(" "):
             case ("status", "", ""):
                 return daemon_status(parts, monotonic())
+            case ("overview", _, names):
+                return overview(parts, monotonic(), names.split())
+            case ("problems", "", ""):
+                return {"problems": parts.events.problems(monotonic())}
             case ("reload", "", ""):
                 try:
                     await self.reload()
@@ -262,7 +266,7 @@ class Daemon:
 
     def _report(self, now: float) -> None:
         parts, links = self.parts, self.parts.links.values()
-        findings = find(parts, now)
+        findings = parts.findings = find(parts, now)
         parts.events.write_findings(findings, now)
         codes = own_codes(findings, is_cut_off=has_no_client(findings, len(parts.local.endpoints)))
         for link in links:

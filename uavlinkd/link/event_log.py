@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterable, Mapping
 from typing import Final, NamedTuple
 
@@ -20,6 +20,8 @@ FINDING_DELAY_S = 2.0
 of unverified freshness, which 1 % of loss causes about once a day."""
 ENDPOINT_DELAY_S = 15.0
 """The same for an endpoint: its client may restart."""
+ENDED_PROBLEMS = 100
+"""So many findings that ended are kept for a page that shows them."""
 FINDING_QUIET_S = 10.0
 """A finding has ended when it was absent for so long, see :data:`uavlinkd.link.conditions.QUIET_S`."""
 
@@ -44,6 +46,7 @@ class EventLog:
         self._watches = defaultdict[str, LinkWatch](LinkWatch)  # by name in the core
         self._findings: dict[_FindingKey, Finding] = {}
         self._present: dict[_FindingKey, float] = {}  # since when
+        self._ended = deque[tuple[Finding, float, float]](maxlen=ENDED_PROBLEMS)  # when they began and ended
         self._forgotten: Counter[LinkProblem] = Counter()  # problems of peers that were removed
         self._problem_conditions = Conditions[tuple[str, LinkProblem]](
             "link", self._limits, self._write_problem, lambda key: (key[0], key[1] is LinkProblem.PATHS_UNPROVEN)
@@ -216,11 +219,20 @@ class EventLog:
                 self._finding_conditions.note(key, now)
         self._present = present
 
+    def problems(self, now: float) -> list[dict[str, object]]:
+        """The findings of the log that last, and the latest that ended. ``began_s`` and ``ended_s`` are ages."""
+        lasting = ((self._findings[key], one.began_at, None) for key, one in self._finding_conditions.logged())
+        return [
+            {**finding.as_json(), "began_s": now - began, "ended_s": None if ended is None else now - ended}
+            for finding, began, ended in (*self._ended, *lasting)
+        ]
+
     def _write_finding(
         self, key: _FindingKey, phase: Phase, condition: OpenCondition, omitted: dict[str, int]
     ) -> None:
         finding = self._findings[key]
         if phase is Phase.ENDED:
+            self._ended.append((finding, condition.began_at, condition.seen_at))
             facts = {field: fact for field, fact in finding.as_json().items() if field not in ("text", "remedy")}
             self._log.info("problem_ended", **facts, duration_s=condition.duration_s, **omitted)
             return

@@ -26,6 +26,7 @@ from uavlinkd.link.relays import Relays
 from uavlinkd.link.switch import Switch
 from uavlinkd.mavlink.payloads import screen
 from uavlinkd.mavlink.routing import Router
+from uavlinkd.ops.findings import Finding
 from uavlinkd.ops.recorder import Recorder
 from uavlinkd.relay.service import RelayService, RelayShell
 from uavlinkd.system.clock import monotonic
@@ -56,6 +57,8 @@ class DaemonParts:
         self.drops = DropSummary(log, limits)
         self.evidence = Evidence(self.links, config.public_key, relay_links)
         self.history = History(now)
+        self.findings: list[Finding] = []
+        """Those of the last look, at most a second ago."""
         self.stall = StallWatch(now, self._on_pause)
         self.peer_sockets = sockets = PeerSockets(self.stall, self.drops, self.evidence, log, node)
         self.events = EventLog(log, limits, sockets.network_name)

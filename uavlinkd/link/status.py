@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 from uavlinkd.authority.enrolment import fingerprint_of
@@ -22,12 +22,21 @@ from uavlinkd.mavlink.dialect import command_name, name_of
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import ANY_OTHER, REFUSALS, Refusal
 from uavlinkd.ops import STATUS_SCHEMA
+from uavlinkd.ops.findings import Finding
 from uavlinkd.ops.log import shown
 from uavlinkd.relay.service import RelayMember, RelayService
 from uavlinkd.system.addresses import Address
 
 WayOf = Callable[[Path], tuple[str | None, SocketAddress | None]]
 """The name of a path's network, if the configuration names any, and the relay's address along a relayed path."""
+
+
+def overview(daemon: DaemonParts, now: float, detailed: Collection[str]) -> dict[str, object]:
+    """The status with few facts of each peer, except of those that ``detailed`` names; findings are up to 1 s old.
+
+    A page that 200 peers are on asks for it every second: the whole status would cost several percent of a core.
+    """
+    return _status(daemon, now, daemon.findings, detailed)
 
 
 def daemon_status(daemon: DaemonParts, now: float) -> dict[str, object]:
@@ -38,8 +47,14 @@ def daemon_status(daemon: DaemonParts, now: float) -> dict[str, object]:
     (``contested``). ``stopped_there``: peers that say so of themselves; that is a claim, and health checks act on
     ``frames_pass``.
     """
+    return _status(daemon, now, find(daemon, now), daemon.links)
+
+
+def _status(
+    daemon: DaemonParts, now: float, findings: Sequence[Finding], detailed: Collection[str]
+) -> dict[str, object]:
     node = daemon.node
-    blocked, findings = daemon.history.blocked(now), find(daemon, now)
+    blocked = daemon.history.blocked(now)
     is_cut_off = has_no_client(findings, len(daemon.local.endpoints))
     contested = [name for name, link in daemon.links.items() if is_contested(link.peer, now)]
     all_up = (bool(daemon.links) or daemon.config.is_only_relay) and all(
@@ -56,7 +71,10 @@ def daemon_status(daemon: DaemonParts, now: float) -> dict[str, object]:
         "contested": contested,
         "stopped_there": [name for name, link in daemon.links.items() if stops_frames(link.peer, now)],
         "findings": [finding.as_json() for finding in findings],
-        "peers": {name: peer_status(link, now, daemon.peer_sockets.way_of) for name, link in daemon.links.items()},
+        "peers": {
+            name: (peer_status if name in detailed else _few_facts)(link, now, daemon.peer_sockets.way_of)
+            for name, link in daemon.links.items()
+        },
         "relays": {name: used_relay_status(relay, daemon, now) for name, relay in daemon.relays.by_name.items()},
         "fleet": None if daemon.fleet is None else fleet_status(daemon.fleet, daemon.links, now),
         "networks": daemon.peer_sockets.network_status(now),
@@ -118,24 +136,35 @@ def fleet_status(fleet: FleetMembers, links: Mapping[str, PeerLink], now: float)
     }
 
 
+def _few_facts(link: PeerLink, now: float, way_of: WayOf) -> dict[str, object]:
+    """What a table of peers shows."""
+    return _peer_now(link, now) | {"paths": [_path_now(link, state, way_of) for state in _best_first(link)]}
+
+
+def _peer_now(link: PeerLink, now: float) -> dict[str, object]:
+    peer, figures, (bytes_in_s, bytes_out_s) = link.peer, link.figures, link.rates.of(link.peer)
+    return {
+        "state": state_of(peer),
+        "path": None if peer.path is None else shown(peer.path.address),
+        "last_received_s": _age(peer.received_at, now),
+        "round_trip_s": link.round_trip_s,
+        "loss_in": figures.loss_in,
+        "loss_out": figures.loss_out,
+        "bytes_in_s": bytes_in_s,
+        "bytes_out_s": bytes_out_s,
+    }
+
+
 def peer_status(link: PeerLink, now: float, way_of: WayOf) -> dict[str, object]:
     """The status of a peer."""
-    peer, figures = link.peer, link.figures
+    peer = link.peer
     session = peer.sessions.current
     traffic = peer.traffic
     expected_there, received_there = traffic.reported
-    return {
-        "state": state_of(peer),
+    return _peer_now(link, now) | {
         "public_key": encode_key(peer.settings.public_key),
-        "path": None if peer.path is None else shown(peer.path.address),
-        "last_received_s": _age(peer.received_at, now),
         "handshake_s": _age(peer.established_at, now),
-        "round_trip_s": link.round_trip_s,
         "freshness_unverified_s": _age(peer.unverified_since, now),
-        "loss_in": figures.loss_in,
-        "loss_out": figures.loss_out,
-        "bytes_in_s": link.rates.of(peer)[0],
-        "bytes_out_s": link.rates.of(peer)[1],
         "paths": paths_status(link, way_of, now),
         "session": None
         if session is None
@@ -288,35 +317,43 @@ def paths_status(link: PeerLink | RelayLink, way_of: WayOf, now: float) -> list[
     is known, and is below 256. ``relay`` is the one through which it leads, and ``relay_address`` where it is
     reached; null for a direct path.
     """
+    return [_path_status(link, state, way_of, now) for state in _best_first(link)]
+
+
+def _best_first(link: PeerLink | RelayLink) -> list[PathState]:
     paths = link.peer.paths
-    states = sorted(paths.states, key=lambda state: state is not paths.best)
-    return [_path_status(link, state, way_of, now) for state in states]
+    return sorted(paths.states, key=lambda state: state is not paths.best)
+
+
+def _path_now(link: PeerLink | RelayLink, state: PathState, way_of: WayOf) -> dict[str, object]:
+    bytes_in_s, bytes_out_s = link.rates.of(state)
+    return {
+        "number": state.number,
+        "network": way_of(state.path)[0],
+        "address": shown(state.path.address),
+        "relay": relay_name(state.path.address),
+        "state": state.condition.value,
+        "reason": state.reason,
+        "role": link.peer.paths.role(state),
+        "round_trip_s": state.srtt_s,
+        "loss_in": state.loss_in,
+        "loss_out": state.loss_out,
+        "bytes_in_s": bytes_in_s,
+        "bytes_out_s": bytes_out_s,
+    }
 
 
 def _path_status(link: PeerLink | RelayLink, state: PathState, way_of: WayOf, now: float) -> dict[str, object]:
     peer = link.peer
-    bytes_in_s, bytes_out_s = link.rates.of(state)
-    network, relay_address = way_of(state.path)
-    return {
-        "number": state.number,
-        "network": network,
-        "address": shown(state.path.address),
-        "relay": relay_name(state.path.address),
+    relay_address = way_of(state.path)[1]
+    return _path_now(link, state, way_of) | {
         "relay_address": None if relay_address is None else str(Address.of(relay_address)),
         "is_configured": state.is_configured,
-        "state": state.condition.value,
-        "reason": state.reason,
         "state_s": now - state.since,
-        "role": peer.paths.role(state),
         "carries": [cls.value for cls, route in peer.paths.routes.items() if peer.is_up and state in route],
         "answered_s": now - state.answered_at if state.is_validated else None,
-        "round_trip_s": state.srtt_s,
         "jitter_s": state.rttvar_s,
-        "loss_in": state.loss_in,
-        "loss_out": state.loss_out,
         "lag_s": state.lag_s(now),
-        "bytes_in_s": bytes_in_s,
-        "bytes_out_s": bytes_out_s,
         "bytes_received": state.bytes_received,
         "bytes_sent": state.bytes_sent,
         "datagrams_received": state.datagrams_received,
