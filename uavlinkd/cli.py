@@ -18,6 +18,7 @@ from uavlinkd.core.constants import PROTOCOL_NAME
 from uavlinkd.fleet.commands import add_parser as add_fleet
 from uavlinkd.ops.commands import add_parsers as add_daemon_commands
 from uavlinkd.system.terminal import FAILED, OK, CommandError, UsageError, printable
+from uavlinkd.web.commands import add_parser as add_web
 
 _LINE_LIMIT = 4096
 OF_THE_LABORATORY = {
@@ -139,6 +140,7 @@ def make_parser() -> argparse.ArgumentParser:
     relay = add("relay", _run, "run a relay: it passes datagrams between its members, and cannot forge them")
     relay.set_defaults(is_relay=True)
     add_daemon_commands(commands)
+    add_web(commands)
     check = add("check", _check, "check a configuration and show its effect")
     for command in (run, relay, check):
         command.add_argument("--config", metavar="FILE", type=Path, required=True)

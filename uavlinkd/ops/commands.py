@@ -23,25 +23,31 @@ WATCH_INTERVAL_S = 1.0
 
 
 def add_parsers(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    status = _add(commands, "status", _status, "show a daemon's links and problems; exit status 0 if frames can pass")
+    status = for_daemon(
+        commands, "status", _status, "show a daemon's links and problems; exit status 0 if frames can pass"
+    )
     form = status.add_mutually_exclusive_group()
     form.add_argument("--watch", action="store_true", help="refresh each second until interrupted")
     form.add_argument("--json", action="store_true", help="print everything as JSON, one line per daemon")
-    _add(commands, "reload", _reload, "make a daemon read its configuration again")
-    peer = _add(commands, "peer", _peer_list, "list a daemon's peers and their keys")
+    for_daemon(commands, "reload", _reload, "make a daemon read its configuration again")
+    peer = for_daemon(commands, "peer", _peer_list, "list a daemon's peers and their keys")
     peer.add_argument("action", choices=["list"])
-    ping = _add(commands, "ping", _ping, "ask along each path to a peer, and show which answer and carry frames")
+    ping = for_daemon(
+        commands, "ping", _ping, "ask along each path to a peer, and show which answer and carry frames"
+    )
     ping.add_argument("peer", metavar="PEER", help="its name in the daemon's configuration")
     ping.add_argument(
         "--count", metavar="N", type=int, default=5, help="questions, one a second (default: %(default)s)"
     )
-    _add(commands, "netcheck", _netcheck, "show whether UDP gets out, how relays see this machine, and its NAT")
-    report = _add(commands, "report", _report, "write one file for a support request, without keys and addresses")
+    for_daemon(commands, "netcheck", _netcheck, "show whether UDP gets out, how relays see this machine, and its NAT")
+    report = for_daemon(
+        commands, "report", _report, "write one file for a support request, without keys and addresses"
+    )
     report.add_argument("--out", metavar="FILE", type=Path, help="where to write it (default: a name with the time)")
     report.add_argument("--yes", action="store_true", help="write it without showing it first")
 
 
-def _add(
+def for_daemon(
     commands: argparse._SubParsersAction[argparse.ArgumentParser],
     name: str,
     function: Callable[[argparse.Namespace], int],

@@ -1,0 +1,48 @@
+"""The page's resources: the document with its script and style, and the events of a browser."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import Response, StreamingResponse
+from starlette.routing import Route
+
+from uavlinkd.web.watch import Watch
+
+_TYPES = {"page.js": "text/javascript", "page.css": "text/css", "icon.svg": "image/svg+xml"}
+
+
+def make_app(watch: Watch) -> Starlette:
+    """The resources. Their content is read once: no path of a request leads to a file."""
+    folder = files("uavlinkd.web") / "static"
+
+    def resource(name: str, media_type: str) -> Response:
+        return Response((folder / name).read_bytes(), media_type=media_type)
+
+    page = resource("index.html", "text/html")
+
+    async def show(_: Request) -> Response:
+        return page
+
+    async def events(request: Request) -> Response:
+        peer = request.query_params.get("peer", "")
+        return StreamingResponse(watch.messages(peer), media_type="text/event-stream")
+
+    def fixed(name: str, media_type: str) -> Route:
+        content = resource(name, media_type)
+
+        async def answer(_: Request) -> Response:
+            return content
+
+        return Route(f"/{name}", answer)
+
+    return Starlette(
+        routes=[
+            Route("/", show),
+            Route("/peer/{name}", show),
+            Route("/events", events),
+            *(fixed(*item) for item in _TYPES.items()),
+        ]
+    )

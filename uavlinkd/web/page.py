@@ -1,0 +1,57 @@
+"""The page of one daemon: what asks the daemon, what answers browsers, and the socket at which it does."""
+
+from __future__ import annotations
+
+import asyncio
+import ssl
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from uavlinkd.endpoints.tcp import tcp_listener
+from uavlinkd.ops.control import ask
+from uavlinkd.system.addresses import Address
+from uavlinkd.system.clock import monotonic
+from uavlinkd.web.app import make_app
+from uavlinkd.web.guard import Guard
+from uavlinkd.web.server import WebServer
+from uavlinkd.web.watch import PATIENCE_S, Watch
+
+
+class Page:
+    """Listens from the start on. Raises BindError if the address cannot be used."""
+
+    def __init__(
+        self,
+        control_socket: Path,
+        address: Address,
+        names: frozenset[str] = frozenset(),
+        password_hash: bytes | None = None,
+        tls: ssl.SSLContext | None = None,
+    ) -> None:
+        async def ask_daemon(request: str) -> dict[str, Any]:
+            return await asyncio.to_thread(ask, control_socket, request, PATIENCE_S)
+
+        self._watch = Watch(ask_daemon)
+        self._listener = tcp_listener(address)
+        self._scheme = "http" if tls is None else "https"
+        app = Guard(make_app(self._watch), names, password_hash, monotonic)
+        self._server = WebServer(app, self._listener, tls)
+
+    def __enter__(self) -> Page:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._listener.close()
+
+    @property
+    def url(self) -> str:
+        return f"{self._scheme}://{Address(*self._listener.getsockname()[:2])}/"
+
+    async def run(self) -> None:
+        """Serve until cancelled."""
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(self._watch.run())
+            tasks.create_task(self._server.run())

@@ -1,0 +1,172 @@
+"""What a browser shows of a status: plain values and finished sentences, which the page sets as text."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Final
+
+from uavlinkd.mavlink.policy.gate import Refusal
+from uavlinkd.ops import status_words as words
+from uavlinkd.ops.netcheck import addresses
+from uavlinkd.ops.status_words import Status
+
+MOST_CARDS: Final = 4
+"""With more peers, the first page has a table of them."""
+PathKey = tuple[str, int]
+"""Peer and number of a path."""
+_WORDS: Final = {"security": "attack", "fault": "blocked", "warning": "warning"}
+_SHOWN_REFUSALS: Final = 30
+
+
+def paths_of(status: Status) -> Iterator[tuple[PathKey, tuple[float | None, float, float]]]:
+    """Round trip in seconds, worse of the two losses, and bytes a second in both directions, of each path."""
+    for name, peer in status["peers"].items():
+        for path in peer["paths"]:
+            loss, rate = max(path["loss_in"], path["loss_out"]), path["bytes_in_s"] + path["bytes_out_s"]
+            yield (name, path["number"]), (path["round_trip_s"], round(loss, 4), round(rate))
+
+
+def view(status: Status, past: Sequence[Mapping[str, Any]], peer: str) -> dict[str, Any]:
+    """The whole page, or that of one peer. ``past``: the problems of the log."""
+    lines = words.problems(status["findings"])
+    states = dict(_states(status, lines))
+    names = [peer] if peer else list(states) if len(states) <= MOST_CARDS else []
+    facts: dict[str, Any] = {
+        "daemon": status["name"],
+        "headline": [part._asdict() for part in words.headline(status)],
+        "problems": [line._asdict() for line in lines if not peer or peer in line.names],
+        "past": [line for line in past if not peer or line["name"] == peer],
+        "cards": [card(name, status["peers"][name], states[name]) for name in names if name in states],
+        "count": len(states),
+    }
+    if peer:
+        return facts
+    relay, fleet = status["relay"], status["fleet"]
+    return facts | {
+        "rows": [] if names else [row(name, status["peers"][name], word) for name, word in states.items()],
+        "members": [] if relay is None else [_member(*item) for item in relay["members"].items()],
+        "endpoints": [_endpoint(*item) for item in status["endpoints"].items()],
+        "networks": [_network(*item) for item in status["networks"].items()],
+        "lines": [
+            *([] if fleet is None else [words.fleet_line(fleet)._asdict()]),
+            *(words.used_relay(*item)._asdict() for item in status["relays"].items()),
+            *({"text": text, "is_good": False} for text in words.other_losses(status)),
+        ],
+    }
+
+
+def _states(status: Status, lines: Sequence[words.ProblemLine]) -> Iterator[tuple[str, str]]:
+    """The word for each peer, the broken ones first."""
+    worst: dict[str, str] = {}
+    for line in lines:  # the most severe first
+        for name in line.names:
+            worst.setdefault(name, line.severity)
+    found = {}
+    for name, peer in status["peers"].items():
+        severity = worst.get(name)
+        if peer["state"] == "up" or severity == "security":
+            found[name] = _WORDS[severity] if severity else "up"
+        else:
+            found[name] = peer["state"]
+    order = ("attack", "lost", "waiting", "blocked", "warning", "up")
+    yield from sorted(found.items(), key=lambda item: (order.index(item[1]), item[0]))
+
+
+def row(name: str, peer: Status, word: str) -> list[Any]:
+    """A peer in the table."""
+    return [name, word, *_figures(peer), peer["path"], len(peer["paths"])]
+
+
+def _figures(part: Status) -> list[float | None]:
+    silent_s, time_s = part["last_received_s"], part["round_trip_s"]
+    return [
+        None if silent_s is None else round(silent_s, 1),
+        None if time_s is None else round(time_s, 4),
+        round(max(part["loss_in"], part["loss_out"]), 3),
+        round(part["bytes_in_s"]),
+        round(part["bytes_out_s"]),
+    ]
+
+
+def card(name: str, peer: Status, word: str) -> dict[str, Any]:
+    """Everything about one peer. A daemon that was not asked for its details has told only a few facts."""
+    facts: dict[str, Any] = {"name": name, "word": word, "figures": _figures(peer)}
+    if "session" not in peer:
+        return facts | {"paths": [], "facts": [], "refused": [], "dropped": [], "reported": []}
+    session = peer["session"] or {}
+    return facts | {
+        "paths": [
+            _path(path, address) for path, address in zip(peer["paths"], addresses(peer["paths"]), strict=True)
+        ],
+        "facts": [
+            ["role", peer["role"] or "none"],
+            ["key exchange", session.get("suite", "no session")],
+            ["mode", session.get("mode", "-")],
+            ["public key", peer["public_key"]],
+            *([["repair", words.repair_line(peer["repair"])]] if peer["repair"]["is_on"] else []),
+        ],
+        "refused": sorted(_refused(peer), key=lambda item: -item[3])[:_SHOWN_REFUSALS],
+        "dropped": words.ranked(words.peer_drops(peer)),
+        "reported": [_reported(claim) for claim in peer["refused_there"]],
+    }
+
+
+def _path(path: Status, address: str) -> dict[str, Any]:
+    return {
+        "number": path["number"],
+        "network": path["network"] or "",
+        "address": address,
+        "way": "direct" if path["relay"] is None else f"relay {path['relay']}",
+        "condition": path["state"],
+        "state": words.path_state(path),
+        "carries": words.carried(path),
+        "rtt": path["round_trip_s"],
+        "jitter": path["jitter_s"],
+        "loss": [path["loss_in"], path["loss_out"]],
+        "rate": [path["bytes_in_s"], path["bytes_out_s"]],
+    }
+
+
+def _refused(peer: Status) -> Iterator[tuple[str, str, str, int]]:
+    """Direction, message or command, reason and count."""
+    for kind in ("refused", "refused_commands"):
+        for direction, messages in peer[kind].items():
+            for message, reasons in messages.items():
+                for reason, count in reasons.items():
+                    yield direction, message, words.phrase(reason, Refusal), count
+
+
+def _reported(claim: Mapping[str, Any]) -> str:
+    what = " ".join(filter(None, (claim["message"], claim["command"])))
+    return f"it refused {what} {claim['count']:,} times: {claim['reason'].replace('_', ' ')}"
+
+
+def _member(name: str, member: Status) -> list[Any]:
+    return [
+        name,
+        "up" if member["is_up"] else "lost",
+        round(member["since_s"]),
+        ", ".join(dict.fromkeys(member["addresses"])),
+        *(member[key] for key in ("bound", "waiting", "datagrams", "over_limit")),
+    ]
+
+
+def _endpoint(name: str, endpoint: Status) -> dict[str, Any]:
+    return {
+        "name": name,
+        "clients": [[address, client["last_received_s"]] for address, client in endpoint["clients"].items()],
+        "frames": [endpoint["frames_received"], endpoint["frames_sent"]],
+        "problems": words.listed(words.endpoint_drops(endpoint)),
+    }
+
+
+def _network(name: str, network: Status) -> dict[str, Any]:
+    line = network["serial"]
+    here = ", ".join(network["addresses"]) if line is None else words.radio_line(line)
+    return {
+        "name": name,
+        "exit": network["interface"] or network["address"] or f"{line['device']} at {line['baud']} baud",
+        "is_metered": network["is_metered"],
+        "is_present": network["is_present"],
+        "text": here if network["is_present"] else f"absent: {network['absent_because']}",
+    }

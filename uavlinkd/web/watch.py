@@ -1,0 +1,143 @@
+"""What the page knows of its daemon: the latest answer, the past ten minutes of each path, and the log's problems."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections import Counter, deque
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any, Final
+
+from uavlinkd.ops.control import ControlError
+from uavlinkd.system.clock import monotonic
+from uavlinkd.web.view import MOST_CARDS, PathKey, Status, paths_of, view
+
+SHORTEST_S: Final = 0.5
+"""Between two questions to the daemon, while a browser looks."""
+LONGEST_S: Final = 1.5
+"""A daemon that does not answer is shown as lost within this and :data:`PATIENCE_S`, less than 3 s."""
+PATIENCE_S: Final = 1.2
+SHARE: Final = 0.01
+"""Of the time, the daemon may need so much for the answers."""
+SAMPLE_S: Final = 4.0
+"""Between two points of a plot; also between two questions while no browser looks."""
+SAMPLES: Final = 150
+"""Ten minutes."""
+
+Ask = Callable[[str], Awaitable[dict[str, Any]]]
+Sample = Mapping[PathKey, tuple[float | None, float, float]]
+
+
+class Watch:
+    """Asks the daemon at the pace that its answers allow, and hands each browser the latest message."""
+
+    def __init__(self, ask: Ask) -> None:
+        self._ask = ask
+        self._status: Status | None = None
+        self._lost: str | None = "the daemon has not answered yet"
+        self._problems: list[dict[str, Any]] = []
+        self._samples = deque[Sample](maxlen=SAMPLES)
+        self._sampled_at = -SAMPLE_S
+        self._viewers = Counter[str]()  # by the peer that they look at; the whole page is ""
+        self._number = 0
+        self._changed = asyncio.Condition()
+        self._wanted = asyncio.Event()
+        self._messages: dict[str, bytes] = {}  # of the present number
+
+    async def run(self) -> None:
+        """Ask until cancelled."""
+        while True:
+            began = monotonic()
+            await self._look(began)
+            async with self._changed:
+                self._number += 1
+                self._messages.clear()
+                self._changed.notify_all()
+            took = monotonic() - began
+            pause_s = min(LONGEST_S, max(SHORTEST_S, took / SHARE)) - took
+            if self._viewers:
+                await asyncio.sleep(max(0.0, pause_s))
+            else:
+                await self._idle(SAMPLE_S - took)
+
+    async def _idle(self, seconds: float) -> None:
+        """Wait, but not once a browser looks."""
+        self._wanted.clear()
+        try:
+            async with asyncio.timeout(max(0.0, seconds)):
+                await self._wanted.wait()
+        except TimeoutError:
+            pass
+
+    async def _look(self, now: float) -> None:
+        detailed = self._detailed()
+        try:
+            self._status = await self._ask(" ".join(["overview", *detailed]))
+            if now - self._sampled_at >= SAMPLE_S:
+                self._problems = (await self._ask("problems"))["problems"]
+                self._samples.append({key: figures for key, figures in paths_of(self._status)})
+                self._sampled_at = now
+        except ControlError as error:
+            self._lost = str(error)
+        else:
+            self._lost = None
+            if set(detailed) != set(self._detailed()):  # the first answer named the peers
+                await self._look(now)
+
+    def _detailed(self) -> list[str]:
+        """The peers of which a browser shows everything."""
+        peers = [] if self._status is None else list(self._status["peers"])
+        return peers if len(peers) <= MOST_CARDS else [name for name in self._viewers if name in peers][:MOST_CARDS]
+
+    @contextmanager
+    def _viewer(self, peer: str) -> Iterator[None]:
+        self._viewers[peer] += 1
+        self._wanted.set()
+        try:
+            yield
+        finally:
+            self._viewers[peer] -= 1
+            self._viewers += Counter()  # forgets those without a viewer
+
+    async def messages(self, peer: str) -> AsyncIterator[bytes]:
+        """The events of one browser, which looks at one peer, or at the whole page if that is empty.
+
+        A browser that is slow gets the latest message when it has read the one before: the others are left out.
+        """
+        with self._viewer(peer):
+            yield b"retry: 1000\n\n" + _event("history", self._history(peer))
+            number, sampled_at = -1, self._sampled_at
+            while True:
+                async with self._changed:
+                    await self._changed.wait_for(lambda number=number: self._number != number)  # type: ignore[misc]
+                    number = self._number
+                yield self._message(peer)
+                if self._sampled_at != sampled_at:
+                    sampled_at = self._sampled_at
+                    yield _event("sample", self._history(peer, last=1))
+
+    def _message(self, peer: str) -> bytes:
+        if peer not in self._messages:
+            facts: dict[str, Any] = {"at": monotonic()}
+            if self._lost is not None or self._status is None:
+                facts["lost"] = self._lost
+            else:
+                facts |= view(self._status, self._problems, peer)
+            self._messages[peer] = _event("now", facts)
+        return self._messages[peer]
+
+    def _history(self, peer: str, last: int = SAMPLES) -> dict[str, dict[int, list[Sequence[float | None]]]]:
+        """Round trips in seconds, losses and bytes a second of each path, the oldest first; null if unknown."""
+        samples = list(self._samples)[-last:]
+        keys = [key for key in dict.fromkeys(key for sample in samples for key in sample) if peer in ("", key[0])]
+        lines: dict[str, dict[int, list[Sequence[float | None]]]] = {}
+        for key in keys if peer else keys[: MOST_CARDS * 4]:
+            points = [sample.get(key, (None, None, None)) for sample in samples]
+            lines.setdefault(key[0], {})[key[1]] = list(zip(*points, strict=True))
+        return lines
+
+
+def _event(name: str, facts: object) -> bytes:
+    """A server-sent event (HTML standard, section 9.2). JSON has no line break."""
+    return f"event: {name}\ndata: {json.dumps(facts, separators=(',', ':'))}\n\n".encode()
