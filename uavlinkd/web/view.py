@@ -95,9 +95,7 @@ def card(name: str, peer: Status, word: str) -> dict[str, Any]:
         return facts | {"paths": [], "facts": [], "refused": [], "dropped": [], "reported": []}
     session = peer["session"] or {}
     return facts | {
-        "paths": [
-            _path(path, address) for path, address in zip(peer["paths"], addresses(peer["paths"]), strict=True)
-        ],
+        "paths": [_path(*item) for item in zip(peer["paths"], addresses(peer["paths"]), strict=True)],
         "facts": [
             ["role", peer["role"] or "none"],
             ["key exchange", session.get("suite", "no session")],

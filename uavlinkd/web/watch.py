@@ -10,8 +10,9 @@ from contextlib import contextmanager
 from typing import Any, Final
 
 from uavlinkd.ops.control import ControlError
+from uavlinkd.ops.status_words import Status
 from uavlinkd.system.clock import monotonic
-from uavlinkd.web.view import MOST_CARDS, PathKey, Status, paths_of, view
+from uavlinkd.web.view import MOST_CARDS, PathKey, paths_of, view
 
 SHORTEST_S: Final = 0.5
 """Between two questions to the daemon, while a browser looks."""
@@ -76,7 +77,7 @@ class Watch:
             self._status = await self._ask(" ".join(["overview", *detailed]))
             if now - self._sampled_at >= SAMPLE_S:
                 self._problems = (await self._ask("problems"))["problems"]
-                self._samples.append({key: figures for key, figures in paths_of(self._status)})
+                self._samples.append(dict(paths_of(self._status)))
                 self._sampled_at = now
         except ControlError as error:
             self._lost = str(error)
