@@ -11,8 +11,8 @@ import pytest
 from tests.imports import circle, graph, imports, is_inside, roots, sources
 
 ORDER = (
-    *("system", "core", "authority", "mavlink", "endpoints", "relay", "config", "ops", "fleet", "lab", "link"),
-    *("cli", "__main__"),
+    *("system", "core", "authority", "mavlink", "endpoints", "relay", "config", "ops", "fleet", "web", "lab"),
+    *("link", "cli", "__main__"),
 )
 """Each package may import those before it."""
 IMPURE = {

@@ -9,12 +9,12 @@ from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
 
-from uavlinkd.web.watch import Watch
+from uavlinkd.web.watch import Watcher
 
 _TYPES = {"page.js": "text/javascript", "page.css": "text/css", "icon.svg": "image/svg+xml"}
 
 
-def make_app(watch: Watch) -> Starlette:
+def make_app(watch: Watcher) -> Starlette:
     """The resources. Their content is read once: no path of a request leads to a file."""
     folder = files("uavlinkd.web") / "static"
 

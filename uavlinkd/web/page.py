@@ -15,7 +15,7 @@ from uavlinkd.system.clock import monotonic
 from uavlinkd.web.app import make_app
 from uavlinkd.web.guard import Guard
 from uavlinkd.web.server import WebServer
-from uavlinkd.web.watch import PATIENCE_S, Watch
+from uavlinkd.web.watch import PATIENCE_S, Watcher
 
 
 class Page:
@@ -32,7 +32,7 @@ class Page:
         async def ask_daemon(request: str) -> dict[str, Any]:
             return await asyncio.to_thread(ask, control_socket, request, PATIENCE_S)
 
-        self._watch = Watch(ask_daemon)
+        self._watch = Watcher(ask_daemon)
         self._listener = tcp_listener(address)
         self._scheme = "http" if tls is None else "https"
         app = Guard(make_app(self._watch), names, password_hash, monotonic)

@@ -89,7 +89,7 @@ def _figures(part: Status) -> list[float | None]:
 
 
 def card(name: str, peer: Status, word: str) -> dict[str, Any]:
-    """Everything about one peer. A daemon that was not asked for its details has told only a few facts."""
+    """Everything about one peer. The daemon was perhaps asked for a few facts only."""
     facts: dict[str, Any] = {"name": name, "word": word, "figures": _figures(peer)}
     if "session" not in peer:
         return facts | {"paths": [], "facts": [], "refused": [], "dropped": [], "reported": []}

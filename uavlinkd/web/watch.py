@@ -30,7 +30,7 @@ Ask = Callable[[str], Awaitable[dict[str, Any]]]
 Sample = Mapping[PathKey, tuple[float | None, float, float]]
 
 
-class Watch:
+class Watcher:
     """Asks the daemon at the pace that its answers allow, and hands each browser the latest message."""
 
     def __init__(self, ask: Ask) -> None:
