@@ -65,9 +65,10 @@ def pip(*arguments: str | Path) -> None:
 
 
 def requirements() -> list[str]:
-    """What a daemon needs on a vehicle, and the faster event loop."""
+    """What a daemon needs on a vehicle, the faster event loop, and the page for a browser."""
     project = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]
-    return [*project["dependencies"], *project["optional-dependencies"]["speed"]]
+    extras = project["optional-dependencies"]
+    return [*project["dependencies"], *extras["speed"], *extras["web"]]
 
 
 def name_of(requirement: str) -> str:

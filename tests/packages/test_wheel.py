@@ -7,7 +7,6 @@ import pty
 import socket
 import subprocess
 import sys
-import tarfile
 import tty
 import venv
 import zipfile
@@ -52,8 +51,8 @@ def folder() -> Iterator[Path]:
         build = "import hatchling.build, sys; hatchling.build.build_sdist(sys.argv[1])"
         environ = {**os.environ, "PYTHONPATH": str(backend)}
         subprocess.run([sys.executable, "-c", build, folder / "sdist"], cwd=ROOT, env=environ, check=True)
-        with tarfile.open(sdist(folder)) as archive:
-            archive.extractall(folder / "source", filter="data")
+        (folder / "source").mkdir()
+        subprocess.run(["tar", "-xf", sdist(folder), "-C", folder / "source"], check=True)
         pip(sys.executable, "wheel", "--no-deps", "--wheel-dir", folder / "wheel", sdist(folder))
         venv.create(folder / "venv")
         pip(folder / "venv/bin/python", "install", next((folder / "wheel").iterdir()))

@@ -12,7 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from uavlinkd.config.keys import KeyFileError, read_private_file, write_secret_file
+from uavlinkd.config.keys import KeyFileError, find_secret_file, read_private_file, write_secret_file
 from uavlinkd.config.tls_files import TlsFileError, load_tls
 from uavlinkd.core.crypto import sha256
 from uavlinkd.ops.commands import control_socket, for_daemon
@@ -26,6 +26,7 @@ DEFAULT: Final = "127.0.0.1:8790"
 _PASSWORD_BYTES: Final = 15  # 120 random bits: no guess finds them, so a fast hash protects them
 _GROUP: Final = 6
 _HASH: Final = "sha256:"
+_FILE_LIMIT: Final = 200
 _HOW: Final = "`uavlinkd web --new-password --password-file FILE` makes one"
 
 
@@ -55,7 +56,7 @@ def _web(options: argparse.Namespace) -> int:
     except AddressError as error:
         raise UsageError(f"--listen {error}") from None
     _check(options, address)
-    password_hash, tls = _read_hash(options.password_file), _read_tls(options.certificate, options.key)
+    password_hash, tls = _read_hash(options.password_file), _read_tls(options)
     socket = control_socket(options)
     try:
         from uavlinkd.web.page import Page  # noqa: PLC0415  of the extra
@@ -109,27 +110,31 @@ def _make_password(file: Path | None) -> int:
     return OK
 
 
+def _found(file: Path) -> tuple[Path, bool]:
+    """The path of a file that an option names, and whether it is a systemd credential."""
+    return find_secret_file(str(file), Path(), os.environ)
+
+
 def _read_hash(file: Path | None) -> bytes | None:
     if file is None:
         return None
+    path, is_credential = _found(file)
     try:
-        text = read_private_file(file, limit=200).decode("ascii", "replace").strip()
-        if not text.startswith(_HASH):
-            raise ValueError
-        read = bytes.fromhex(text.removeprefix(_HASH))
-        if len(read) != len(sha256(b"")):
-            raise ValueError
+        text = read_private_file(path, _FILE_LIMIT, credential=is_credential).decode("ascii", "replace").strip()
+        read = bytes.fromhex(text.removeprefix(_HASH)) if text.startswith(_HASH) else b""
     except KeyFileError as error:
         raise UsageError(f"--password-file {error}: {_HOW}") from None
     except ValueError:
-        raise UsageError(f"--password-file {file}: is not the hash of a password: {_HOW}") from None
+        read = b""
+    if len(read) != len(sha256(b"")):
+        raise UsageError(f"--password-file {path} does not have the hash of a password: {_HOW}")
     return read
 
 
-def _read_tls(certificate: Path | None, key: Path | None) -> ssl.SSLContext | None:
-    if certificate is None or key is None:
+def _read_tls(options: argparse.Namespace) -> ssl.SSLContext | None:
+    if options.certificate is None:
         return None
     try:
-        return load_tls(certificate, key)
+        return load_tls(_found(options.certificate)[0], _found(options.key)[0])
     except TlsFileError as error:
         raise UsageError(error) from None
