@@ -173,7 +173,7 @@ def test_installation_by_hand_is_refused(package: Package, machine: Machine) -> 
     machine.say("rm -r /opt/uavlinkd; dpkg --install /root/uavlinkd.deb")
     assert machine.say("uavlinkd --version").strip() == f"uavlinkd {__version__}, {PROTOCOL_NAME.decode()}"
     assert machine.say("dpkg --verify uavlinkd") == ""
-    for unit in ("uavlinkd.service", "uavlinkd@.service", "uavlinkd-relay.service"):
+    for unit in ("uavlinkd.service", "uavlinkd@.service", "uavlinkd-relay.service", "uavlinkd-web.service"):
         assert machine.run(f"systemctl is-enabled {unit}").stdout.strip() in {"disabled", "static"}
     for command in ("uavlinkd demo", "uavlinkd sim", "uavlinkd evaluate", "/opt/uavlinkd/bin/uavlink-mitm"):
         without = machine.run(command)
