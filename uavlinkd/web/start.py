@@ -12,6 +12,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
+import anyio
+
 from uavlinkd.config.keys import KeyFileError, find_secret_file, read_private_file, write_secret_file
 from uavlinkd.config.tls_files import TlsFileError, load_tls
 from uavlinkd.core.crypto import sha256
@@ -37,14 +39,24 @@ def start(options: argparse.Namespace) -> int:
         raise UsageError(f"--listen {error}") from None
     _check(options, address)
     password_hash, tls = _read_hash(options.password_file), _read_tls(options)
-    page = Page(
-        control_socket(options), address, frozenset(name.lower() for name in options.name), password_hash, tls
-    )
-    with page:
+    names, socket = frozenset(name.lower() for name in options.name), control_socket(options)
+    with Page(socket, address, names, password_hash, tls) as page:
+        _leave_root(socket)
         print(printable(f"the page is at {page.url} until Ctrl-C"), flush=True)
         with suppress(KeyboardInterrupt):
             asyncio.run(_until_ended(page))
     return OK
+
+
+def _leave_root(socket: Path) -> None:
+    """After ``sudo``, become the user of the control socket: what answers browsers needs no more rights than that."""
+    if os.geteuid() != 0 or not socket.exists():
+        return
+    asyncio.run(asyncio.to_thread(anyio.run, anyio.sleep, 0))  # they import parts at first use: not readable later
+    owner = socket.stat()
+    os.setgroups([])
+    os.setgid(owner.st_gid)
+    os.setuid(owner.st_uid)
 
 
 async def _until_ended(page: Page) -> None:
