@@ -23,7 +23,7 @@ from uavlinkd.core.certificates import MemberRole
 from uavlinkd.fleet import operations, transaction
 from uavlinkd.fleet.authority_key import AUTHORITY_FILE, SUCCESSOR_FILE
 from uavlinkd.fleet.files import reply_for
-from uavlinkd.fleet.manifest import Fleet, FleetSettings, check_settings, fill, read_manifest
+from uavlinkd.fleet.manifest import Fleet, FleetSettings, check_settings, fill, parse_addresses, read_manifest
 from uavlinkd.fleet.signing import Identity
 from uavlinkd.fleet.transaction import lock
 from uavlinkd.lab.child_processes import end_with_parent
@@ -268,6 +268,46 @@ def test_edits_of_the_user_are_kept(folder: Path) -> None:
     assert table["fleet"]["deny"] == ["drone9", "drone8"]
     assert [contact["addresses"] for contact in table["contact"]] == [["198.51.100.9:5790"]]
     check_fleet(folder)
+
+
+def test_addresses_that_a_person_added_to_a_contact_are_kept(folder: Path) -> None:
+    """A URL, and an address on one network, which replaces the signed one; also with a new key of the contact.
+
+    URLs that the authority signed replace it.
+    """
+    path = folder / "drone1" / "drone1.toml"
+    url, place = "wss://relay.example.org:443/uavlink", {"address": "relay.example.org:5790", "network": "lte"}
+    own = f'addresses = [{{ address = "relay.example.org:5790", network = "lte" }}, "{url}"]'
+    network = '\n[[network]]\nname = "lte"\ninterface = "wwan0"\n'
+    path.write_text(path.read_text().replace('addresses = ["relay.example.org:5790"]', own) + network)
+    operations.add(folder, "other", RELAY, unasked)
+    operations.add(folder, "relay", Identity(), unasked, replaces=True)
+    operations.add(folder, "drone1", Identity(), unasked, replaces=True)
+    operations.revoke(folder, "other", unasked, resign=True)
+    assert tomllib.loads(path.read_text())["contact"][0]["addresses"] == [place, url]
+    assert [str(one) for one in check_fleet(folder).member("relay").addresses] == ["relay.example.org:5790"]
+    signed = Identity(None, None, (Address("relay.example.org", 5790), Address("relay.example.org", 8443, "/other")))
+    operations.add(folder, "relay", signed, unasked, replaces=True)
+    contact = tomllib.loads(path.read_text())["contact"][0]
+    assert contact["addresses"] == ["wss://relay.example.org:8443/other", place]
+    path.write_text(path.read_text().replace(contact["certificate"], "AQAB"))
+    operations.add(folder, "relay", Identity(), unasked, replaces=True)
+    addresses = tomllib.loads(path.read_text())["contact"][0]["addresses"]
+    assert addresses == ["relay.example.org:5790", "wss://relay.example.org:8443/other"]
+
+
+def test_url_of_a_relay_reaches_the_members(tmp_path: Path) -> None:
+    """As `init --relay` names it behind the relay's address. Another relay does not get it: it would not use it."""
+    folder, url = tmp_path / "fleet", "wss://relay.example.org:443/uavlink"
+    relays = parse_addresses("--relay", ["relay.example.org:5790", "wss://relay.example.org", "198.51.100.9:5790"])
+    create(folder, drones=1, relays=relays)
+    fleet = read_manifest(folder)
+    assert [len(member.addresses) for member in fleet.members] == [2, 1, 0]
+    for name, addresses in (("drone1", ["relay.example.org:5790", url]), ("relay2", ["relay.example.org:5790"])):
+        assert tomllib.loads((folder / name / f"{name}.toml").read_text())["contact"][0]["addresses"] == addresses
+    assert list(map(str, loaded(folder, "relay1").listen)) == ["0.0.0.0:5790", "[::]:5790"]
+    (relay, _) = loaded(folder, "drone1").relays
+    assert [str(address) for address in relay.addresses] == ["relay.example.org:5790", url]
 
 
 def test_files_that_cannot_be_edited_safely_are_refused(folder: Path) -> None:

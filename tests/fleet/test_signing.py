@@ -26,6 +26,7 @@ from uavlinkd.system.addresses import Address
 
 SIGNER = SigningKey(Secret(bytes(32)))
 AT, ELSEWHERE = Address("relay.example.org", 5790), Address("198.51.100.7", 5790)
+URL = Address("relay.example.org", 443, "/uavlink")
 
 ANY = Identity()
 
@@ -95,6 +96,8 @@ def test_new_members_get_the_next_serial_and_system_id(fleet: Fleet) -> None:
         ),
         ("other", Identity(MemberRole.RELAY), {}, "a relay needs --address"),
         ("other", Identity(MemberRole.RELAY, (9, 9), (ELSEWHERE,)), {}, "has no system id"),
+        ("v8", Identity(addresses=(ELSEWHERE, URL)), {}, "v8 has a URL: only a relay has one"),
+        ("other", Identity(MemberRole.RELAY, None, (URL,)), {}, "beside its HOST:PORT, which is named first"),
     ],
 )
 def test_impossible_members_are_refused(

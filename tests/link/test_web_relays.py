@@ -65,7 +65,7 @@ def streams(monkeypatch: pytest.MonkeyPatch) -> list[Stream]:
 
 def relay(port: int = 443) -> tuple[WebRelay, Recorder]:
     log = Recorder()
-    written = PeerAddress(Address("127.0.0.1", port), resource="/uavlink")
+    written = PeerAddress(Address("127.0.0.1", port, "/uavlink"))
     stall = StallWatch(monotonic(), lambda seconds: None)
     return WebRelay(written, NUMBER, SocketStateLog(), stall, cast(Any, log)), log
 

@@ -26,7 +26,7 @@ from uavlinkd.core.crypto import AuthorityKey, is_usable_public_key, sha256
 from uavlinkd.core.drops import Drop
 from uavlinkd.core.suites import SUITES, Suite
 from uavlinkd.core.wire import CERTIFICATE_BYTES
-from uavlinkd.system.addresses import AddressError, parse_address
+from uavlinkd.system.addresses import AddressError, parse_place
 from uavlinkd.system.base64_text import from_base64, to_base64
 from uavlinkd.system.terminal import UsageError
 
@@ -187,7 +187,7 @@ def verify_reply(reply: Reply, own_key: bytes) -> Trust:
         trust = Trust(authority, own_key, b"", reply.bulletin)
         for addresses in (reply.addresses, *(contact.addresses for contact in reply.contacts)):
             for address in addresses:
-                parse_address(address, allow_names=True)
+                parse_place(address)
     except AddressError as error:
         raise FleetError(f"the line has an address that {error}") from None
     except ValueError as error:

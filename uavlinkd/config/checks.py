@@ -57,7 +57,7 @@ def _reachability(file: Sections) -> Found:
             )
     for section in (*file.peers, *file.relays, *file.contacts):
         for written in section.get("addresses", ()):
-            if not written.resource and any(_reaches(written.address, own) for own in listen):
+            if not written.address.resource and any(_reaches(written.address, own) for own in listen):
                 yield section.at("addresses"), f"names {written.address}, where this daemon listens: write the peer's"
 
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from uavlinkd.authority.trust import HeldCertificate
 from uavlinkd.core.certificates import MemberRole
 from uavlinkd.core.crypto import AuthorityKey, Secret
-from uavlinkd.core.path import RELAY_HOST, SERIAL_HOST, WEB_HOST
+from uavlinkd.core.path import RELAY_HOST, SERIAL_HOST
 from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.endpoints.url import EndpointUrl, SerialUrl
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
@@ -21,8 +21,6 @@ from uavlinkd.system.addresses import Address
 from uavlinkd.system.terminal import UsageError
 
 SERIAL = Address(SERIAL_HOST, 0)  # the other end of a serial network
-WEB_RESOURCE = "/uavlink"
-"""The path in the URL of a relay, unless that has one."""
 PolicyData = Mapping[str, object]
 """A policy as immutable plain data. :mod:`uavlinkd.mavlink.policy.compilation` documents its keys."""
 
@@ -110,8 +108,6 @@ class PeerAddress:
 
     address: Address
     network: str = ""
-    resource: str = ""
-    """Of a relay that is reached by TLS: the path in its URL."""
 
     @property
     def is_serial(self) -> bool:
@@ -121,8 +117,6 @@ class PeerAddress:
     def __str__(self) -> str:
         if self.is_serial:
             return f"serial network {self.network}"
-        if self.resource:
-            return f"{WEB_HOST}{self.address}{self.resource}"
         return f"{self.address} on {self.network}" if self.network else str(self.address)
 
 

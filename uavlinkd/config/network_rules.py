@@ -64,7 +64,7 @@ def _wrong(written: PeerAddress, known: set[str], serial: set[str], configs: Seq
         names = ", ".join(f'"{name}"' for name in sorted(known))
         remedy = f"write one of {names}" if names else "add a [[network]] of that name, or write the address alone"
         return f"names a network for {written.address} that this file does not have: {remedy}"
-    if written.is_serial or written.resource or not configs or any(used_networks(configs, written)):
+    if written.is_serial or written.address.resource or not configs or any(used_networks(configs, written)):
         return None
     family = f"no address of {_FAMILIES.get(written.address.family)}"
     if zone := written.address.host.partition("%")[2]:

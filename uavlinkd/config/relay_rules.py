@@ -67,7 +67,7 @@ def relays(file: Sections) -> Found:
         yield from _addresses(section, peer, file.relays[:number])
     for section in (*file.peers, *file.contacts):
         is_relay = section in file.used_relays
-        if not is_relay and any(written.resource for written in section.get("addresses", ())):
+        if not is_relay and any(written.address.resource for written in section.get("addresses", ())):
             yield section.at("addresses"), "has the URL of a relay, and this is none: write it in a [[relay]]"
     known = {section.get("name"): section for section in file.used_relays}
     names = ", ".join(f'"{name}"' for name in sorted(name for name in known if name is not None))

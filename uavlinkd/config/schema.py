@@ -17,7 +17,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PlainValidato
 
 from uavlinkd.authority.trust import HeldCertificate
 from uavlinkd.config.keys import decode_key, is_canonical_public_key
-from uavlinkd.config.model import SERIAL, WEB_RESOURCE, HttpsServer, PeerAddress
+from uavlinkd.config.model import SERIAL, HttpsServer, PeerAddress
 from uavlinkd.core import constants as c
 from uavlinkd.core.certificates import LAST_SERIAL, parse_bulletin, parse_certificate
 from uavlinkd.core.certificates import NAME as MEMBER_NAME
@@ -26,14 +26,13 @@ from uavlinkd.core.drops import Drop
 from uavlinkd.core.suites import SUITES_BY_NAME, X25519, Suite
 from uavlinkd.endpoints.url import EndpointUrl, SerialUrl, parse_line, parse_url
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
-from uavlinkd.system.addresses import Address, AddressError, parse_address
+from uavlinkd.system.addresses import Address, AddressError, parse_address, parse_place
 from uavlinkd.system.base64_text import from_base64
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
 _INTERFACE = re.compile(r"[^\s/:]{1,15}")  # as dev_valid_name() of Linux
 # A complete or nearly complete key in base64 or hex: no message repeats it.
 _LIKE_A_KEY = re.compile(r"[A-Za-z0-9+/_-]{40,}={0,2}")
-_RESOURCE = re.compile(r"[A-Za-z0-9._~/-]{0,64}")  # of a URL, behind its first slash
 _SMALL_GROUP = re.compile(r"(?:modp|ffdhe?|dhe?)?[-_ ]?(?:512|768|1024)")
 _HTTPS = '{ listen = "0.0.0.0:443", certificate = "tls.crt", key = "tls.key" }'
 ENROLL_AGAIN = "run `uavlinkd enroll --finish` again with the line of `uavlinkd fleet sign`"
@@ -131,10 +130,8 @@ def _peer_address(value: Any) -> PeerAddress:
                 " for a serial network"
             )
         text, network = value["address"], _name(value["network"])
-    if isinstance(text, str) and "://" in text:
-        return _web_address(text, network)
     try:
-        address = parse_address(_text(text), allow_names=True)
+        address = parse_place(_text(text))
     except AddressError as error:
         if network or {".", ":"} & set(text):
             raise
@@ -143,21 +140,9 @@ def _peer_address(value: Any) -> PeerAddress:
         ) from None
     if address.is_wildcard:
         raise ValueError('is every address of this machine: write the peer\'s own, such as "10.13.0.2:5790"')
-    return PeerAddress(address, network)
-
-
-def _web_address(text: str, network: str) -> PeerAddress:
-    scheme, _, rest = text.partition("://")
-    place, slash, resource = rest.partition("/")
-    if network:
+    if address.resource and network:
         raise ValueError("has the URL of a relay with a network: write the URL alone, it uses any")
-    if scheme != "wss" or not _RESOURCE.fullmatch(resource):
-        raise ValueError('is not the URL of a relay: write one such as "wss://relay.example.org:443/uavlink"')
-    has_port = place.rpartition("]")[2].count(":") == 1
-    address = parse_address(place if has_port else f"{place}:443", allow_names=True)
-    if address.is_wildcard:
-        raise ValueError('is every address of this machine: write the relay\'s own, such as "relay.example.org"')
-    return PeerAddress(address, resource=slash + resource or WEB_RESOURCE)
+    return PeerAddress(address, network)
 
 
 def _https(value: Any) -> HttpsServer:

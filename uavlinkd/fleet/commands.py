@@ -34,7 +34,8 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
     init = add("init", "create a fleet: its authority, and folders for the members that are asked for")
     init.add_argument("--no-passphrase", action="store_true", help="for tests: each copy of authority.pem can sign")
-    _add_list(init, "--relay", "HOST:PORT", "a relay with this public address (may be repeated, up to three times)")
+    text = "a relay with this public address, up to three; a wss:// URL behind it is one more of the same relay"
+    _add_list(init, "--relay", "HOST:PORT", text)
     counts = {
         "drones": "drone1 to droneN, with system ids from 1 up",
         "ground-stations": "system ids from 255 down",

@@ -10,15 +10,18 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from uavlinkd.authority.enrolment import Contact, FleetError, Reply, ids_of
 from uavlinkd.core.certificates import MemberRole, parse_certificate
+from uavlinkd.core.drops import Drop
+from uavlinkd.core.path import WEB_HOST
 from uavlinkd.core.suites import SUITES_BY_NAME
 from uavlinkd.fleet.manifest import Fleet, FleetFileError, FleetSettings, Member, fill, toml_lines
-from uavlinkd.system.addresses import parse_address
-from uavlinkd.system.base64_text import to_base64
+from uavlinkd.system.addresses import parse_place
+from uavlinkd.system.base64_text import from_base64, to_base64
 
 _HEADER = re.compile(r"[ \t]*(\[{1,2})[ \t]*([A-Za-z0-9_-]+)[ \t]*\]|[ \t]*\[")
 _KEY = re.compile(r"[ \t]*(?:\"([^\"]*)\"|'([^']*)'|([A-Za-z0-9_-]+))[ \t]*=")
@@ -47,7 +50,13 @@ def reply_for(fleet: Fleet, member: Member) -> Reply:
         member.signed,
         fleet.published,
         tuple(
-            Contact(contact.public_key, contact.signed, tuple(map(str, contact.addresses)), contact.relays)
+            Contact(
+                contact.public_key,
+                contact.signed,
+                # A member that relays uses no URL of another relay.
+                tuple(str(one) for one in contact.addresses if not (one.resource and member.relays)),
+                contact.relays,
+            )
             for contact in fleet.contacts_of(member.name)
         ),
     )
@@ -57,7 +66,9 @@ def listen_on(reply: Reply) -> list[str]:
     """Where a member listens, so that others reach it at its addresses."""
     listen: list[str] = []
     for text in reply.addresses:
-        address = parse_address(text, allow_names=True)
+        address = parse_place(text)
+        if address.resource:
+            continue  # [relay_server] has that
         if address.ip is not None:  # a loopback address is for tests
             listen.append(text if address.is_loopback else address.wildcard().strip('"'))
         else:  # a name may have addresses of both families
@@ -121,16 +132,16 @@ def with_fleet(text: str, reply: Reply, top: Table | None = None, former_ids: tu
             "bulletin": to_base64(reply.bulletin),
         },
     }
+    table = _parsed(text)
     contacts = [
         {
             "public_key": to_base64(contact.public_key),
             "certificate": to_base64(contact.certificate),
-            "addresses": list(contact.addresses),
+            "addresses": _addresses(contact, table),
             "relays": contact.relays and parse_certificate(contact.certificate).role is not MemberRole.RELAY,
         }
         for contact in reply.contacts
     ]
-    table = _parsed(text)
     if "fleet" not in table:
         facts["link"] = {"confidential": True}
         if MemberRole.VEHICLE in reply.calls:
@@ -149,6 +160,24 @@ def with_fleet(text: str, reply: Reply, top: Table | None = None, former_ids: tu
     if _parsed(after) != (table if contacts else {key: table[key] for key in table if key != "contact"}):
         raise FleetError("its edits cannot be kept: move it away, and run the command again to write a new one")
     return after
+
+
+def _addresses(contact: Contact, table: Table) -> list[Any]:
+    """The signed addresses, and what a person wrote beside them: those of one network, and URLs if none is signed."""
+    has_url = any(parse_place(text).resource for text in contact.addresses)
+    written = _written(table.get("contact"), parse_certificate(contact.certificate).name)
+    kept = [one for one in written if isinstance(one, dict) or (str(one).startswith(WEB_HOST) and not has_url)]
+    replaced = [one.get("address") for one in kept if isinstance(one, dict)]
+    return [*(text for text in contact.addresses if text not in replaced), *kept]
+
+
+def _written(contacts: Any, name: str) -> list[Any]:
+    """The addresses of a contact in a file, which may be damaged."""
+    for contact in contacts if isinstance(contacts, list) else ():
+        with suppress(LookupError, TypeError, ValueError, Drop):
+            if parse_certificate(from_base64(contact["certificate"])).name == name:
+                return list(contact["addresses"])
+    return []
 
 
 def _parsed(text: str) -> Table:

@@ -27,7 +27,7 @@ from uavlinkd.core.certificates import (
 from uavlinkd.core.crypto import AuthorityKey
 from uavlinkd.core.drops import Drop
 from uavlinkd.core.suites import SUITES_BY_NAME
-from uavlinkd.system.addresses import Address, AddressError, parse_address
+from uavlinkd.system.addresses import Address, AddressError, parse_place
 from uavlinkd.system.base64_text import from_base64, to_base64
 from uavlinkd.system.terminal import FAILED, printable
 
@@ -64,7 +64,7 @@ def fill(template: str, number: int, name: str) -> str:
 def parse_addresses(option: str, texts: list[str]) -> tuple[Address, ...]:
     """The addresses in the values of an option."""
     try:
-        return tuple(parse_address(text, allow_names=True) for text in texts)
+        return tuple(map(parse_place, texts))
     except AddressError as error:
         raise FleetError(f"{option}: {error}") from None
 
@@ -190,12 +190,17 @@ def _table_of(member: Member) -> dict[str, Any]:
 
 
 def toml_lines(values: Mapping[str, object]) -> list[str]:
-    """The lines with these keys, without those that are None. JSON writes strings, numbers and lists as TOML does."""
-    return [
-        f"{key} = {json.dumps(value, ensure_ascii=False, default=str)}"
-        for key, value in values.items()
-        if value is not None
-    ]
+    """The lines with these keys, without those that are None."""
+    return [f"{key} = {_toml(value)}" for key, value in values.items() if value is not None]
+
+
+def _toml(value: object) -> str:
+    """JSON writes strings and numbers as TOML does."""
+    if isinstance(value, list):
+        return f"[{', '.join(map(_toml, value))}]"
+    if isinstance(value, dict):
+        return f"{{ {', '.join(toml_lines(value))} }}"
+    return json.dumps(value, ensure_ascii=False, default=str)
 
 
 def read_manifest(folder: Path) -> Fleet:

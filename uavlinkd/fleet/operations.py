@@ -76,7 +76,7 @@ def init(
     fleet = signing.new_fleet(signer, sha256(SigningKey(successor).public), settings)
     private_keys: dict[str, str] = {}
     for role, name, each in (
-        (MemberRole.RELAY, "relay", [(address,) for address in places[0]]),
+        (MemberRole.RELAY, "relay", _relays(places[0])),
         (MemberRole.OPERATOR, "ground-station", _places(counts[MemberRole.OPERATOR], places[1])),
         (MemberRole.VEHICLE, "drone", _places(counts[MemberRole.VEHICLE])),
         (MemberRole.OBSERVER, "observer", _places(counts[MemberRole.OBSERVER])),
@@ -107,6 +107,17 @@ def init(
             raise _exists(folder) from None
         raise FleetFileError(f"{folder} cannot be created: {error.strerror}") from None
     return Result(fleet, tuple(member.name for member in fleet.members)), private
+
+
+def _relays(addresses: Sequence[Address]) -> list[tuple[Address, ...]]:
+    """The addresses of each relay. A URL is one more of the relay before it."""
+    relays = list[tuple[Address, ...]]()
+    for address in addresses:
+        if address.resource and relays:
+            relays[-1] += (address,)
+        else:
+            relays.append((address,))
+    return relays
 
 
 def _places(count: int, addresses: Sequence[Address] = ()) -> list[tuple[Address, ...]]:

@@ -79,6 +79,9 @@ def certify(
     relays = role is MemberRole.RELAY or (
         role is MemberRole.OPERATOR and addresses != () and not any(member.relays for member in others)
     )
+    has_url = {address.resource != "" for address in addresses}
+    if True in has_url and (False not in has_url or not relays):
+        raise FleetError(f"{name} has a URL: only a relay has one, beside its HOST:PORT, which is named first")
     member = Member(public_key, certificate, _certified(signer, certificate, public_key), addresses, relays)
     if former is not None:
         fleet = revoke(fleet, signer, [former])

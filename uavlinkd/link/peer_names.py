@@ -33,7 +33,7 @@ class PeerNames:
         self._answers: dict[PeerAddress, Resolved] = {address: [] for address in link.config.addresses}
         self._searches: list[tuple[asyncio.Task[None], asyncio.Event, set[str]]] = []  # those: names that fail
         for address in link.config.addresses:
-            if address.is_serial or address.resource:
+            if address.is_serial or address.address.resource:
                 continue  # it needs no look-up, or has one for each connection
             if address.address.ip is not None and "%" not in address.address.host:
                 self._answers[address] = numeric(address.address)

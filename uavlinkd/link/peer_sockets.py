@@ -423,7 +423,7 @@ class PeerSockets:
             if (path := self.serial.path_to(written.network)) is not None:
                 yield path
             return
-        if written.resource:
+        if written.address.resource:
             yield self.web.path_to(written)
             return
         for family, sockaddr in resolved:

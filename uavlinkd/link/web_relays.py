@@ -341,7 +341,7 @@ class WebRelays:
     def follow(self, peer: Peer, addresses: Iterable[PeerAddress]) -> None:
         """Connect to these URLs of a relay, whenever it does not answer by UDP."""
         addresses = list(addresses)
-        has_udp = any(not (written.resource or written.is_serial) for written in addresses)
+        has_udp = any(not (written.address.resource or written.is_serial) for written in addresses)
         for relay in self._of(addresses):
             relay.start(peer, self._receive, self._on_change, has_udp=has_udp)
 

@@ -1,4 +1,4 @@
-"""``HOST:PORT`` and ``[IPv6]:PORT``, as they are written in a configuration."""
+"""``HOST:PORT``, ``[IPv6]:PORT`` and ``wss://HOST:PORT/PATH``, as they are written in a configuration."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ DEFAULT_PORT = 5790  # The usual port of a daemon. It is a convention: a configu
 IPV4_UDP_BYTES = 20 + 8  # header bytes of a datagram over IPv4 (RFC 791, RFC 768)
 IPV6_UDP_BYTES = 40 + 8  # header bytes of a datagram over IPv6 (RFC 8200, RFC 768)
 
+WEB_RESOURCE = "/uavlink"  # the usual path in the URL of a relay
+
 _MAX_PORT = 65535
+_RESOURCE = re.compile(r"[A-Za-z0-9._~/-]{0,64}")  # of a URL, behind its first slash
 _PORT = re.compile(r"[0-9]{1,5}")
 _ZONE = re.compile(r"[A-Za-z0-9_.-]{1,15}")
 _LABEL = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?")
@@ -32,6 +35,8 @@ class Address:
 
     host: str
     port: int
+    resource: str = ""
+    """Of a relay that is reached by TLS: the path in its URL."""
 
     @classmethod
     def of(cls, sockaddr: tuple[Any, ...]) -> Address:
@@ -40,7 +45,8 @@ class Address:
     def __str__(self) -> str:
         if not self.port:  # of a line, which has no addresses
             return self.host
-        return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
+        place = f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
+        return f"wss://{place}{self.resource}" if self.resource else place
 
     @property
     def ip(self) -> IPv4Address | IPv6Address | None:
@@ -111,6 +117,19 @@ def parse_address(text: str, *, allow_names: bool) -> Address:
     if ip.is_multicast or host == "255.255.255.255":
         raise AddressError("is a multicast or broadcast address: write the address of one machine")
     return Address(str(ip), port)
+
+
+def parse_place(text: str) -> Address:
+    """Parse where a peer is reached: ``HOST:PORT``, or the URL of a relay. Raises AddressError."""
+    if "://" not in text:
+        return parse_address(text, allow_names=True)
+    scheme, _, rest = text.partition("://")
+    place, slash, resource = rest.partition("/")
+    if scheme != "wss" or not _RESOURCE.fullmatch(resource):
+        raise AddressError('is not the URL of a relay: write one such as "wss://relay.example.org:443/uavlink"')
+    has_port = place.rpartition("]")[2].count(":") == 1
+    address = parse_address(place if has_port else f"{place}:443", allow_names=True)
+    return Address(address.host, address.port, slash + resource or WEB_RESOURCE)
 
 
 def _split(text: str) -> tuple[str, int]:
