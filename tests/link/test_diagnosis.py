@@ -129,7 +129,7 @@ def daemon() -> Daemon:
 
 def test_every_cause_is_documented_with_its_severity() -> None:
     """Each is in one row of the table of README.md, and the row names its severity. Only attacks are security."""
-    section = (ROOT / "uavlinkd/ops/README.md").read_text().partition("### Causes")[2].partition("\n## ")[0]
+    section = (ROOT / "uavlinkd/ops/README.md").read_text().partition("### Causes")[2].partition("\n##")[0]
     rows = [line.split(" | ") for line in section.splitlines() if line.startswith("| `") and "`cause`" not in line]
     documented = {name: severity for names, severity, *_ in rows for name in re.findall(r"`(\w+)`", names)}
     sources = ((ROOT / "uavlinkd/link").glob(name) for name in ("diagnosis.py", "*_problems.py"))

@@ -77,10 +77,46 @@ def test_one_relay_alone_shows_only_possibilities(member: Member) -> None:
     assert "`nc -zvw3 203.0.113.1 22`" in finding.remedy
 
 
+URL = "wss://one:443/uavlink"
+
+
 def test_relay_that_does_not_answer_by_tls_either(member: Member) -> None:
     member.add_relay("one", FIRST)
-    member.parts.peer_sockets.web.states = lambda addresses: {"wss://one:443/uavlink": "ECONNREFUSED"}
-    assert ": by TLS (wss://one:443/uavlink) ECONNREFUSED; by UDP it is off" in member.only().text
+    member.parts.peer_sockets.web.states = lambda addresses: {URL: "ECONNREFUSED"}
+    finding = member.only()
+    assert f": by TLS ({URL}) no process listens there now (ECONNREFUSED); by UDP it is off" in finding.text
+    assert finding.remedy.startswith("start it, or correct the port; or run `uavlinkd status` at one")
+    member.add_relay("two", SECOND)
+    finding = member.only()
+    assert finding.cause == "udp_blocked"
+    assert f"(one, two); one by TLS ({URL}) no process listens" in finding.text
+    assert finding.remedy.startswith("start it, or correct the port; or try another network")
+
+
+@pytest.mark.parametrize(
+    ("state", "text", "remedy"),
+    [
+        ("http_404", "a web server answers there, but not for this path (http_404)", "correct the URL, or"),
+        ("proxy_407", "the proxy wants a name and password (proxy_407)", "write HTTPS_PROXY="),
+        ("TimeoutError", "no answer in time (TimeoutError)", "open TCP port 443 at the relay"),
+        ("connected", "it is connected, and gets no answer (silent)", "the public_key of the [[relay]] must"),
+        ("not connected", "not connected", "run `uavlinkd status` at one"),
+    ],
+)
+def test_relay_with_a_url_alone(member: Member, state: str, text: str, remedy: str) -> None:
+    """The finding names why it is not reached by TLS, and says nothing about UDP."""
+    relay = member.add_relay("one")
+    relay.set_paths([Path(7, (URL, 0))], 0.0)
+    member.parts.peer_sockets.web.states = lambda addresses: {URL: state}
+    assert member.findings(LATER - 0.1) == {}
+    finding = member.only()
+    assert (finding.cause, finding.severity) == ("relay_not_answering", Severity.FAULT)
+    assert finding.text.endswith(f": by TLS ({URL}) {text}")
+    assert finding.remedy.startswith(remedy)
+    other = member.add_relay("two", FIRST)
+    texts = [one.text for one in member.findings(LATER).values()]
+    assert len(texts) == 1, "relays on two hosts, of which one has no address for UDP, show nothing about UDP"
+    assert other in Moment(member.parts, LATER).silent_relays
 
 
 @pytest.mark.parametrize("is_far", [True, False])

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 import time
 from typing import Any
 
 import pytest
 
+from tests.test_readmes import ROOT
 from uavlinkd.ops.netcheck import (
     BLOCKED,
     BY_TLS,
@@ -21,6 +23,7 @@ from uavlinkd.ops.netcheck import (
     ping,
     report,
 )
+from uavlinkd.system.error_meanings import WEB_ERRORS
 
 PRIVATE, PUBLIC, OTHER = "192.168.1.5:5790", "203.0.113.7:40001", "203.0.113.7:40002"
 
@@ -120,10 +123,11 @@ def test_report_fits_80_columns(state: str) -> None:
     [
         ("", "connects"),
         ("http_404", "a web server answers there, but not for this path"),
-        ("http_403", "a web server or proxy answers there and refuses the WebSocket"),
-        ("tls", "something answers there that does not speak TLS"),
-        ("proxy_407", "proxy_407"),
-        ("ECONNREFUSED", "ECONNREFUSED"),
+        ("http_403", "a web server, proxy or login page answers there and refuses the WebSocket (http_403): log in"),
+        ("tls", "no TLS at this port, or a firewall that inspects TLS ends it (tls): compare the port"),
+        ("proxy_407", "the proxy wants a name and password (proxy_407): write HTTPS_PROXY=http://USER"),
+        ("proxy_403", "the proxy refuses to connect to the relay (proxy_403): its owner"),
+        ("ECONNREFUSED", "no process listens there now (ECONNREFUSED): start it, or correct the port"),
     ],
 )
 def test_each_url_of_a_relay_is_tried(error: str, line: str) -> None:
@@ -132,6 +136,21 @@ def test_each_url_of_a_relay_is_tried(error: str, line: str) -> None:
     (found,) = [text for text in lines if text.startswith("TLS ")]
     through = " through the proxy 10.0.0.1:3128" if error == "proxy_407" else ""
     assert found.startswith(f"TLS          wss://one:443/uavlink{through}: {line}")
+
+
+def test_reasons_by_tls_are_a_closed_list() -> None:
+    """Each reason of a member has a meaning and a remedy, which ``status`` shows too, and a row in README.md."""
+    sources = [ROOT / "uavlinkd/endpoints" / f"{name}.py" for name in ("web_connect", "web_stream", "tls_channel")]
+    written = r'(?:lose\(|lose, |return |fault = |else |WebConnectError\()f?"([a-z0-9_]+)'
+    reasons = {reason for path in sources for reason in re.findall(written, path.read_text())}
+    of_relays, of_daemon = {"page", "wrong_path"}, {"finished"}
+    elsewhere = {"http_404", "proxy_407", "TimeoutError", "silent", "ECONNRESET", "EPIPE", "ETIMEDOUT"}
+    assert reasons - of_relays - of_daemon | elsewhere == set(WEB_ERRORS)
+    assert all(": " in meaning for meaning in WEB_ERRORS.values())
+    table = (ROOT / "uavlinkd/ops/README.md").read_text().partition("| reason | meaning | remedy |")[2]
+    rows = [line.split(" | ")[0] for line in table.partition("\n\n")[0].splitlines()]
+    names = {name for row in rows for name in re.findall(r"`(\w+)`", row)}
+    assert names - {"ECONNREFUSED"} == set(WEB_ERRORS)
 
 
 def silent(at: str, icmp: str = "", *, host_answers: bool = False) -> dict[str, Any]:

@@ -32,7 +32,7 @@ from uavlinkd.link.facts import (
 from uavlinkd.link.relay_link import RelayLink
 from uavlinkd.ops.findings import IS_REACHABLE
 from uavlinkd.ops.log import shown
-from uavlinkd.system.error_meanings import meaning_of
+from uavlinkd.system.error_meanings import CONNECTED, meaning_of, web_problem
 
 CONFIRM_S: Final = 2.0
 """A handshake that is not complete after this time is reported."""
@@ -152,17 +152,23 @@ def silent_relays(
     admitted = "a [[member]] there"
     if moment.daemon.fleet is not None:
         admitted += ", or a member of its fleet that is not revoked"
-    if relays and moment.is_udp_blocked:
-        names = [relay.config.name for relay in moment.silent_relays]
-        yield fault_or_warning(
-            "udp_blocked",
-            f"UDP is probably blocked here: none of {len(names)} relays on different hosts answers ({listed(names)})",
+    by_udp = [relay for relay in relays if hosts_of(relay)]
+    if by_udp and moment.is_udp_blocked:
+        names = [relay.config.name for relay in moment.silent_relays if hosts_of(relay)]
+        tried = [(relay.config.name, *_by_tls(moment, relay)) for relay in by_udp]
+        remedy = (
             "try another network, or let UDP to the ports of the relays, and back, through the firewalls here, or let"
             ' members reach a relay by TLS (uavlinkd/relay/README.md, "Where UDP does not pass").'
-            f" {IS_REACHABLE.format(min(hosts_of(relays[0])))}. If this daemon is new to a relay, it must be"
-            f" {admitted}: `uavlinkd status` there shows what arrives",
+            f" {IS_REACHABLE.format(min(hosts_of(by_udp[0])))}. If this daemon is new to a relay, it must be"
+            f" {admitted}: `uavlinkd status` there shows what arrives"
         )
-        return
+        yield fault_or_warning(
+            "udp_blocked",
+            f"UDP is probably blocked here: none of {len(names)} relays on different hosts answers ({listed(names)})"
+            + "".join(f"; {name} {what}" for name, what, _ in tried if what),
+            "; or ".join([*dict.fromkeys(advice for _, _, advice in tried if advice), remedy]),
+        )
+        relays = [relay for relay in relays if relay not in by_udp]
     for relay in relays:
         name, hosts = relay.config.name, hosts_of(relay)
         text = f"the relay {name} does not answer at {listed(map(str, relay.config.addresses))}: "
@@ -170,10 +176,12 @@ def silent_relays(
             f"{_ASK_THERE.format(name)}; else open its firewall. `uavlinkd pubkey` there must print the public_key of"
             f" the [[relay]] here, and this daemon must be {admitted}"
         )
-        for url, state in moment.daemon.peer_sockets.web.states(relay.config.addresses).items():
-            text += f"by TLS ({url}) {state}; by UDP "
+        what, advice = _by_tls(moment, relay)
+        text += what and f"{what}; by UDP " if hosts else what
         error, path = moment.reported(relay) or ("", None)
-        if path is not None and error in UNREACHABLE:
+        if not hosts:
+            pass
+        elif path is not None and error in UNREACHABLE:
             text += f"the network reports that {shown(path.address)} is not reachable ({error}, ICMP)"
             remedy = f"compare its address, and see `ip route get ADDRESS`; or {remedy}"
         elif error:
@@ -194,7 +202,15 @@ def silent_relays(
         else:
             text += "it is off, the address is wrong, a firewall drops UDP here or there, or keys or suites differ"
             remedy += f". {IS_REACHABLE.format(min(hosts, default=name))}"
-        yield fault_or_warning("relay_not_answering", text, remedy)
+        yield fault_or_warning("relay_not_answering", text, f"{advice}; or {remedy}" if advice else remedy)
+
+
+def _by_tls(moment: Moment, relay: RelayLink) -> tuple[str, str]:
+    """Why a silent relay is not reached at its URLs, and the remedies; empty if it has none."""
+    states = moment.daemon.peer_sockets.web.states(relay.config.addresses)
+    problems = {url: web_problem("silent" if state == CONNECTED else state) for url, state in states.items()}
+    what = "; ".join(f"by TLS ({url}) {what}" for url, (what, _) in problems.items())
+    return what, "; or ".join(dict.fromkeys(remedy for _, remedy in problems.values() if remedy))
 
 
 def relay_warnings(moment: Moment) -> Iterator[Found]:

@@ -97,7 +97,8 @@ class Moment:
         place = "relay", relay.config.name
         refused = self.daemon.evidence.seen_at(DropReason.BAD_HANDSHAKE, place, self.now)
         certain = (self.seen_at(relay, error) for error in ("EPERM", *UNROUTED))
-        return is_over and bool(hosts_of(relay)) and refused is None and not any(certain)
+        has_address = bool(relay.peer.paths.configured)  # by UDP or TLS
+        return is_over and has_address and refused is None and not any(certain)
 
     @cached_property
     def silent_relays(self) -> list[RelayLink]:
@@ -107,8 +108,8 @@ class Moment:
     @cached_property
     def is_udp_blocked(self) -> bool:
         """Whether it probably is: relays on two hosts are silent, none answers, and no ICMP message says why."""
-        relays = self.silent_relays
-        if len(relays) < len(self.daemon.relays.by_name) or any(map(self.reported, relays)):
+        relays = [relay for relay in self.silent_relays if hosts_of(relay)]
+        if len(self.silent_relays) < len(self.daemon.relays.by_name) or any(map(self.reported, relays)):
             return False
         is_far = any(one.isdisjoint(other) for one, other in combinations(map(hosts_of, relays), 2))
         return is_far and not self.beside_relays

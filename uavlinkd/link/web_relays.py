@@ -22,6 +22,7 @@ from uavlinkd.link.conditions import LineLimits
 from uavlinkd.link.networks import NetworkBudget, Receive
 from uavlinkd.mavlink.egress.bucket import Bucket
 from uavlinkd.system.clock import monotonic
+from uavlinkd.system.error_meanings import CONNECTED
 from uavlinkd.system.stall import StallWatch
 from uavlinkd.system.tasks import keep_running
 
@@ -144,7 +145,7 @@ class WebRelay:
     @property
     def state(self) -> str:
         """``connected``, ``not connected``, or why the last try failed."""
-        return "connected" if self._stream is not None else self._error or "not connected"
+        return CONNECTED if self._stream is not None else self._error or "not connected"
 
     def start(self, peer: Peer, receive: Receive, on_change: Callable[[], None], *, has_udp: bool = False) -> None:
         """Connect whenever this relay does not answer by UDP. ``has_udp``: it has an address for that."""

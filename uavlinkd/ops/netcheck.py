@@ -15,6 +15,7 @@ from textwrap import fill
 from typing import Any, Final
 
 from uavlinkd.ops.findings import IS_REACHABLE
+from uavlinkd.system.error_meanings import web_problem
 from uavlinkd.system.terminal import printable
 
 INTERVAL_S: Final = 1.0  # between the questions of `ping`
@@ -133,20 +134,6 @@ ONE_PORT = (
     "The same host answers at another port: let UDP to the silent port through the firewalls here and there, or"
     " correct `listen` of the relay, or `addresses` here"
 )
-_WEB_ERRORS: Final = (
-    (
-        "http_404",
-        "a web server answers there, but not for this path: correct the URL, or the web server before the relay",
-    ),
-    (
-        "http_",
-        "a web server or proxy answers there and refuses the WebSocket: see uavlinkd/relay/README.md",
-    ),
-    ("tls", "something answers there that does not speak TLS"),
-    ("TimeoutError", "no answer within 3 s: a firewall drops TCP too, or a name has no address"),
-    ("slow_handshake", "something accepts the connection and does not answer"),
-)
-"""By how the reason begins."""
 _ICMP: Final = {"": "", "ECONNREFUSED": " (ICMP: no process listens there)"}
 _UNREACHABLE: Final = " (ICMP: not reachable)"
 
@@ -169,7 +156,7 @@ def report(answer: Answer) -> Iterator[str]:
         yield f"relay        {name}: {relay['state']}{_about(relay)}"
     for url, result in answer["web"].items():
         through = f" through the proxy {result['proxy']}" if result["proxy"] else ""
-        yield f"TLS          {url}{through}: {_meaning(result['error']) if result['error'] else 'connects'}"
+        yield f"TLS          {url}{through}: {_outcome(result['error'])}"
     for view in answer["views"] if up else ():
         network = f" on {view['network']}" if view["network"] else ""
         yield f"seen as      {view['seen_as']} by {view['relay']} at {view['relay_address']}{network}"
@@ -208,8 +195,8 @@ def _headline(answer: Answer, down: list[str], ports: list[str]) -> str:
     return f"gets out: {counted}"
 
 
-def _meaning(error: str) -> str:
-    return next((text for start, text in _WEB_ERRORS if error.startswith(start)), error)
+def _outcome(error: str) -> str:
+    return ": ".join(filter(None, web_problem(error))) if error else "connects"
 
 
 def folded(line: str) -> str:
