@@ -38,7 +38,6 @@ class Owner:
     def __init__(self) -> None:
         self.stream: WebStream
         self.opened = 0
-        self.writable = 0
         self.batches: list[list[bytes]] = []
         self.reasons: list[str] = []
 
@@ -54,9 +53,6 @@ class Owner:
 
     def on_lost(self, reason: str) -> None:
         self.reasons.append(reason)
-
-    def on_writable(self) -> None:
-        self.writable += 1
 
     def fill(self, datagram: bytes) -> int:
         """Send as long as there is room. Returns how many were sent."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import socket
 import struct
@@ -295,6 +296,24 @@ def _cannot_listen(address: Address, error: OSError) -> BindError:
     bind_error = BindError(f"cannot listen on {address}: {error.strerror or error}{f': {remedy}' if remedy else ''}")
     bind_error.is_taken = error.errno == errno.EADDRINUSE
     return bind_error
+
+
+async def connect_tcp(
+    family: socket.AddressFamily, sockaddr: tuple[Any, ...], options: Iterable[tuple[int, str, int | bytes]] = ()
+) -> socket.socket:
+    """A TCP socket with these options that is connected there. Raises OSError: the kernel's error."""
+    sock = socket.socket(family, socket.SOCK_STREAM)
+    try:
+        sock.setblocking(False)
+        set_options(sock, options)
+        await asyncio.get_running_loop().sock_connect(sock, sockaddr)
+        if sock.getsockname() == sock.getpeername():
+            # When no process listens on a local port, the kernel may choose that port for our own side.
+            raise ConnectionRefusedError(errno.ECONNREFUSED, "connected to itself")
+    except BaseException:
+        sock.close()
+        raise
+    return sock
 
 
 def set_options(sock: socket.socket, options: Iterable[tuple[int, str, int | bytes]]) -> None:

@@ -13,10 +13,9 @@ import struct
 import sys
 from contextlib import suppress
 from secrets import SystemRandom
-from typing import Any
 
 from uavlinkd.endpoints.ports import CLIENT_SILENT_S, CLIENTS_PER_ENDPOINT, PortHandler, failure_name
-from uavlinkd.endpoints.sockets import bind, new_socket, set_options
+from uavlinkd.endpoints.sockets import bind, connect_tcp, new_socket, set_options
 from uavlinkd.endpoints.stream_endpoint import STALLED_S, StreamEndpoint
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic
@@ -200,28 +199,13 @@ class TcpClient(StreamEndpoint):
             self.could_not_open("not_resolved")
         for family, sockaddr in resolved[:MAX_ADDRESSES]:
             try:
-                return await _connected(family, sockaddr)
+                async with asyncio.timeout(CONNECT_TIMEOUT_S):
+                    return await connect_tcp(family, sockaddr, _OPTIONS)
             except TimeoutError:
                 self.could_not_open("connect_timeout")
             except OSError as error:
                 self.could_not_open(failure_name(error))
         return None
-
-
-async def _connected(family: socket.AddressFamily, sockaddr: tuple[Any, ...]) -> socket.socket:
-    """A socket that is connected there. Raises the kernel's OSError, or TimeoutError if there is no answer."""
-    sock = socket.socket(family, socket.SOCK_STREAM)
-    try:
-        _prepare(sock)
-        async with asyncio.timeout(CONNECT_TIMEOUT_S):
-            await asyncio.get_running_loop().sock_connect(sock, sockaddr)
-        if sock.getsockname() == sock.getpeername():
-            # When no process listens on a local port, the kernel may choose that port for our own side.
-            raise ConnectionRefusedError(errno.ECONNREFUSED, "connected to itself")
-    except BaseException:
-        sock.close()
-        raise
-    return sock
 
 
 _EXHAUSTED = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})

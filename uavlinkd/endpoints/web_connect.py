@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import socket
 from contextlib import suppress
-from typing import Any, Final
+from typing import Final
 
 from websockets.exceptions import InvalidProxy
 from websockets.http11 import Response
@@ -13,6 +13,7 @@ from websockets.proxy import Proxy, get_proxy, parse_proxy, prepare_connect_requ
 from websockets.streams import StreamReader
 from websockets.uri import WebSocketURI
 
+from uavlinkd.endpoints.sockets import connect_tcp
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.resolver import Resolved, resolve
 from uavlinkd.system.tasks import Threads
@@ -73,7 +74,7 @@ async def _connect(address: Address, threads: Threads | None) -> socket.socket:
     try:
         while waiting or attempts:
             if waiting:
-                attempts.add(asyncio.ensure_future(_connected(*waiting.pop(0))))
+                attempts.add(asyncio.ensure_future(connect_tcp(*waiting.pop(0))))
             timeout_s = STAGGER_S if waiting else None
             done, _ = await asyncio.wait(attempts, timeout=timeout_s, return_when=asyncio.FIRST_COMPLETED)
             for attempt in done:
@@ -96,17 +97,6 @@ def _close(attempt: asyncio.Task[socket.socket]) -> None:
     """An attempt that another one overtook."""
     if not attempt.cancelled() and attempt.exception() is None:
         attempt.result().close()
-
-
-async def _connected(family: socket.AddressFamily, sockaddr: Any) -> socket.socket:
-    sock = socket.socket(family, socket.SOCK_STREAM)
-    try:
-        sock.setblocking(False)
-        await asyncio.get_running_loop().sock_connect(sock, sockaddr)
-    except BaseException:
-        sock.close()
-        raise
-    return sock
 
 
 async def _tunnel(sock: socket.socket, proxy: Proxy, uri: WebSocketURI) -> None:

@@ -62,9 +62,6 @@ class StreamHandler(Protocol):
     def on_lost(self, reason: str) -> None:
         """The connection ended. Called once."""
 
-    def on_writable(self) -> None:
-        """There is room again after :meth:`WebStream.room` returned 0."""
-
 
 def server_protocol() -> ServerProtocol:
     """For a relay."""
@@ -110,7 +107,6 @@ class WebStream:
         self._queue: deque[tuple[bytes, float]] = deque()
         self._queued_bytes = 0
         self._pong = b""  # the answer to the newest Ping, as a frame: it answers those before, too
-        self._is_awaited = False  # the owner wants to know when there is room
         self._header_bytes = 0
         self._pings_left = float(PINGS)
         self._pinged_at = monotonic()
@@ -173,13 +169,12 @@ class WebStream:
         self._flush_soon()
 
     def room(self, now: float) -> float:
-        """How many bytes leave at once if they are sent now. After 0, the stream calls ``on_writable``."""
+        """How many bytes leave at once if they are sent now."""
         if not self.is_open:
             return 0.0
         room = GATHER_BYTES - self._queued_bytes
         if room > 0 and self._window.is_open and self._channel.has_room():
             return float(room)
-        self._is_awaited = True
         if self._window.is_stuck(now):
             self._flush_soon()
         return 0.0
@@ -204,9 +199,6 @@ class WebStream:
         self._drop_old(now)
         while (self._pong or (self._queue and window.is_open)) and channel.has_room():
             channel.write(self._gather(now))
-        if self._is_awaited and not self._queue and window.is_open and channel.has_room():
-            self._is_awaited = False
-            self._handler.on_writable()
 
     def _gather(self, now: float) -> bytes:
         """The content of the next record."""
@@ -278,7 +270,7 @@ class WebStream:
         elif self.is_open:
             if pings:
                 self._pong = protocol.data_to_send()[-1]  # while it is open, the library writes only Pongs
-            if self._pong or self._queue or self._is_awaited:
+            if self._pong or self._queue:
                 self._flush_soon()
 
     def on_end(self) -> None:

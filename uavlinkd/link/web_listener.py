@@ -99,9 +99,6 @@ class _Connection:
     def on_lost(self, reason: str) -> None:
         self._listener.on_lost(self, reason)
 
-    def on_writable(self) -> None:
-        """A relay keeps no queue of a member's datagrams."""
-
 
 class WebListener:
     """``number``: that of the socket, for the core."""

@@ -106,9 +106,6 @@ class _Attempt:
         elif self._owner is not None:
             self._owner.lost(reason)
 
-    def on_writable(self) -> None:
-        """Frames that wait ask for room every :data:`WAIT_S`."""
-
 
 class WebRelay:
     """One URL of a relay. ``number``: that of its socket."""

@@ -99,9 +99,6 @@ class _End:
         self.stream = None
         self.other.lose()
 
-    def on_writable(self) -> None:
-        """Nothing waits for it."""
-
 
 class WebProxy:
     """Listens for a member's connections. Each is passed on to the relay, with TLS of its own."""
