@@ -312,6 +312,8 @@ def test_path_by_tls_is_the_best_only_without_another() -> None:
     assert paths.best is of(paths, WEB)
     assert paths.role(of(paths, LTE)) == "metered"
     assert answer(paths, LTE, 2.0, 0.5)[0] == PathChanged(PEER, LTE, WEB, "udp")
+    paths.set_socket_state(WEB.socket, 3.0, is_up=False)
+    assert PathStateChanged(PEER, WEB, False, "closed") in paths.update(PEER, 3.0), "its network is still there"
     assert (LTE.is_udp, LTE.is_web) == (True, False)
     assert (WEB.is_udp, WEB.is_web) == (False, True)
     assert not relayed(WEB.socket, "vps", 7).is_udp

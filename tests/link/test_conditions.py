@@ -12,7 +12,8 @@ from structlog.testing import capture_logs
 
 from tests.core.harness import Named
 from uavlinkd.config.model import ConfigError, Problem
-from uavlinkd.core.outputs import PeerLost, PeerUp
+from uavlinkd.core.outputs import PathStateChanged, PeerLost, PeerUp
+from uavlinkd.core.path import Path
 from uavlinkd.link import conditions, daemon
 from uavlinkd.link.conditions import (
     HOUR_S,
@@ -211,6 +212,14 @@ def test_withheld_commands_are_not_a_warning(log: EventLog) -> None:
         ("problem_began", "info"),
         ("problem_ended", "info"),
     ]
+
+
+def test_path_by_tls_that_is_closed_is_not_a_warning(log: EventLog) -> None:
+    """UDP works again: `relay_disconnected` says so. A path that fails is one."""
+    with capture_logs() as lines:
+        for reason in ("closed", "unanswered"):
+            log.write(PathStateChanged(Named("b"), Path(0, ("192.0.2.1", 5790)), False, reason), 1.0)
+    assert [(line["event"], line["reason"]) for line in lines] == [("path_down", "unanswered")]
 
 
 def test_security_finding_is_an_error(log: EventLog) -> None:

@@ -37,9 +37,9 @@ _REFUSED = 'uavlinkd_peer_refused_frames_total{instance="a",peer="b"'
 _FINDING = 'uavlinkd_finding{instance="a",cause="wrong_psk",subject="peer",name="b"'
 
 
-def _path(peer: str, number: str, usable: str, down: str) -> dict[str, str]:
+def _path(peer: str, number: str, usable: str, down: str, network: str = "lte") -> dict[str, str]:
     """The samples of two states of a path."""
-    labels = f'instance="a",peer="{peer}",path="{number}",network="lte",address="learned"'
+    labels = f'instance="a",peer="{peer}",path="{number}",network="{network}",address="learned"'
     return {
         f'uavlinkd_peer_path_state{{{labels},state="usable"}}': usable,
         f'uavlinkd_peer_path_state{{{labels},state="down"}}': down,
@@ -62,8 +62,9 @@ CASES: dict[str, tuple[dict[str, str], list[tuple[str, bool]]]] = {
         [("30s", False), ("1m", True)],
     ),
     "UavlinkdPathDown": (
-        {  # The first was usable; the second never was; the third belongs to a peer that is down.
+        {  # The first was usable; the second never was; one by TLS was closed; the last peer is down.
             **_path("b", "1", usable="1x4 0x20", down="0x4 1x20"),
+            **_path("b", "3", usable="1x4 0x20", down="0x4 1x20", network="TLS"),
             **_path("b", "2", usable="0x24", down="1x24"),
             **_path("c", "1", usable="1x4 0x20", down="0x4 1x20"),
             'uavlinkd_peer_up{instance="a",peer="b"}': "1x24",

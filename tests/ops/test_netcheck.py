@@ -253,6 +253,7 @@ DIRECT: dict[str, Any] = {
     "network": "lte",
     "answered_s": 1.02,  # at once, an interval ago
     "round_trip_s": 0.0234,
+    "reason": "answered",
     "loss_in": 0.0,
     "loss_out": 0.02,
     "carries": ["critical", "stream", "bulk"],
@@ -267,9 +268,12 @@ RELAYED = {
     "carries": ["critical"],
 }
 SILENT = {**RELAYED, "answered_s": 3.0, "carries": []}
+BY_TLS_BEFORE = {**SILENT, "network": "TLS", "reason": "closed"}
 
 
-@pytest.mark.parametrize(("paths", "is_answered"), [([DIRECT, SILENT], True), ([SILENT], False), ([], False)])
+@pytest.mark.parametrize(
+    ("paths", "is_answered"), [([DIRECT, SILENT], True), ([SILENT], False), ([], False), ([BY_TLS_BEFORE], False)]
+)
 def test_each_question_has_a_line_for_each_path(
     paths: list[dict[str, Any]],
     is_answered: bool,
@@ -290,3 +294,5 @@ def test_each_question_has_a_line_for_each_path(
             " bulk",
             "1: relayed via vps, no answer, loss 0 % in, 2 % out, carries no frames",
         ]
+    if paths == [BY_TLS_BEFORE]:
+        assert lines[0].startswith("1: relayed via vps on TLS, not connected, loss")

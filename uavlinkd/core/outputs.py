@@ -121,7 +121,7 @@ class PathChanged(NamedTuple):
 
 
 class PathStateChanged(NamedTuple):
-    """A path became usable, or went down. ``reason``: ``answered``, ``unanswered`` or ``network``."""
+    """A path became usable, or went down. ``reason``: that of its state."""
 
     peer: LinkedPeer
     path: Path

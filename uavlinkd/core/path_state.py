@@ -60,7 +60,7 @@ class PathState:
     """Whether it was reported as usable, and not as down since."""
     condition: PathCondition = PathCondition.UNPROVEN
     reason: str = "new"
-    """Why it is in this condition: ``answered``, ``unanswered``, ``loss``, ``network`` or ``new``."""
+    """Why: ``answered``, ``unanswered``, ``loss``, ``network``, ``closed`` (a connection of TCP) or ``new``."""
     since: float = 0.0
     """When the condition began."""
     sent: int = 0
@@ -317,7 +317,7 @@ class PathState:
         self._waiting.clear()
         self._unanswered, self._unanswered_since = 0, c.NEVER
         if is_off:
-            self._set(PathCondition.DOWN, "network", now)
+            self._set(PathCondition.DOWN, "closed" if self.is_stream else "network", now)
         self.question_at = c.NEVER if is_off else now
         if not is_off:
             self.questioned_at = -c.NEVER  # ask at once, however recently it was asked

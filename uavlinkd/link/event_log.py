@@ -131,7 +131,7 @@ class EventLog:
                 log = log.bind(**self._path_facts("path", "network", path), reason=reason)
                 if is_usable:
                     log.info("path_usable")
-                else:
+                elif reason != "closed":  # which `relay_disconnected` explains, often on purpose
                     log.warning("path_down")
             case o.SessionEstablished():
                 log.info("session_established", **_session_facts(event))
