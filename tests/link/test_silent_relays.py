@@ -99,7 +99,7 @@ def test_relay_that_does_not_answer_by_tls_either(member: Member) -> None:
         ("http_404", "a web server answers there, but not for this path (http_404)", "correct the URL, or"),
         ("proxy_407", "the proxy wants a name and password (proxy_407)", "write HTTPS_PROXY="),
         ("TimeoutError", "no answer in time (TimeoutError)", "open TCP port 443 at the relay"),
-        ("connected", "it is connected, and gets no answer (silent)", "the public_key of the [[relay]] must"),
+        ("connected", "it is connected, and gets no answer (silent)", "compare the public_key of the"),
         ("not connected", "not connected", "run `uavlinkd status` at one"),
     ],
 )

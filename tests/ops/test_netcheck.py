@@ -123,8 +123,8 @@ def test_report_fits_80_columns(state: str) -> None:
     [
         ("", "connects"),
         ("http_404", "a web server answers there, but not for this path"),
-        ("http_403", "a web server, proxy or login page answers there and refuses the WebSocket (http_403): log in"),
-        ("tls", "no TLS at this port, or a firewall that inspects TLS ends it (tls): compare the port"),
+        ("http_403", "a web server, proxy or login page there refuses (http_403): log in to this network"),
+        ("tls", "no TLS at this port, or a firewall that inspects TLS ends it (tls): compare the URL"),
         ("proxy_407", "the proxy wants a name and password (proxy_407): write HTTPS_PROXY=http://USER"),
         ("proxy_403", "the proxy refuses to connect to the relay (proxy_403): its owner"),
         ("ECONNREFUSED", "no process listens there now (ECONNREFUSED): start it, or correct the port"),

@@ -192,16 +192,26 @@ def test_every_condition_of_a_path_is_shown(condition: PathCondition, reason: st
     assert expected in printed(render_status(status_of({"drone1": peer("up", paths=paths)})))
 
 
+def test_path_by_tls_that_is_not_needed_is_no_failure() -> None:
+    paths = [PATH, {**PATH, "network": "TLS", "state": "down", "reason": "closed"}]
+    text = words(render_status(status_of({"drone1": peer("up", paths=paths)})))
+    assert "TLS 203.0.113.255:65535 not connected" in text
+    assert "down" not in text
+
+
 def test_relay_shows_its_members_those_that_are_down_first() -> None:
     """Whole on 80 columns, an address once for all ports; without tables of peers and endpoints that it lacks."""
     member = {"is_up": True, "since_s": 3540.0, "addresses": ["203.0.113.255:65535"] * 2}
     member |= {"bound": 1, "waiting": 0, "datagrams": 1_234_567, "over_limit": 5}
     members = {"drone1": member, "ground-station": {**member, "is_up": False, "addresses": []}}
-    https = {"address": "0.0.0.0:443", "connections": 1002, "strangers": 2}
+    refused = {"unproven": 1204, "wrong_path": 7, "displaced": 9, "tls": 1}
+    https = {"address": "0.0.0.0:443", "connections": 1002, "strangers": 2, "refused": refused}
     relay = {"members": members, "dropped": {"relay_unknown_handle": 7}, "https": https}
     text = words(render_status(status_of({}, relay=relay)))
     assert "relay: 1 of 2 members up" in text
     assert text.index("ground-station down 59 min") < text.index("drone1 up 59 min 203.0.113.255:65535 1 0 1,234,567")
     assert "not forwarded: 7 of an unknown handle of a relay" in text
-    assert "by TLS at 0.0.0.0:443: 1,000 members, 2 strangers" in text
+    assert "by TLS at 0.0.0.0:443: 1,000 members, 2 strangers; refused so far: 1,204 unproven, 9 displaced, 7" in text
+    https["refused"] = {}
+    assert "refused so far" not in words(render_status(status_of({}, relay=relay)))
     assert "endpoint" not in text

@@ -19,8 +19,6 @@ from uavlinkd.system.error_meanings import web_problem
 from uavlinkd.system.terminal import printable
 
 INTERVAL_S: Final = 1.0  # between the questions of `ping`
-CLOSED: Final = {"closed": "not connected"}
-"""What is written of a path by TLS without a connection: it is not needed, or the relay's line says why."""
 
 Answer = Mapping[str, Any]
 
@@ -41,9 +39,10 @@ def ping(ask: Callable[[], Answer], count: int) -> bool:
         answers = [time_s is not None and time_s < 1.5 * INTERVAL_S for time_s in times]
         answered = any(answers)
         for path, address, is_answered in zip(paths, addresses(paths), answers, strict=True):
+            no_answer = "not connected" if path["reason"] == "closed" else "no answer"
             facts = [
                 address if path["relay"] is not None else f"direct to {address}",
-                f"{1000 * path['round_trip_s']:.1f} ms" if is_answered else CLOSED.get(path["reason"], "no answer"),
+                f"{1000 * path['round_trip_s']:.1f} ms" if is_answered else no_answer,
                 f"loss {100 * path['loss_in']:.0f} % in, {100 * path['loss_out']:.0f} % out",
                 f"carries {' and '.join(path['carries'])}" if path["carries"] else "carries no frames",
             ]

@@ -22,6 +22,7 @@ _STYLES: Final = {
     "suspect": "yellow",
     "down": "bold red",
     "unproven": "yellow",
+    "closed": "",
     "security": "bold red",
     "fault": "bold yellow",
     "warning": "yellow",
@@ -44,8 +45,7 @@ def render_status(status: Status, width: int = 80) -> RenderableType:
     if relay is not None:
         parts.append(_members(relay))
         if (https := relay["https"]) is not None:
-            members = https["connections"] - https["strangers"]
-            parts.append(Text(f"by TLS at {https['address']}: {members:,} members, {https['strangers']:,} strangers"))
+            parts.append(Text(words.web_line(https)))
     parts += [_said(words.used_relay(name, used)) for name, used in status["relays"].items()]
     if status["networks"]:
         parts.append(_networks(status))
@@ -202,7 +202,7 @@ def _cells(path: Status, address: str) -> list[Text]:
         rtt = f"{_short(1000 * path['round_trip_s'])}±{_short(1000 * path['jitter_s'])}"
     return [
         Text(f" {where}", style="bold" if path["role"] == "best" else ""),
-        Text(words.path_state(path), style=_STYLES[path["state"]]),
+        Text(words.path_state(path), style=_STYLES[words.condition(path)]),
         Text(words.carried(path)),
         Text(rtt),
         Text(f"{100 * path['loss_in']:.0f}/{100 * path['loss_out']:.0f}"),

@@ -137,10 +137,17 @@ def other_losses(status: Status) -> Iterator[str]:
         yield f"dropped after a pause of the daemon: {stale:,} frames"
 
 
+def condition(path: Status) -> str:
+    """A closed path by TLS is no failure: it is not needed, or a problem of the relay names it."""
+    return "closed" if path["reason"] == "closed" else str(path["state"])
+
+
 def path_state(path: Status) -> str:
     """The role of a usable path; of another one, what is wrong."""
     if path["state"] == "usable":
         return str(path["role"])
+    if condition(path) == "closed":
+        return "not connected"
     reason = _NOT_USABLE.get(path["reason"])
     return f"{path['state']}: {reason}" if reason else str(path["state"])
 
@@ -169,6 +176,14 @@ def radio_line(line: Status) -> str:
 
 
 # What was dropped or refused.
+
+
+def web_line(https: Status) -> str:
+    """Where a relay listens for TLS, who is connected, and why strangers were refused: codes of README.md."""
+    members, strangers = https["connections"] - https["strangers"], https["strangers"]
+    refused = listed([(reason.replace("_", " "), count) for reason, count in https["refused"].items()])
+    text = f"by TLS at {https['address']}: {members:,} members, {strangers:,} strangers"
+    return f"{text}; refused so far: {refused}" if refused else text
 
 
 def peer_drops(peer: Status) -> list[Count]:

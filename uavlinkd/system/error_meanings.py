@@ -15,37 +15,30 @@ NAME_NOT_RESOLVED: Final = "name_not_resolved"
 ADDRESS_NOT_HERE_YET: Final = "address_not_here_yet"
 CONNECTED: Final = "connected"  # by TLS
 
-_NOT_A_RELAY: Final = "what answers there is no relay: compare the URL with `https` in the relay's file"
-_CUT: Final = "the connection ends soon: wait for the next one, or try another network: a firewall here may cut it"
+_COMPARE: Final = "compare the URL with `https` in the relay's file, or try another network"
+_BROKEN: Final = "not_websocket", "long_header", "text", "fragment", "long_message", "protocol", "pings"
+_CUT: Final = "closed", "no_pong", "not_reading", "ECONNRESET", "EPIPE", "ETIMEDOUT"
 
 WEB_ERRORS: Final[Mapping[str, str]] = {
     "not_resolved": "the name has no address now: see `getent hosts NAME`, or write an IP address into the URL",
-    "TimeoutError": "no answer in time: open TCP port 443 at the relay, or a firewall here drops TCP too: try another"
-    " network",
+    "TimeoutError": "no answer in time: open TCP port 443 at the relay; a firewall here may drop TCP too",
     "proxy_407": "the proxy wants a name and password: write HTTPS_PROXY=http://USER:PASSWORD@HOST:PORT",
     "proxy_": "the proxy refuses to connect to the relay: its owner must permit CONNECT to this host and port",
-    "proxy_closed": "the proxy closes the connection: its owner must permit CONNECT to the relay",
-    "proxy_not_understood": "HTTPS_PROXY is wrong, or no HTTP proxy answers there: write http://HOST:PORT",
+    "proxy_closed": "the proxy closes the connection: its owner must permit CONNECT to this host and port",
     "proxy_not_http": "HTTPS_PROXY names a proxy of another kind: write http://HOST:PORT of an HTTP proxy",
-    "tls": "no TLS at this port, or a firewall that inspects TLS ends it: compare the port with `https` in the"
-    " relay's file, or try another network",
-    "slow_handshake": "something accepts the connection and does not answer: compare the URL with `https` in the"
-    " relay's file, or try another network",
-    "http_404": "a web server answers there, but not for this path: correct the URL, or the web server before the"
-    " relay",
-    "http_": "a web server, proxy or login page answers there and refuses the WebSocket: log in to this network, or"
-    " correct the web server before the relay (uavlinkd/relay/README.md)",
+    "proxy_not_understood": "HTTPS_PROXY is wrong, or no HTTP proxy answers there: write http://HOST:PORT",
+    "tls": f"no TLS at this port, or a firewall that inspects TLS ends it: {_COMPARE}",
+    "slow_handshake": f"something accepts the connection and does not answer: {_COMPARE}",
+    "http_404": "a web server answers there, but not for this path: correct the URL, or the server before the relay",
+    "http_": "a web server, proxy or login page there refuses: log in to this network, or correct the web server",
+    **dict.fromkeys(_BROKEN, f"what answers there is no relay: {_COMPARE}"),
     **dict.fromkeys(
-        ("not_websocket", "long_header", "text", "fragment", "long_message", "protocol", "pings"), _NOT_A_RELAY
+        _CUT, "the connection ends soon: wait for the next one; a firewall may cut it: try another network"
     ),
-    **dict.fromkeys(("closed", "no_pong", "not_reading", "ECONNRESET", "EPIPE", "ETIMEDOUT"), _CUT),
-    "silent": "it is connected, and gets no answer: the public_key of the [[relay]] must be what `uavlinkd pubkey`"
-    " prints there, and this daemon a member",
+    "silent": "it is connected, and gets no answer: compare the public_key of the [[relay]] with `uavlinkd pubkey`"
+    " there, and look whether this daemon is a member there",
 }
-"""Why a member does not reach its relay by TLS. ``http_`` and ``proxy_`` stand for any other status of HTTP.
-
-uavlinkd/ops/README.md has the same list.
-"""
+"""Why a member does not reach its relay by TLS, as in ops/README.md. ``http_`` and ``proxy_``: any other status."""
 
 ERROR_MEANINGS: Final[Mapping[str, str]] = {
     # The network.

@@ -115,7 +115,7 @@ def _path(path: Status, address: str) -> dict[str, Any]:
         "network": path["network"] or "",
         "address": address,
         "way": "direct" if path["relay"] is None else f"relay {path['relay']}",
-        "condition": path["state"],
+        "condition": words.condition(path),
         "state": words.path_state(path),
         "carries": words.carried(path),
         "rtt": path["round_trip_s"],
