@@ -5,11 +5,13 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
+import sys
 from collections import defaultdict
 from pathlib import Path
 
 import pytest
 
+from tests.namespaces import Namespace, NamespaceError, need_namespaces
 from tests.needs import need
 from uavlinkd.link.daemon import HOUSEKEEPING_S
 
@@ -110,3 +112,21 @@ def test_relay_is_restarted_and_isolated_as_a_daemon_is() -> None:
     assert relay["PrivateDevices"] == ["yes"]
     assert relay["ExecStart"] == ["/opt/uavlinkd/bin/uavlinkd relay --config /etc/uavlinkd/relay.toml"]
     assert (relay["DynamicUser"], relay["LoadCredential"]) == (["yes"], ["keys:/etc/uavlinkd/relay"])
+
+
+def test_relay_listens_on_port_443_with_the_setting_of_the_readme() -> None:
+    """The service and the container have no capability, and other units of the machine are not touched."""
+    need_namespaces()
+    readme = (UNITS.parent / "uavlinkd/relay/README.md").read_text()
+    setting = re.search(r"echo net\.ipv4\.(\w+)=(\d+) \|", readme)
+    assert setting is not None
+    assert settings("uavlinkd-relay.service")["AmbientCapabilities"] == [""]
+    assert "cap_drop: [ALL]" in (UNITS.parent / "configs/compose.relay.yaml").read_text()
+    listen = "import os; from socket import *; os.setuid(65534); create_server(('', 443))"
+    listen += "; create_server(('::', 443), family=AF_INET6)"
+    with Namespace() as host:
+        with pytest.raises(NamespaceError, match="Permission denied"):
+            host.run(sys.executable, "-c", listen)
+        with host.entered():
+            Path("/proc/sys/net/ipv4", setting[1]).write_text(setting[2])
+        host.run(sys.executable, "-c", listen)

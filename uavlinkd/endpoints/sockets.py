@@ -286,7 +286,7 @@ def family_of(host: str) -> socket.AddressFamily:
 
 _REMEDIES = {
     errno.EADDRINUSE: "end the process that listens there (`ss -lntup` names it), or write another port",
-    errno.EACCES: "write a port of 1024 or more: lower ones need root, or CAP_NET_BIND_SERVICE in the unit",
+    errno.EACCES: "write a port from 1024 on: lower ones are for root, or see uavlinkd/relay/README.md",
 }
 
 
