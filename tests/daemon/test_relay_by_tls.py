@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import pytest
+
 from tests.daemon.fleet import drone_and_ground, relay_for
 from tests.daemon.frames import heartbeat
 from tests.daemon.harness import Stage
@@ -9,6 +13,7 @@ from tests.daemon.members import CertifiedFleet, is_up
 from tests.daemon.process import DaemonProcess
 from tests.daemon.tls import listen_for_tls
 from tests.daemon.udp import Client, Sockaddr
+from uavlinkd.config.keys import generate_private_key, public_key_text
 from uavlinkd.core.certificates import MemberRole
 from uavlinkd.lab.sim.loopback_ports import free_port
 
@@ -107,3 +112,24 @@ async def test_members_of_a_fleet(stage: Stage) -> None:
     await vehicle.until(lambda status: is_up(status, "ground"))
     await ground.until(lambda status: is_up(status, "drone1"))
     assert await carrying(vehicle) == url
+
+
+@pytest.mark.parametrize(
+    ("is_key_wrong", "text"),
+    [(False, "no process listens there now (ECONNREFUSED)"), (True, "gets no answer (silent)")],
+)
+async def test_status_names_why_a_relay_with_a_url_alone_is_silent(
+    stage: Stage, *, is_key_wrong: bool, text: str
+) -> None:
+    """Its port is closed, or it has another key: then it answers no stranger."""
+    scene = Scene(stage)
+    member, relay = scene.drone, scene.drone.config["relay"][0]
+    relay["addresses"] = [scene.url if is_key_wrong else f"wss://127.0.0.1:{free_port()}/uavlink"]
+    if is_key_wrong:
+        relay["public_key"] = public_key_text(generate_private_key())
+    await stage.start(scene.relay, member, linked=False)
+
+    def is_named(status: dict[str, Any]) -> bool:
+        return any(one["cause"] == "relay_not_answering" and text in one["text"] for one in status["findings"])
+
+    await member.until(is_named)
