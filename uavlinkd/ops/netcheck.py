@@ -123,8 +123,8 @@ NO_RELAY = (
     " its fleet. Compare addresses and public_key. `uavlinkd status` here and there names the cause"
 )
 BY_TLS = (
-    "TLS works where UDP does not: a firewall drops it, or the address for UDP is wrong. TCP delivers late what UDP"
-    " would lose, so let UDP through where you can"
+    "TLS works where UDP does not: a firewall drops it, or the address for UDP is wrong or missing. TCP delivers late"
+    " what UDP would lose, so let UDP through where you can"
 )
 ONE_RELAY = (
     "UDP gets out, so the cause is at the silent relay or close to it: it is off, its address or public_key is wrong,"
