@@ -68,6 +68,7 @@ ALSO = {
     "endpoints.*.clients.*.last_received_s": "null",
     "recording": "null",
     "relay.https": "null",
+    "process.resident_bytes": "null",
     "fleet.events.*": "number",
     "networks.*.serial.radio": "object",
     **{f"networks.*.serial.radio.{name}": "integer" for name in RADIO_FIGURES},

@@ -42,6 +42,7 @@ class DaemonParts:
         self.config = config
         """The one in force."""
         self.log = log
+        self.started_at = now
         admit = None if config.fleet is None else self._admit
         self.node = node = Node(
             config.private_key, os.urandom, now, screen=screen, admit=admit, most_admitted=most_members(config)

@@ -1,10 +1,16 @@
-"""The status of a daemon: plain values for JSON, without secrets. ``ops/metrics.py`` exports them by their keys."""
+"""The status of a daemon: plain values for JSON, without secrets. ``web/metrics.py`` exports them by their keys."""
 
 from __future__ import annotations
 
+import os
+import platform
+import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path as FilePath
 from typing import Any
 
+from uavlinkd import __version__
 from uavlinkd.authority.enrolment import fingerprint_of
 from uavlinkd.config.keys import encode_key
 from uavlinkd.core.path import Path, SocketAddress, relay_name
@@ -21,7 +27,7 @@ from uavlinkd.link.traffic_problems import has_no_client, is_contested
 from uavlinkd.mavlink.dialect import command_name, name_of
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import ANY_OTHER, REFUSALS, Refusal
-from uavlinkd.ops import STATUS_SCHEMA
+from uavlinkd.ops import LOG_SCHEMA, STATUS_SCHEMA
 from uavlinkd.ops.findings import Finding
 from uavlinkd.ops.log import shown
 from uavlinkd.relay.service import RelayMember, RelayService
@@ -29,6 +35,7 @@ from uavlinkd.system.addresses import Address
 
 WayOf = Callable[[Path], tuple[str | None, SocketAddress | None]]
 """The name of a path's network, if the configuration names any, and the relay's address along a relayed path."""
+_STATM = FilePath("/proc/self/statm")
 
 
 def overview(daemon: DaemonParts, now: float, detailed: Collection[str]) -> dict[str, object]:
@@ -47,7 +54,21 @@ def daemon_status(daemon: DaemonParts, now: float) -> dict[str, object]:
     (``contested``). ``stopped_there``: peers that say so of themselves; that is a claim, and health checks act on
     ``frames_pass``.
     """
-    return _status(daemon, now, find(daemon, now), daemon.links)
+    status = _status(daemon, now, find(daemon, now), daemon.links)
+    return status | {"process": _own_process() | {"uptime_s": now - daemon.started_at}}
+
+
+def _own_process() -> dict[str, object]:
+    resident_bytes = None
+    with suppress(OSError):  # as on other systems than Linux
+        resident_bytes = int(_STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    return {
+        "version": __version__,
+        "python": platform.python_version(),
+        "log_schema": LOG_SCHEMA,
+        "cpu_s": time.process_time(),
+        "resident_bytes": resident_bytes,
+    }
 
 
 def _status(
