@@ -59,7 +59,7 @@ def test_ten_lines_are_enough(tmp_path: Path) -> None:
     assert peer.addresses == (PeerAddress(Address("10.13.0.2", 5790)),)
     assert (peer.settings.link, peer.settings.psk, peer.egress) == (Link(), None, EgressSettings())
     assert (config.log.level, config.log.format, config.relays_frames) == ("info", "auto", False)
-    assert (config.control_socket, config.metrics, config.recording, config.networks) == (None, None, None, ())
+    assert (config.control_socket, config.recording, config.networks) == (None, None, ())
     assert config.warnings == ()
 
 
@@ -68,13 +68,12 @@ def test_every_section_is_read(tmp_path: Path) -> None:
     config = load(
         tmp_path,
         f'control_socket = "a.sock"\n{HEAD}{ENDPOINT}radio_status = true\nstatus_text = true\n{PEER}[routing]\n'
-        'relay = true\n[metrics]\nlisten = "127.0.0.1:9790"\n[log]\nlevel = "debug"\nformat = "json"\n'
+        'relay = true\n[log]\nlevel = "debug"\nformat = "json"\n'
         '[recording]\nfolder = "flights"\n',
     )
     assert config.control_socket == tmp_path / "a.sock"
     assert (config.endpoints[0].radio_status, config.endpoints[0].status_text) == (True, True)
     assert config.relays_frames
-    assert config.metrics == Address("127.0.0.1", 9790)
     assert (config.log.level, config.log.format) == ("debug", "json")
     assert config.recording == Recording(tmp_path / "flights", 100, 1_000_000_000)
     assert config.warnings == ()
@@ -370,10 +369,6 @@ _WARNED = [
     (
         GOOD.replace("127.0.0.1", "0.0.0.0").replace("[[peer]]", 'role = "observer"\n[[peer]]'),
         r"any sender.*send what its policy passes",
-    ),
-    (
-        GOOD + '[metrics]\nlisten = "0.0.0.0:9790"\n',
-        r'metrics\.listen is beyond loopback.*reads the links of this daemon.*listen = "127\.0\.0\.1:9790"',
     ),
     (HEAD + PEER, r"no \[\[endpoint\]\]"),
     (HEAD + PEER + "[routing]\nrelay = true\n", r"no \[\[endpoint\]\]"),

@@ -14,7 +14,6 @@ from uavlinkd.config.model import Config
 from uavlinkd.config.schema import (
     EndpointSection,
     LinkSection,
-    MetricsSection,
     PolicySection,
     RecordingSection,
     RoutingSection,
@@ -67,11 +66,10 @@ def test_configuration_in_a_readme_is_valid(tmp_path: Path, text: str) -> None:
 def test_station_has_every_default() -> None:
     """The ground station's file contains every key with its default, and names each key of a policy."""
     table = tomllib.loads(STATION)
-    off = {"metrics": {"listen"}, "recording": {"folder"}}  # the file has these as comments
+    off = {"recording": {"folder"}}  # the file has it as a comment
     for name, model in (
         ("link", LinkSection),
         ("routing", RoutingSection),
-        ("metrics", MetricsSection),
         ("recording", RecordingSection),
     ):
         assert set(table[name]) == set(model.model_fields) - off.get(name, set())

@@ -56,7 +56,7 @@ _PEER_ROWS = [
     ('Endpoint = "10.0.0.1:1"', "Endpoint", "addresses"),
     ('interface = "wlan0"', "interface", 'a [[network]] "mesh" with this'),
     ("colour = 'red'", "colour", "the keys are"),
-    ("metrics = 1", "metrics", "write [metrics], a section of its own"),
+    ("recording = 1", "recording", "write [recording], a section of its own"),
     ("confidental = true", "confidental", "did you mean confidential?"),
 ]
 # Old and new text in the good file.
@@ -116,12 +116,7 @@ _FILE_ROWS = [
         "key of peer[0] (drone1) too: each peer has its own",
     ),
     (TOP + ENDPOINT + OTHER_PEER, "peer[0].addresses (drone2)", "neither end could initiate"),
-    (GOOD + '[metrics]\nlisten = "127.0.0.1"\n', "metrics.listen", "127.0.0.1:5790"),
-    (
-        GOOD.replace("udpin", "tcpin") + '[metrics]\nlisten = "127.0.0.1:14550"\n',
-        "metrics.listen",
-        f"is where {_SECOND} listens",
-    ),
+    (GOOD + "[metrics]\n", "metrics", "was removed: delete [metrics]; `uavlinkd web` serves http://127.0.0.1:8790"),
     (GOOD + "[recording]\nmin_free_bytes = 1e6\n", "recording.min_free_bytes", "min_free_bytes = 1_000_000_000"),
     # Networks.
     (networks(LTE + LTE.replace("wwan0", "wwan1")), "network[1].name (lte)", "the name of network[0] (lte) too"),

@@ -108,5 +108,3 @@ def test_its_port_is_its_own(tmp_path: Path) -> None:
     """Two cannot listen on one."""
     tcp = '[[endpoint]]\nname = "tcp"\nurl = "tcpin:127.0.0.1:5443"\n'
     assert "where endpoint[1] (tcp) listens" in refused(tmp_path, _RELAY + tcp + HTTPS)["relay_server.https"]
-    metrics = '[metrics]\nlisten = "127.0.0.1:5443"\n'
-    assert "where the relay listens" in refused(tmp_path, _RELAY + metrics + HTTPS)["metrics.listen"]

@@ -15,7 +15,6 @@ from tests.daemon.harness import Stage
 from tests.daemon.test_reload import reload
 from tests.daemon.tls import listen_for_tls
 from tests.waiting import PATIENCE_S
-from uavlinkd.lab.sim.loopback_ports import free_port
 
 HOOK = """
 import atexit, sys
@@ -67,19 +66,20 @@ async def imported(hook: Path, *packages: str) -> list[str]:
 
 
 async def test_a_daemon_imports_no_laboratory(stage: Stage) -> None:
-    """Neither ``lab``, matplotlib nor pymavlink, with every part in use: endpoints, metrics, recording, a reload."""
+    """Nor what the page speaks HTTP with, nor pymavlink, with every part in use: endpoints, recording, a reload."""
     a, b = stage.pair()
     a.add_endpoint("client")
     a.add_endpoint("server", "tcp:127.0.0.1:9")
     a.add_endpoint("autopilot", "serial:/dev/absent.test:57600")
-    a.config |= {"metrics": {"listen": f"127.0.0.1:{free_port()}"}, "recording": {"folder": "recordings"}}
+    a.config["recording"] = {"folder": "recordings"}
     hook, environ = hooked(stage, HOOK)
     await a.start(environ)
     await b.start()
     await a.until_linked()
     assert await reload(a) == []
     assert await a.stop() == 0
-    assert await imported(hook, "uavlinkd.lab", "matplotlib", "pymavlink", *OF_TLS) == []
+    of_page = "starlette", "uvicorn", "prometheus_client"
+    assert await imported(hook, "uavlinkd.lab", "matplotlib", "pymavlink", *of_page, *OF_TLS) == []
 
 
 @pytest.mark.parametrize("has_tls", [False, True])

@@ -87,7 +87,7 @@ async def test_check_survives_a_reader_that_leaves(stage: Stage) -> None:
     assert result.stderr == ""
 
 
-async def test_it_runs_without_control_socket_recording_and_metrics(stage: Stage) -> None:
+async def test_it_runs_without_control_socket_and_recording(stage: Stage) -> None:
     """Sockets and files are there only where the configuration names them: no TCP socket listens."""
     a, b = stage.pair()
     del a.config["control_socket"]

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import asyncio
-import urllib.request
 from base64 import b64encode
 from pathlib import Path
 
@@ -14,7 +13,6 @@ from tests.daemon.frames import frame
 from tests.daemon.harness import Stage, secret_forms
 from tests.daemon.test_life import run
 from uavlinkd.config import keys
-from uavlinkd.lab.sim.loopback_ports import free_port
 
 KEY = b64encode(bytes(range(130, 162))).decode()
 """With + and / in it; so the other spelling of base64 differs."""
@@ -37,12 +35,11 @@ def test_search_finds_what_is_there() -> None:
 
 @pytest.mark.long
 async def test_nothing_that_a_daemon_gives_away_holds_a_key(stage: Stage) -> None:
-    """Log at its most talkative, status, metrics, recordings, what /proc shows, and what its commands print."""
+    """Log at its most talkative, status, recordings, what /proc shows, and what its commands print."""
     a, b = stage.pair(confidential=True)
     for daemon in (a, b):
         daemon.config["log"] = {"level": "debug"}
         daemon.config["recording"] = {"folder": "recordings", "min_free_bytes": 100_000}
-        daemon.config["metrics"] = {"listen": f"127.0.0.1:{free_port()}"}
     into = a.add_endpoint("autopilot")
     await stage.start(a, b)
     client = await stage.client()
@@ -54,8 +51,6 @@ async def test_nothing_that_a_daemon_gives_away_holds_a_key(stage: Stage) -> Non
         await daemon.status()
         output += [line.encode() for line in (*daemon.lines, *daemon.statuses)]
         output += [Path(f"/proc/{daemon.pid}/{name}").read_bytes() for name in ("cmdline", "environ")]
-        url = f"http://{daemon.config['metrics']['listen']}/metrics"
-        output.append(await asyncio.to_thread(lambda url=url: urllib.request.urlopen(url).read()))  # type: ignore[misc]
         output += [path.read_bytes() for path in (daemon.folder / "recordings").iterdir()]
         for command in (["check"], ["status", "--json"], ["status"], ["peer", "list"], ["reload"]):
             done = await asyncio.to_thread(run, daemon, *command)

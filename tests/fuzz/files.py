@@ -31,7 +31,7 @@ CONFIGS: Final = Path(__file__).resolve().parents[2] / "configs"
 WORDS: Final = tuple(
     word.encode()
     for word in (
-        *("[link]\n", "[[peer]]\n", "\n[peer]\n", "\n[endpoint]\n", "[[endpoint]]\n", "[routing]\n", "[metrics]\n"),
+        *("[link]\n", "[[peer]]\n", "\n[peer]\n", "\n[endpoint]\n", "[[endpoint]]\n", "[routing]\n"),
         *("[recording]\n", "[log]\n", "[peer]\n", "[endpoint]\n"),
         *("name = ", "public_key = ", "addresses = ", "url = ", "suites = ", "system_ids = ", "role = ", "listen = "),
         *("psk_file = ", "tag_bits = ", "rate_in = {", "allow_in = [", "deny_out = [", "keepalive_s = "),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import re
 import tomllib
 from collections.abc import Callable
 from typing import Any, Final, NamedTuple
@@ -24,7 +23,7 @@ from uavlinkd.lab.sim import tlog
 from uavlinkd.link import direct_search, relays
 from uavlinkd.mavlink import frames, routing
 from uavlinkd.mavlink.policy import gate
-from uavlinkd.ops import control, metrics_server
+from uavlinkd.ops import control
 from uavlinkd.relay import forwarding, service
 
 
@@ -207,9 +206,6 @@ PLANTS: Final = {
         control.ControlServer,
         "_respond",
         _raises(KeyError(), lambda request: max(request, default=0) > 127),
-    ),
-    "metrics for an invalid request": Plant(
-        "metrics", metrics_server, "_REQUEST_LINE", lambda _: re.compile(rb"(\S*) (/[!-~]*).*")
     ),
     "a name is looked up blindly": Plant("config", config_checks, "check", _blind_look_up),
     "a message quotes the file": Plant(

@@ -21,7 +21,6 @@ from tests.fuzz import (
 from tests.fuzz.engine import Target
 
 _CONTROL: Final = (b"status", b"reload", b"\n", b"\r\n")
-_HTTP: Final = (b"GET ", b"HEAD ", b"/metrics", b" HTTP/1.1\r\n", b"Host: ", b"\r\n\r\n", b"[::1]")
 
 _TARGETS: Final = (
     Target("idle", "datagrams before any handshake", outsiders.make_idle, 4096),
@@ -44,7 +43,6 @@ _TARGETS: Final = (
     Target("gate", "frames at a policy", frames.make_gate),
     Target("switch", "frames from six ports through policies and router", frames.make_switch),
     Target("control", "the control socket", requests.make_control, 512, _CONTROL),
-    Target("metrics", "HTTP at the metrics port", requests.make_metrics, 10_000, _HTTP, True),
     Target("config", "the configuration", files.make_config, 4096, files.WORDS, True, files.config_seeds),
     Target("mitm", "the man in the middle's settings", files.make_mitm, 4096, files.WORDS, True, files.mitm_seeds),
     Target("manifest", "a fleet's manifest", files.make_manifest, 4096, files.WORDS, True),

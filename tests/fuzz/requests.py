@@ -1,4 +1,4 @@
-"""Requests to the daemon: the control socket's lines and Prometheus's HTTP, through the servers' own coroutines."""
+"""Requests to the daemon: the lines of the control socket, through the server's own coroutine."""
 
 from __future__ import annotations
 
@@ -9,14 +9,11 @@ from pathlib import Path
 
 from tests.fuzz.engine import Run
 from uavlinkd.ops.control import MAX_REQUEST_BYTES, ControlServer
-from uavlinkd.ops.metrics_server import MetricsServer
-from uavlinkd.system.addresses import Address
 
 KNOWN = ("status", "reload")
 LOOP = asyncio.new_event_loop()
 """Of all scripts; it is closed when the process ends."""
 atexit.register(LOOP.close)
-_STATUSES = {200, 400, 404, 405, 421, 431}
 
 
 class Connection(asyncio.Transport):
@@ -25,39 +22,19 @@ class Connection(asyncio.Transport):
     def __init__(self) -> None:
         super().__init__()
         self.written = bytearray()
-        self.is_closed = self.is_aborted = False
+        self.is_closed = False
         protocol = asyncio.streams.FlowControlMixin(LOOP)
         protocol._get_close_waiter = lambda _: LOOP.create_future()  # type: ignore[attr-defined]
-        self.reader = asyncio.StreamReader(limit=1, loop=LOOP)
-        self.writer = asyncio.StreamWriter(self, protocol, self.reader, LOOP)
+        self.writer = asyncio.StreamWriter(self, protocol, None, LOOP)
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
         self.written += data
 
-    def write_eof(self) -> None:
-        """No more bytes follow."""
-
     def is_closing(self) -> bool:
         return self.is_closed
 
-    def pause_reading(self) -> None:
-        """Not needed here."""
-
-    resume_reading = pause_reading
-
     def close(self) -> None:
         self.is_closed = True
-
-    def abort(self) -> None:
-        self.is_aborted = True
-
-
-def _reader(data: bytes, limit: int) -> asyncio.StreamReader:
-    """The bytes, and then the end of the stream."""
-    reader = asyncio.StreamReader(limit=limit, loop=LOOP)
-    reader.feed_data(data)
-    reader.feed_eof()
-    return reader
 
 
 def make_control() -> Run:
@@ -73,7 +50,10 @@ def make_control() -> Run:
     def run(data: bytes) -> None:
         asked.clear()
         connection = Connection()
-        LOOP.run_until_complete(server._serve(_reader(data, MAX_REQUEST_BYTES), connection.writer))
+        reader = asyncio.StreamReader(limit=MAX_REQUEST_BYTES, loop=LOOP)
+        reader.feed_data(data)
+        reader.feed_eof()
+        LOOP.run_until_complete(server._serve(reader, connection.writer))
         assert connection.is_closed, "the connection was left open"
         assert server._connections == 0, "a closed connection is counted"
         line = data.partition(b"\n")[0]
@@ -86,30 +66,5 @@ def make_control() -> Run:
         (request,) = asked
         assert request == line.decode("utf-8", "replace").strip(), "another request than was sent"
         assert reply == ({"asked": request} if request in KNOWN else {"error": "unknown request"})
-
-    return run
-
-
-def make_metrics() -> Run:
-    """One connection per script: one well-formed answer or none; the content only for a request of it."""
-    server = MetricsServer(Address("127.0.0.1", 9000), lambda: b"metric 1\n")
-
-    def run(data: bytes) -> None:
-        connection = Connection()
-        LOOP.run_until_complete(server._serve(_reader(data, 8192), connection.writer))
-        assert connection.is_closed, "the connection was left open"
-        assert not server._connections, "a closed connection is counted"
-        if not connection.written:
-            assert connection.is_aborted
-            assert b"\r\n\r\n" not in data[:8192], "a request was not answered"
-            return
-        head, _, body = bytes(connection.written).partition(b"\r\n\r\n")
-        version, status, *_ = head.split(b" ")
-        assert version == b"HTTP/1.1"
-        assert int(status) in _STATUSES
-        assert head.count(b"\r\n") <= 7, "an injected header"
-        if b"metric 1" in body:
-            assert data.startswith((b"GET /metrics ", b"GET /metrics?")), "content without a request"
-            assert int(status) == 200
 
     return run

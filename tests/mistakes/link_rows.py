@@ -96,7 +96,7 @@ LINK_ROWS = (
         command=r"tag_bits: must be 64, 96, 128 or 256",
         signs=_here("configuration_refused", r"`uavlinkd check --config .*` prints, and run `uavlinkd reload`"),
     ),
-    Mistake("51", scenes.reload_listen, command=r"metrics: cannot change while the daemon runs: restart it"),
+    Mistake("51", scenes.reload_listen, command=r"recording: cannot change while the daemon runs: restart it"),
     Mistake(
         "52",
         scenes.without_restart,

@@ -266,7 +266,7 @@ async def reload_listen(scene: Scene) -> None:
     """It gets a file with a key that needs a restart."""
     scene.introduce()
     await scene.start(scene.here)
-    scene.here.config["metrics"] = {"listen": f"127.0.0.1:{free_port()}"}
+    scene.here.config["recording"] = {"folder": "recordings"}
     scene.command = await said_by_process("reload", "--config", str(scene.here.write_config()))
 
 

@@ -43,7 +43,6 @@ def advice(config: Config) -> Iterator[str]:
         yield f"{'every peer' if names == every and len(every) > 1 else ', '.join(names)}: {warning}"
     yield from _shared_systems(endpoints, peers)
     yield from _relayed(peers, config.relays_frames)
-    yield from _exposed_metrics(config.metrics)
     yield from _reach(() if config.has_ip_networks else config.listen, peers)
     yield from _shared(peers)
     if config.is_only_relay:
@@ -155,15 +154,6 @@ def _relayed(peers: Sequence[PeerConfig], relays_frames: bool) -> Iterator[str]:
             " operator (mission items, parameters, file transfer) are writes to another vehicle, so a captured"
             ' vehicle can change the others through this daemon; link them directly as "swarm-member" instead,'
             " or let each vehicle accept only the operator's system_ids"
-        )
-
-
-def _exposed_metrics(metrics: Address | None) -> Iterator[str]:
-    if metrics is not None and not metrics.is_loopback:
-        yield (
-            f"metrics.listen is beyond loopback ({metrics}): any client that reaches that port reads the links of"
-            " this daemon, their times and traffic, unencrypted; open the firewall for Prometheus only, or write"
-            f' listen = "127.0.0.1:{metrics.port}"'
         )
 
 

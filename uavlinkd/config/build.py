@@ -76,7 +76,6 @@ def build(path: Path, file: Sections, states: Path) -> Config:
         peers=(*pinned, *(_contact_peers(file, fleet) if fleet else ())),
         relays_frames=file.routing.get("relay", False),
         control_socket=file.folder / socket if socket else None,
-        metrics=file.metrics.get("listen"),
         recording=_recording(file),
         log=Log(**file.log.valid),
         networks=tuple(network_of(network) for network in file.networks),

@@ -17,7 +17,6 @@ _FIXED = {
     "control_socket": "control_socket",
     "log": "log",
     "relays_frames": "routing",
-    "metrics": "metrics",
     "recording": "recording",
 }
 """Fields that cannot change while the daemon runs, with the key of each in the file."""

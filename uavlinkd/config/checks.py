@@ -71,11 +71,7 @@ def _reaches(target: Address, listening: Address) -> bool:
 def _endpoints(file: Sections) -> Found:
     """Each endpoint has a port of its own, which is not a port for peers, and does not feed another endpoint."""
     listen: list[Address] = file.top.get("listen", [])
-    metrics: Address | None = file.metrics.get("listen")
     https: HttpsServer | None = file.relay_server.get("https")
-    own_ports = (file.metrics.at("listen"), metrics), (file.relay_server.at("https"), https and https.listen)
-    if metrics and https and overlaps(metrics, https.listen):
-        yield file.metrics.at("listen"), "is where the relay listens, relay_server.https: write another port"
     urls = [(section, url) for section in file.endpoints if isinstance(url := section.get("url"), NetworkUrl)]
     for section, url in urls:
         key = section.at("url")
@@ -83,9 +79,8 @@ def _endpoints(file: Sections) -> Found:
             yield key, f"has the port that `listen` has for peers, {url.address.port}: write another"
         if url.kind is EndpointKind.UDPOUT and any(_reaches(url.address, own) for own in listen):
             yield key, "sends to this daemon's own port for peers: write the address of the MAVLink client"
-        for place, address in own_ports:
-            if address and url.kind is EndpointKind.TCPIN and overlaps(address, url.address):
-                yield place, f"is where {section.at()} listens: write another port"
+        if https and url.kind is EndpointKind.TCPIN and overlaps(https.listen, url.address):
+            yield file.relay_server.at("https"), f"is where {section.at()} listens: write another port"
     for (other, other_url), (section, url) in combinations(urls, 2):
         if message := _clash(url, other_url):
             yield section.at("url"), message.format(other=other.at())

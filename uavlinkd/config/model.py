@@ -250,9 +250,8 @@ class Config:
     """The complete configuration of a daemon. Its secrets do not print.
 
     ``listen`` is empty if the daemon only initiates. ``relays_frames``: whether frames from a peer may go to other
-    peers. ``metrics`` is the address of the server for Prometheus.
-    ``warnings`` are sentences for a person; the daemon runs in spite of them. If ``networks`` has no interface or
-    address, the kernel's routes decide how to reach peers over IP.
+    peers. ``warnings`` are sentences for a person; the daemon runs in spite of them. If ``networks`` has no interface
+    or address, the kernel's routes decide how to reach peers over IP.
     """
 
     path: Path
@@ -264,7 +263,6 @@ class Config:
     peers: tuple[PeerConfig, ...]
     relays_frames: bool
     control_socket: Path | None
-    metrics: Address | None
     recording: Recording | None
     log: Log
     networks: tuple[NetworkConfig, ...] = ()

@@ -63,7 +63,6 @@ class Sections:
     link: Values
     log: Values
     routing: Values
-    metrics: Values
     recording: Values
     relay_server: Values
     fleet: Values
@@ -250,15 +249,20 @@ _OTHERS_CALL_IT: dict[type[schema.Section], dict[str, str]] = {
 """Names that WireGuard and common usage have for keys of any section or of one, where the most similar is another."""
 
 
-_REMOVED = (
-    "was removed: to change a key, write the new public key into the other ends' files, restart the daemon whose key"
-    " it is, and reload the others at the same time; in a fleet, `uavlinkd fleet rotate NAME` writes the files"
-)
+_REMOVED = {
+    **dict.fromkeys(
+        ("previous_public_key", "previous_private_key_file"),
+        "to change a key, write the new public key into the other ends' files, restart the daemon whose key it is,"
+        " and reload the others at the same time; in a fleet, `uavlinkd fleet rotate NAME` writes the files",
+    ),
+    "metrics": "delete [metrics]; `uavlinkd web` serves http://127.0.0.1:8790/metrics",
+}
+"""Keys and sections that files of earlier versions may have."""
 
 
 def unknown_key(key: str, model: type[schema.Section]) -> str:
-    if key in ("previous_public_key", "previous_private_key_file"):  # files of earlier versions may have them
-        return _REMOVED
+    if key in _REMOVED:
+        return f"was removed: {_REMOVED[key]}"
     plain = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|[ -]", "_", key).lower()
     for section in (model, schema.Section):
         if remedy := _OTHERS_CALL_IT.get(section, {}).get(plain):

@@ -380,10 +380,6 @@ class RoutingSection(Section):
     relay: bool = False
 
 
-class MetricsSection(Section):
-    listen: ListenAddress | None = Field(default=None, examples=['"127.0.0.1:9790"'])
-
-
 class RecordingSection(Section):
     folder: FileName | None = Field(default=None, examples=['"recordings"'])
     max_files: int = Field(default=100, ge=2, le=100_000)
@@ -408,7 +404,6 @@ SINGLE: dict[str, type[Section]] = {
     "link": LinkSection,
     "log": LogSection,
     "routing": RoutingSection,
-    "metrics": MetricsSection,
     "recording": RecordingSection,
     "relay_server": RelayServerSection,
     "fleet": FleetSection,

@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from uavlinkd.core.outputs import Output
-    from uavlinkd.ops.metrics_server import MetricsServer
 
 HOUSEKEEPING_S = INTERVAL_S
 """How often links are measured, and idle clients forgotten."""
@@ -54,14 +53,12 @@ class Daemon:
     def __init__(self, config: Config) -> None:
         self.log = structlog.get_logger().bind(daemon=config.name)
         self._loop = asyncio.get_running_loop()
-        self._started_at = now = monotonic()
-        self.parts = DaemonParts(config, self.log, now, self._perform)
+        self.parts = DaemonParts(config, self.log, monotonic(), self._perform)
         self.carrier = FrameCarrier(self.parts)
         self._notes = PilotNotes(self.parts.switch.router.addresses)
         self._housekeeping: asyncio.TimerHandle | None = None
         self._reporting: asyncio.Handle | None = None
         self._control: ControlServer | None = None
-        self._metrics: MetricsServer | None = None
         self._supervisor = Supervisor(os.environ, os.getpid())
         self._reload_lock = asyncio.Lock()
         self._hangups: set[asyncio.Task[None]] = set()
@@ -91,10 +88,6 @@ class Daemon:
             relay = config.relay_server
             parts.peer_sockets.open(config.listen, config.networks, relay.https if relay is not None else None)
             parts.local.open(config.endpoints)
-            if config.metrics is not None:
-                from uavlinkd.ops.metrics_server import serve_metrics  # noqa: PLC0415  only if configured
-
-                self._metrics = await serve_metrics(config.metrics, lambda: daemon_status(parts, monotonic()))
             if config.control_socket is not None:
                 self._control = ControlServer(config.control_socket, self.answer)
                 await self._control.start()
@@ -139,13 +132,11 @@ class Daemon:
         if parts.recorder is not None:
             await parts.recorder.stop(now)
         counted = {**parts.drops.plain_totals(), **parts.events.totals, **parts.peer_sockets.serial.totals}
-        self.log.info("daemon_stopped", uptime_s=round(now - self._started_at, 1), counted=counted)
+        self.log.info("daemon_stopped", uptime_s=round(now - parts.started_at, 1), counted=counted)
 
     def _close_sockets(self) -> None:
         self.parts.peer_sockets.close()
         self.parts.local.close()
-        if self._metrics is not None:
-            self._metrics.stop()
 
     def _write_warnings(self) -> None:
         for warning in self.parts.config.warnings:

@@ -27,8 +27,8 @@ LOG_LINES: Final = 300
 MAX_SECTION: Final = 200_000  # characters of a section; of a longer one the end is kept
 SERVICE_FILES: Final = Path("/etc/uavlinkd")
 _PACKAGES: Final = (
-    *("cryptography", "fastcrc", "prometheus_client", "pydantic"),
-    *("rich", "serialx", "structlog", "uvloop", "websockets"),
+    *("cryptography", "fastcrc", "prometheus_client", "pydantic", "rich", "serialx"),
+    *("starlette", "structlog", "uvicorn", "uvloop", "websockets"),
 )
 _INTRODUCTION: Final = """\
 uavlinkd report. Keys are replaced by key-1, …, the addresses of peers by

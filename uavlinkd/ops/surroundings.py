@@ -72,8 +72,6 @@ def _addresses(config: Config) -> Iterator[str]:
         for endpoint in config.endpoints
         if isinstance(endpoint.url, NetworkUrl) and endpoint.url.listens
     ]
-    if config.metrics is not None:
-        listening.append(("metrics.listen", config.metrics))
     peers = [(f'peer "{peer.name}"', written.address) for peer in config.peers for written in peer.addresses]
     interfaces = {text for number, name in socket.if_nameindex() for text in (str(number), name)}
     for key, address in [*listening, *peers]:

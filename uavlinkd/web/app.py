@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from importlib.resources import files
 
 from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
-from starlette.routing import Route
+from starlette.routing import BaseRoute, Route
 
 from uavlinkd.web.watch import Watcher
 
 _TYPES = {"page.js": "text/javascript", "page.css": "text/css", "icon.svg": "image/svg+xml"}
 
 
-def make_app(watch: Watcher) -> Starlette:
-    """The resources. Their content is read once: no path of a request leads to a file."""
+def make_app(watch: Watcher, more: Sequence[BaseRoute]) -> Starlette:
+    """The resources, ``more`` before the page's own. Content is read once: no path of a request leads to a file."""
     folder = files("uavlinkd.web") / "static"
 
     def resource(name: str, media_type: str) -> Response:
@@ -40,6 +41,7 @@ def make_app(watch: Watcher) -> Starlette:
 
     return Starlette(
         routes=[
+            *more,
             Route("/", show),
             Route("/peer/{name}", show),
             Route("/events", events),

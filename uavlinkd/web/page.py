@@ -8,12 +8,15 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from starlette.routing import Route
+
 from uavlinkd.endpoints.tcp import tcp_listener
 from uavlinkd.ops.control import ask
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic
 from uavlinkd.web.app import make_app
 from uavlinkd.web.guard import Guard
+from uavlinkd.web.scrapes import Scrapes
 from uavlinkd.web.server import WebServer
 from uavlinkd.web.watch import PATIENCE_S, Watcher
 
@@ -35,7 +38,8 @@ class Page:
         self._watch = Watcher(ask_daemon)
         self._listener = tcp_listener(address)
         self._scheme = "http" if tls is None else "https"
-        app = Guard(make_app(self._watch), names, password_hash, monotonic)
+        metrics = Route("/metrics", Scrapes(ask_daemon).answer)
+        app = Guard(make_app(self._watch, [metrics]), names, password_hash, monotonic)
         self._server = WebServer(app, self._listener, tls)
 
     def __enter__(self) -> Page:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import re
 
-from tests.ops.test_metrics import STATUS
-from uavlinkd.ops.metrics import exposition
+from tests.web.test_metrics import STATUS
+from uavlinkd.web.metrics import exposition
 
 
 def observed() -> dict[str, str]:
     """Every metric as ``gauge{peer}``."""
-    text = exposition(STATUS, 1.0).decode()
+    text = exposition(STATUS).decode()
     labels: dict[str, str] = {}
     for name, listed in re.findall(r"(?m)^(uavlinkd_\w+)(?:\{(.*)\})? ", text):
         labels[name] = ",".join(re.findall(r'(\w+)="', listed))

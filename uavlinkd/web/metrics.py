@@ -7,18 +7,13 @@ exist before.
 
 Points in time are exported as ages: a drone without a set clock knows how old a handshake is, but not its date.
 
-``prometheus_client`` writes the format. Only the metrics server imports this module: the library takes memory and
-start time, which a daemon without metrics saves.
+``prometheus_client`` writes the format.
 """
 
 from __future__ import annotations
 
-import os
-import platform
-import time
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
 from functools import reduce
 from operator import getitem
 from pathlib import Path
@@ -28,12 +23,11 @@ from prometheus_client import CONTENT_TYPE_PLAIN_0_0_4, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from uavlinkd import __version__
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.path_state import PathCondition
 from uavlinkd.core.settings import Class
 from uavlinkd.mavlink.policy.gate import Refusal
-from uavlinkd.ops import LOG_SCHEMA, METRICS_SCHEMA, STATUS_SCHEMA
+from uavlinkd.ops import METRICS_SCHEMA
 from uavlinkd.relay.forwarding import RelayReason
 
 CONTENT_TYPE = CONTENT_TYPE_PLAIN_0_0_4
@@ -45,17 +39,16 @@ Status = dict[str, Any]
 Part = tuple[tuple[str, ...], Status]
 """The values of the labels of a part of the daemon, and its part of the status."""
 
-_STATM = Path("/proc/self/statm")
 _RELAY_REASONS = (
     *(DropReason.RELAY_MALFORMED, DropReason.RELAY_UNKNOWN_HANDLE, DropReason.RELAY_OVER_LIMIT),
     *RelayReason,
 )
 
 
-def exposition(status: Status, uptime_s: float) -> bytes:
+def exposition(status: Status) -> bytes:
     """Write a status (:func:`uavlinkd.link.status.daemon_status`) as the text that Prometheus reads."""
     # Not the global registry of the library, which measures the process its own way.
-    return generate_latest(_StatusCollector({**status, "uptime_s": uptime_s}))
+    return generate_latest(_StatusCollector(status))
 
 
 class _StatusCollector(Collector):
@@ -82,15 +75,12 @@ class _StatusCollector(Collector):
 
 
 def _daemon(status: Status) -> Iterator[Part]:
-    resident = None
-    with suppress(OSError, ValueError, IndexError):
-        resident = int(_STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    process = status["process"]
+    versions = status["schema"], process["log_schema"], METRICS_SCHEMA
     facts = {
-        "cpu_s": time.process_time(),
-        "resident": resident,
         "finding": {tuple(finding[label] for label in _FINDING): 1 for finding in status["findings"]},
-        "build": {(status["name"], *_BUILD.values()): 1},
-        "schemas": {tuple(_SCHEMAS.values()): 1},
+        "build": {(status["name"], process["version"], process["python"]): 1},
+        "schemas": {tuple(map(str, versions)): 1},
     }
     yield (), status | facts
 
@@ -198,8 +188,6 @@ _FINDING = ("cause", "severity", "subject", "name")
 _SESSION = ("suite", "mode", "tag_bits")
 _STRANGERS = ("prefix_full", "displaced", "too_many_connections", "unproven", "slow_handshake")
 _STATES = ("bound", "waiting", "unanswered")  # of a peer at a relay
-_BUILD = {"version": __version__, "python": platform.python_version()}
-_SCHEMAS = {"status": str(STATUS_SCHEMA), "log": str(LOG_SCHEMA), "metrics": str(METRICS_SCHEMA)}
 
 _PARTS: Mapping[str, Callable[[Status], Iterator[Part]]] = {
     "daemon": _daemon,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
-import sys
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -13,8 +12,8 @@ from typing import Any
 from tests.needs import need
 from uavlinkd.core.drops import DropReason
 from uavlinkd.mavlink.policy.gate import Refusal
-from uavlinkd.ops import metrics
-from uavlinkd.ops.metrics import exposition
+from uavlinkd.web import metrics
+from uavlinkd.web.metrics import exposition
 
 _NUMBERS = count(1000)
 
@@ -108,6 +107,9 @@ STATUS: dict[str, Any] = {
         "members": {"drone1": {"is_up": True, **MEMBER}},
     },
     "name": "drone0",
+    "schema": 3,
+    "process": {"version": "0.1.0", "python": "3.13.5", "log_schema": 2}
+    | numbered("uptime_s", "cpu_s", "resident_bytes"),
     "networks": {
         "lte": {"is_present": True, "serial": None},
         "sik": {"is_present": True, "serial": LINE},
@@ -137,7 +139,7 @@ _SAMPLE = re.compile(r"uavlinkd_(\w+(?:\{.*\})?) (\S+)")
 
 def samples(status: dict[str, Any] = STATUS) -> dict[str, float]:
     """Values by name and labels; each pair occurs once."""
-    lines = [line for line in exposition(status, 5.0).decode().splitlines() if not line.startswith("#")]
+    lines = [line for line in exposition(status).decode().splitlines() if not line.startswith("#")]
     matches = [match for line in lines if (match := _SAMPLE.fullmatch(line)) is not None]
     values = {match[1]: float(match[2]) for match in matches}
     assert len(values) == len(lines)
@@ -185,7 +187,7 @@ def test_unknown_values_have_no_sample() -> None:
 
 def test_prometheus_accepts_the_format() -> None:
     """The checker of Prometheus accepts format and names without a remark."""
-    assert promtool("check", "metrics", given=exposition(STATUS, 1.0).decode()) == ("", "")
+    assert promtool("check", "metrics", given=exposition(STATUS).decode()) == ("", "")
 
 
 def test_counters_of_attacks_start_at_zero() -> None:
@@ -196,9 +198,3 @@ def test_counters_of_attacks_start_at_zero() -> None:
     for kind, name in ("peer", "drone1"), ("endpoint", "autopilot"):
         part = f'{kind}_refused_frames_total{{direction="in",{kind}="{name}"'
         assert all(f'{part},reason="{reason}"}}' in names for reason in Refusal)
-
-
-def test_daemon_without_metrics_does_not_load_the_library() -> None:
-    """Its start time and memory do not pay for `prometheus_client`."""
-    script = "import sys, uavlinkd.link.daemon; sys.exit('prometheus_client' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from tests.ops.test_metrics import STATUS, promtool
+from tests.web.test_metrics import STATUS, promtool
 from uavlinkd.core.drops import DropReason
-from uavlinkd.ops.metrics import exposition
+from uavlinkd.web.metrics import exposition
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 ALERTS = CONFIGS / "prometheus-alerts.yml"
 DASHBOARD = json.loads((CONFIGS / "grafana-dashboard.json").read_text())
-KNOWN = set(re.findall(r"(?m)^(uavlinkd_\w+)", exposition(STATUS, 1.0).decode()))
+KNOWN = set(re.findall(r"(?m)^(uavlinkd_\w+)", exposition(STATUS).decode()))
 
 
 def expressions() -> list[str]:

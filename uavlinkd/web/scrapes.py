@@ -1,0 +1,37 @@
+"""``GET /metrics``: the answers to Prometheus."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Final
+
+from starlette.requests import Request
+from starlette.responses import PlainTextResponse, Response
+
+from uavlinkd.ops.control import ControlError
+from uavlinkd.system.clock import monotonic
+from uavlinkd.web.metrics import CONTENT_TYPE, exposition
+from uavlinkd.web.watch import Ask
+
+CONTENT_AGE_S: Final = 0.5
+"""An answer is reused for this long: frequent requests must not take CPU time from the links."""
+
+
+class Scrapes:
+    """Answers with the metrics of the daemon; with 503 if that does not answer, so that ``up`` is 0 in Prometheus."""
+
+    def __init__(self, ask: Ask) -> None:
+        self._ask = ask
+        self._answer = Response()
+        self._answered_at = -CONTENT_AGE_S
+        self._asking = asyncio.Lock()
+
+    async def answer(self, _: Request) -> Response:
+        async with self._asking:
+            if monotonic() >= self._answered_at + CONTENT_AGE_S:
+                try:
+                    self._answer = Response(exposition(await self._ask("status")), media_type=CONTENT_TYPE)
+                except ControlError as error:
+                    self._answer = PlainTextResponse(f"{error}\n", 503)
+                self._answered_at = monotonic()
+            return self._answer
