@@ -63,7 +63,7 @@ class Guard:
         hosts = headers.getlist("host")
         if len(hosts) != 1 or not is_addressed(hosts[0], self._names):
             return _refuse(421, "this page has another name: start `uavlinkd web` with --name for each of its names")
-        if not _is_own_page(headers, f"{scope['scheme']}://{hosts[0]}"):
+        if not _is_own_page(headers, f"{scope['scheme']}://{hosts[0]}", scope["method"] in ("GET", "HEAD")):
             return _refuse(403, "another site's page asked for this one")
         if self._password_hash is None:
             if "x-forwarded-for" in headers or "forwarded" in headers:
@@ -101,9 +101,12 @@ def is_addressed(host: str, names: frozenset[str]) -> bool:
     return True
 
 
-def _is_own_page(headers: Headers, own: str) -> bool:
-    """Whether the browser sent the request for this page itself, or because a person followed a link to it."""
-    if headers.get("origin", own) != own:
+def _is_own_page(headers: Headers, own: str, is_read: bool) -> bool:
+    """Whether the browser sent the request for this page itself, or because a person followed a link to it.
+
+    A request that changes something has an origin in every browser: without one it is refused.
+    """
+    if headers.get("origin", own if is_read else None) != own:
         return False
     is_link = headers.get("sec-fetch-mode") == "navigate" and headers.get("sec-fetch-dest") == "document"
     return headers.get("sec-fetch-site", "none") in ("none", "same-origin") or is_link
