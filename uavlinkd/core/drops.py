@@ -252,7 +252,7 @@ class DropReason(Reason):
     DUPLICATE = (
         "duplicate",
         "a copy of an envelope or initiation that had just arrived: peers send copies along several paths",
-        "copies along other paths",
+        "copies of earlier ones",
         Attention.EXPLAINED,
     )
     LATE_COPY = (

@@ -217,7 +217,7 @@ def _refused(part: Status) -> dict[str, int]:
 def phrase(code: str, *lists: Iterable[Reason]) -> str:
     """A reason in plain words, for a count in front; an error of the kernel in the system's words."""
     for reason in chain(*lists):
-        if reason == code:
+        if reason == code and reason.phrase:
             return reason.phrase
     if code in ENDPOINT_FAILURES:
         return ENDPOINT_FAILURES[code]

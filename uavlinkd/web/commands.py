@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
@@ -31,10 +33,17 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 
 def _web(options: argparse.Namespace) -> int:
-    try:
+    with of_the_extra("uavlinkd web"):
         from uavlinkd.web.start import start  # noqa: PLC0415
+    return start(options)
+
+
+@contextmanager
+def of_the_extra(command: str) -> Iterator[None]:
+    """Imports that need the extra. Raises CommandError with the remedy if it is not installed."""
+    try:
+        yield
     except ModuleNotFoundError as error:
         raise CommandError(
-            f"uavlinkd web needs the extra `web` ({error.name} is missing). In a checkout: pip install '.[web]'"
+            f"{command} needs the extra `web` ({error.name} is missing). In a checkout: pip install '.[web]'"
         ) from None
-    return start(options)

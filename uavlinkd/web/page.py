@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import ssl
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from starlette.routing import Route
+from starlette.routing import BaseRoute, Route
 
 from uavlinkd.endpoints.tcp import tcp_listener
 from uavlinkd.ops.control import ask
@@ -22,7 +23,7 @@ from uavlinkd.web.watch import PATIENCE_S, Watcher
 
 
 class Page:
-    """Listens from the start on. Raises BindError if the address cannot be used."""
+    """Listens from the start on. ``more``: resources of others. Raises BindError if the address cannot be used."""
 
     def __init__(
         self,
@@ -31,6 +32,8 @@ class Page:
         names: frozenset[str] = frozenset(),
         password_hash: bytes | None = None,
         tls: ssl.SSLContext | None = None,
+        *,
+        more: Sequence[BaseRoute] = (),
     ) -> None:
         async def ask_daemon(request: str) -> dict[str, Any]:
             return await asyncio.to_thread(ask, control_socket, request, PATIENCE_S)
@@ -39,7 +42,7 @@ class Page:
         self._listener = tcp_listener(address)
         self._scheme = "http" if tls is None else "https"
         metrics = Route("/metrics", Scrapes(ask_daemon).answer)
-        app = Guard(make_app(self._watch, [metrics]), names, password_hash, monotonic)
+        app = Guard(make_app(self._watch, [*more, metrics]), names, password_hash, monotonic)
         self._server = WebServer(app, self._listener, tls)
 
     def __enter__(self) -> Page:
