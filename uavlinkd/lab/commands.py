@@ -9,6 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from uavlinkd.system.terminal import FAILED, OK, CommandError, UsageError, printable
+from uavlinkd.web.commands import of_the_extra
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -38,7 +39,11 @@ def _add_sim(sim: argparse.ArgumentParser) -> None:
 def _add_demo(demo: argparse.ArgumentParser) -> None:
     demo.set_defaults(command=_demo)
     demo.add_argument("--seconds", type=float, metavar="N", help="of traffic (default: 15, or 3 for each attack)")
-    demo.add_argument(
+    attacked = demo.add_mutually_exclusive_group()
+    attacked.add_argument(
+        "--web", action="store_true", help="until Ctrl-C, show a daemon's page in a browser, with buttons that attack"
+    )
+    attacked.add_argument(
         "--attack",
         metavar="NAME[,key=value]",
         help="attack between the drones: a name of `uavlink-mitm --list`, or all; exit status 0 if no forged, altered"
@@ -86,9 +91,17 @@ def _demo(options: argparse.Namespace) -> int:
     from uavlinkd.lab.sim.demo import DEMO_ERRORS, run_demo  # noqa: PLC0415
 
     _check_seconds(options)
+    if options.web:
+        with of_the_extra("uavlinkd demo --web"):
+            from uavlinkd.lab.sim import demo_web  # noqa: PLC0415
+    serve = demo_web.serve if options.web else None
     try:
         with interrupted_by_signals():
-            summary = asyncio.run(run_demo(options.seconds, show=not options.json, attack=options.attack))
+            summary = asyncio.run(
+                run_demo(options.seconds, show=not options.json, attack=options.attack, serve=serve)
+            )
+    except KeyboardInterrupt:
+        return OK if options.web else FAILED  # with a page, it runs until then
     except AttackError as error:
         raise UsageError(error) from None
     except DEMO_ERRORS as error:

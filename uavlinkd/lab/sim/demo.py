@@ -1,16 +1,17 @@
 """``uavlinkd demo``: two real daemons on loopback, each with a client; every frame is checked.
 
-With ``--attack``, the man in the middle between the two runs one attack after the other.
+With ``--attack``, the man in the middle between the two runs one attack after the other; with ``--web`` those that a
+person starts.
 """
 
 from __future__ import annotations
 
 import asyncio
+import math
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from contextlib import ExitStack
 from time import monotonic
-from typing import Any
 
 from rich.console import Console
 from rich.live import Live
@@ -65,6 +66,9 @@ _OPTIONS = {
     "blackout": ",seconds=60",
 }
 
+Serve = Callable[["Demo", float], Awaitable[None]]
+"""Shows a demo until this time of the monotonic clock."""
+
 
 def attacks_of(text: str) -> list[AttackSpec]:
     """The attacks that ``--attack`` names: one as for ``uavlink-mitm``, or ``all``.
@@ -80,13 +84,19 @@ def attacks_of(text: str) -> list[AttackSpec]:
 
 
 async def run_demo(
-    seconds: float | None = None, *, show: bool, attack: str | None = None, console: Console | None = None
+    seconds: float | None = None,
+    *,
+    show: bool,
+    attack: str | None = None,
+    console: Console | None = None,
+    serve: Serve | None = None,
 ) -> Summary:
     """Run the demo, on a live screen if ``show``.
 
     Args:
         seconds: of traffic; by default :data:`SECONDS`, or with attacks :data:`ATTACK_SECONDS` for each.
         attack: an attack between the drones, as for ``uavlink-mitm``, or ``all``.
+        serve: shows the demo in a browser, instead of the live screen.
 
     Raises:
         DroneError, EvaluationError: the daemons do not start or do not link.
@@ -95,47 +105,56 @@ async def run_demo(
     console = console or Console()
     specs = None if attack is None else attacks_of(attack)
     if seconds is None:
-        seconds = SECONDS if specs is None else ATTACK_SECONDS * len(specs)
+        seconds = math.inf if serve else SECONDS if specs is None else ATTACK_SECONDS * len(specs)
     link = LINK if specs is None else {**LINK, **ATTACKED_LINK}
     with private_folder("uavlinkd-demo-") as folder, ExitStack() as stack:
         # The summary replaces the live screen; after Ctrl-C it remains.
-        live = stack.enter_context(Live(console=console, auto_refresh=False)) if show else None
+        live = stack.enter_context(Live(console=console, auto_refresh=False)) if show and not serve else None
         try:
             async with DaemonStage(NAMES, folder, MiddleHere(NAMES, None, 0), link, rate_hz=RATE_HZ) as stage:
-                summary = await _Demo(stage, live).run(seconds, specs)
+                summary = await Demo(stage, live).run(seconds, specs, serve)
         except asyncio.CancelledError:
             if show:
                 console.print("Interrupted. The daemons have stopped, and their keys are deleted.")
             raise
         if live is not None:
             live.update(render_summary(summary), refresh=True)
+        elif show:
+            console.print(render_summary(summary))
     return summary
 
 
-class _Demo:
+class Demo:
+    """A demo that runs, with the results of its attacks."""
+
     def __init__(self, stage: DaemonStage, live: Live | None) -> None:
-        self._stage = stage
+        self.stage = stage
+        self.results: list[AttackResult] = []
+        self.is_attacking = False
         self._live = live
         self._began = stage.ledger.mark()
         self._drops_before = Counter[str]()
         self._noticed_before = Counter[str]()
-        self._results: list[AttackResult] = []
+        self._attempts_before = 0
 
-    async def run(self, seconds: float, specs: list[AttackSpec] | None) -> Summary:
-        stage, ledger, began_at = self._stage, self._stage.ledger, monotonic()
+    async def run(self, seconds: float, specs: list[AttackSpec] | None, serve: Serve | None) -> Summary:
+        stage, ledger, began_at = self.stage, self.stage.ledger, monotonic()
         await self._look(began_at + seconds)
         self._drops_before, self._began = self.drops(), ledger.mark()  # before, there was no session
         is_recovered = True
-        if specs is None:
-            await self._until(began_at + seconds)
+        if serve is not None:
+            await serve(self, began_at + seconds)
+        elif specs is None:
+            await self.until(began_at + seconds)
         for spec in specs or ():
-            await self._attack(spec, seconds / len(specs or ()))
+            await self.attack(spec, seconds / len(specs or ()))
+        is_attacked = specs is not None or bool(self.results)
         end, elapsed_s = ledger.mark(), monotonic() - began_at
-        if specs is None:
-            await self._until(monotonic() + DRAIN_S, lambda: len(set(ledger.count(self._began, end))) == 1)
+        if not is_attacked:
+            await self.until(monotonic() + DRAIN_S, lambda: len(set(ledger.count(self._began, end))) == 1)
         else:
             ledger.await_recovery(monotonic())
-            is_recovered = await self._until(monotonic() + RECOVERY_S, lambda: ledger.recovery_s is not None)
+            is_recovered = await self.until(monotonic() + RECOVERY_S, lambda: ledger.recovery_s is not None)
         sent, delivered = ledger.count(self._began, end)
         peers = [peer for drone in stage.drones.values() for peer in drone.peer_statuses]
         round_trips = [peer["round_trip_s"] for peer in peers if peer["round_trip_s"] is not None]
@@ -147,14 +166,14 @@ class _Demo:
             handshakes=peers[0]["handshakes"],
             drops=dict(self.drops() - self._drops_before),
             rtt_ms=round(1000 * min(round_trips), 3) if round_trips else None,
-            attacks=None if specs is None else self._results,
+            attacks=self.results if is_attacked else None,
             is_recovered=is_recovered,
         )
 
     def drops(self) -> Counter[str]:
         """What the daemons dropped, by reason: datagrams, outgoing frames, and frames that they refused."""
         drops = Counter[str]()
-        for status in (drone.status for drone in self._stage.drones.values()):
+        for status in (drone.status for drone in self.stage.drones.values()):
             drops.update({**status["drops"], **status["send_failures"], "stale": sum(status["stale"].values())})
             for sender in (*status["endpoints"].values(), *status["peers"].values()):
                 drops.update(sender.get("drops", {}))
@@ -162,45 +181,52 @@ class _Demo:
                     drops.update({f"refused_{reason}": count for reason, count in reasons.items()})
         return +drops
 
-    async def _attack(self, spec: AttackSpec, share_s: float) -> None:
+    async def attack(self, spec: AttackSpec, share_s: float) -> None:
         """Attack for a part of this time, and let the link recover in the rest."""
-        middle, begin_at = self._stage.middle, monotonic()
+        middle, begin_at = self.stage.middle, monotonic()
         needs_load = spec.name in _NEEDS_LOAD or "cookie" in str(spec.options)
-        before = sum((await middle.statistics()).of([spec.name]).values())
+        self._attempts_before = await self._attempts(spec.name)
         self._noticed_before = self._noticed()
-        self._results.append(AttackResult(str(spec), -before))
+        self.results.append(AttackResult(str(spec)))
+        self.is_attacking = True
         await middle.attack([*([_LOAD] if needs_load else []), str(spec)])
-        await self._until(begin_at + ATTACKED_SHARE * share_s)
-        self._results[-1].interventions += sum((await middle.statistics()).of([spec.name]).values())
+        await self.until(begin_at + ATTACKED_SHARE * share_s)
         await middle.attack([])
-        await self._until(begin_at + share_s + (_DETECTION_S if spec.name in _WITHHOLDS else 0.0))
+        await self.until(begin_at + share_s + (_DETECTION_S if spec.name in _WITHHOLDS else 0.0))
+        self.is_attacking = False
+
+    async def _attempts(self, name: str) -> int:
+        return sum((await self.stage.middle.statistics()).of([name]).values())
 
     def _noticed(self) -> Counter[str]:
         """The counters of dropped datagrams and of link problems, of both drones."""
         noticed = self.drops()
-        for drone in self._stage.drones.values():
+        for drone in self.stage.drones.values():
             for peer in drone.peer_statuses:
                 noticed.update({sign: peer[sign] for sign in LinkProblem})
         return noticed
 
-    async def _until(self, done_at: float, is_done: Callable[[], bool] = lambda: False) -> bool:
+    async def until(self, done_at: float, is_done: Callable[[], bool] = lambda: False) -> bool:
         while not is_done() and monotonic() < done_at:
             await self._look(done_at)
             await asyncio.sleep(min(SCREEN_S, max(0.0, done_at - monotonic())))
         await self._look(done_at)
         return is_done()
 
+    def frames(self) -> dict[str, int]:
+        """Those sent and delivered so far, and what was delivered but not sent so: forged, altered or replayed."""
+        ledger = self.stage.ledger
+        sent, delivered = ledger.count(self._began, ledger.mark())
+        return {"sent": sent, "delivered": delivered, "altered": ledger.faults.total()}
+
     async def _look(self, done_at: float) -> None:
-        for drone in self._stage.drones.values():
+        for drone in self.stage.drones.values():
             await drone.ask()
-        if self._results:
-            self._results[-1].noticed = dict(self._noticed() - self._noticed_before)
+        if self.is_attacking:
+            result = self.results[-1]
+            result.interventions = await self._attempts(result.name.partition(",")[0]) - self._attempts_before
+            result.noticed = dict(self._noticed() - self._noticed_before)
         if self._live is not None:
-            ledger = self._stage.ledger
-            frames: dict[str, Any] = dict(
-                zip(("sent", "delivered"), ledger.count(self._began, ledger.mark()), strict=True)
-            )
-            drops = self.drops() - self._drops_before
-            frames["altered"] = ledger.faults.total()
+            frames, drops = self.frames(), self.drops() - self._drops_before
             left_s = done_at - monotonic()
-            self._live.update(render(self._stage.drones.values(), frames, drops, left_s, self._results), refresh=True)
+            self._live.update(render(self.stage.drones.values(), frames, drops, left_s, self.results), refresh=True)

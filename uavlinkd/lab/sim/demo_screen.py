@@ -128,7 +128,7 @@ def _results(attacks: Iterable[AttackResult], *, wrap: bool = False) -> Table:
     overflow: Literal["fold", "ellipsis"] = "fold" if wrap else "ellipsis"
     table.add_column("counted by the drones", no_wrap=not wrap, overflow=overflow, ratio=None if wrap else 1)
     for attack in attacks:
-        table.add_row(attack.name, f"{max(0, attack.interventions):,}", _counts(attack.noticed) or _NOTHING)
+        table.add_row(attack.name, f"{attack.interventions:,}", _counts(attack.noticed) or _NOTHING)
     return table
 
 
