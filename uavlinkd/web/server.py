@@ -1,25 +1,33 @@
 """HTTP of the page, by uvicorn; the connections, and the limits on them, are ours.
 
 Strangers may open any number of connections and send slowly, or nothing. A connection without a request ends after
-:data:`REQUEST_S`; if there is no room for a new one, it replaces the oldest without a request.
+:data:`REQUEST_S`. If there is no room for a new one, it replaces one without a request: the oldest of the source that
+has the most of them.
 """
 
 from __future__ import annotations
 
 import asyncio
+import logging
 import socket
 import ssl
-from typing import Final
+from collections import Counter
+from collections.abc import Hashable
+from contextlib import suppress
+from typing import Any, Final
 
 import uvicorn
 from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol, RequestResponseCycle
 from uvicorn.server import ServerState
 
+from uavlinkd.core.limits import source_of
 from uavlinkd.endpoints.sockets import set_options
 
 MOST_CONNECTIONS: Final = 128
 """A browser has up to six: the page's parts, then one for the events."""
+AT_ONCE: Final = 32
+"""Connections that are accepted before browsers have a turn, however fast strangers connect."""
 REQUEST_S: Final = 5.0
 """For TLS and a whole request, and between two requests."""
 MAX_HEADER_BYTES: Final = 16_384
@@ -32,10 +40,18 @@ _OPTIONS: Final = (
     (socket.IPPROTO_TCP, "TCP_NODELAY", 1),
     (socket.IPPROTO_TCP, "TCP_USER_TIMEOUT", DEAD_S * 1000),
 )
+LOG: Final = logging.Logger("uavlinkd.web", logging.ERROR)
+"""For faults of the page. A stranger's invalid request is none: it must not fill a disk."""
 
 
 class _Connection(H11Protocol):
     """One connection of a browser."""
+
+    def __init__(self, config: uvicorn.Config, state: ServerState) -> None:
+        super().__init__(config, state, {})
+        self.logger, self.access_log = LOG, False
+        self.gone = asyncio.Event()
+        self._deadline: asyncio.TimerHandle | None = None
 
     @property
     def is_idle(self) -> bool:
@@ -51,12 +67,40 @@ class _Connection(H11Protocol):
         super().on_response_complete()
         self._expect_request()
 
-    def _expect_request(self) -> None:
-        self.loop.call_later(REQUEST_S, self._end_if_idle, self.cycle)
+    def connection_lost(self, exc: Exception | None) -> None:
+        super().connection_lost(exc)
+        self._forget_deadline()
+        self.gone.set()
 
-    def _end_if_idle(self, cycle: object) -> None:
-        if self.is_idle and self.cycle is cycle:
+    def send_400_response(self, msg: str) -> None:
+        """End the connection. Amid another response, or after it, HTTP has no place for an answer."""
+        if self.cycle is not None:
+            self.cycle.disconnected = True
+        self.transport.abort()
+
+    def _expect_request(self) -> None:
+        self._forget_deadline()
+        self._deadline = self.loop.call_later(REQUEST_S, self._end_if_idle)
+
+    def _forget_deadline(self) -> None:
+        if self._deadline is not None:
+            self._deadline.cancel()  # else it holds the connection in memory
+
+    def _end_if_idle(self) -> None:
+        if self.is_idle:
             self.transport.abort()
+
+
+class _Place:
+    """A connection from its first moment on, when it may have no TLS yet."""
+
+    def __init__(self, source: Hashable) -> None:
+        self.source = source
+        self.connection: _Connection | None = None
+
+    @property
+    def is_free(self) -> bool:
+        return self.connection is None or self.connection.is_idle
 
 
 class WebServer:
@@ -67,7 +111,6 @@ class WebServer:
             app,
             lifespan="off",
             log_config=None,
-            access_log=False,
             server_header=False,
             proxy_headers=False,
             ws="none",
@@ -79,59 +122,69 @@ class WebServer:
         self._state.default_headers = self._config.encoded_headers
         self._listener = listener
         self._tls = tls
-        self._open: dict[asyncio.Task[None], _Connection | None] = {}  # oldest first; None before TLS is set up
+        self._open: dict[asyncio.Task[None], _Place] = {}  # oldest first
 
     async def run(self) -> None:
         """Accept connections until cancelled."""
-        loop = asyncio.get_running_loop()
+        loop, acceptable = asyncio.get_running_loop(), asyncio.Event()
         self._listener.setblocking(False)
+        loop.add_reader(self._listener, acceptable.set)
         try:
             while True:
+                await acceptable.wait()
+                acceptable.clear()
                 try:
-                    sock, _ = await loop.sock_accept(self._listener)
-                except OSError:  # the client has gone, or there is no descriptor
+                    for _ in range(AT_ONCE):
+                        self._accept(*self._listener.accept())
+                except BlockingIOError:
+                    continue
+                except OSError:  # there is no descriptor
                     await asyncio.sleep(0.05)
-                    continue
-                if len(self._open) >= MOST_CONNECTIONS and not self._make_room():
-                    sock.close()
-                    continue
-                task = loop.create_task(self._serve(sock))
-                self._open[task] = None
-                task.add_done_callback(self._open.pop)
         finally:
-            for task in self._open:
-                task.cancel()
+            loop.remove_reader(self._listener)
             self._listener.close()
+            tasks = [*self._open]
+            for task in tasks:
+                task.cancel()
+            # Then no request is left: uvicorn would log that it is cancelled.
+            await asyncio.gather(*tasks, *self._state.tasks, return_exceptions=True)
+
+    def _accept(self, sock: socket.socket, sockaddr: tuple[Any, ...]) -> None:
+        if len(self._open) >= MOST_CONNECTIONS and not self._make_room():
+            sock.close()
+            return
+        place = _Place(source_of(sockaddr[0]))
+        task = asyncio.get_running_loop().create_task(self._serve(sock, place))
+        self._open[task] = place
+        task.add_done_callback(lambda task: self._forget(task, sock))
+
+    def _forget(self, task: asyncio.Task[None], sock: socket.socket) -> None:
+        self._open.pop(task, None)
+        sock.close()  # also that of a task that was cancelled before it began
 
     def _make_room(self) -> bool:
-        """End the oldest connection without a request. Whether there was one."""
-        for task, connection in self._open.items():
-            if connection is None or connection.is_idle:
-                task.cancel()
-                self._open.pop(task)
-                return True
-        return False
+        """End a connection without a request. Whether there was one."""
+        free = [(task, place.source) for task, place in self._open.items() if place.is_free]
+        if not free:
+            return False
+        ((most, _),) = Counter(source for _, source in free).most_common(1)
+        task = next(task for task, source in free if source == most)
+        task.cancel()
+        del self._open[task]
+        return True
 
-    async def _serve(self, sock: socket.socket) -> None:
+    async def _serve(self, sock: socket.socket, place: _Place) -> None:
         set_options(sock, _OPTIONS)
-        gone = asyncio.Event()
-        task = asyncio.current_task()
-        assert task is not None
-
-        class Connection(_Connection):
-            def connection_lost(self, exc: Exception | None) -> None:
-                super().connection_lost(exc)
-                gone.set()
-
-        connection = Connection(self._config, self._state, {})
+        connection = _Connection(self._config, self._state)
         loop = asyncio.get_running_loop()
         timeout = None if self._tls is None else REQUEST_S
         try:
-            await loop.connect_accepted_socket(lambda: connection, sock, ssl=self._tls, ssl_handshake_timeout=timeout)
-            self._open[task] = connection
-            await gone.wait()
-        except OSError:  # no TLS, or none in time
-            sock.close()
+            with suppress(OSError):  # no TLS, or none in time
+                await loop.connect_accepted_socket(
+                    lambda: connection, sock, ssl=self._tls, ssl_handshake_timeout=timeout
+                )
+                place.connection = connection
+                await connection.gone.wait()
         finally:
             if connection.transport is not None:
                 connection.transport.abort()
