@@ -18,6 +18,7 @@ from uavlinkd.core.limits import SourceLimiter, source_of
 WRONG_PER_S: Final = 1 / 10
 WRONG_AT_ONCE: Final = 10
 """Limits on wrong passwords of one source: an address, or a /64 of IPv6."""
+_OF_PROXIES: Final = ("forwarded", "via", "x-real-ip")
 HEADERS: Final[Mapping[str, str]] = {
     # Nothing from elsewhere, no inline script or style, no frame around it, and no text that becomes markup.
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self';"
@@ -66,7 +67,7 @@ class Guard:
         if not _is_own_page(headers, f"{scope['scheme']}://{hosts[0]}", scope["method"] in ("GET", "HEAD")):
             return _refuse(403, "another site's page asked for this one")
         if self._password_hash is None:
-            if "x-forwarded-for" in headers or "forwarded" in headers:
+            if is_passed_on(headers, scope["http_version"]):
                 return _refuse(403, "behind a proxy this page needs a password: --password-file FILE")
             return None
         return self._password_refusal(headers.get("authorization"), scope)
@@ -101,6 +102,11 @@ def is_addressed(host: str, names: frozenset[str]) -> bool:
     return True
 
 
+def is_passed_on(headers: Headers, http_version: str) -> bool:
+    """Whether a proxy sent the request. A browser speaks HTTP/1.1; nginx may add no header, but speaks HTTP/1.0."""
+    return http_version == "1.0" or any(name in _OF_PROXIES or name.startswith("x-forwarded-") for name in headers)
+
+
 def _is_own_page(headers: Headers, own: str, is_read: bool) -> bool:
     """Whether the browser sent the request for this page itself, or because a person followed a link to it.
 
@@ -128,4 +134,5 @@ def _password(credentials: str) -> bytes:
 
 
 def _refuse(status: int, text: str, headers: Mapping[str, str] | None = None) -> PlainTextResponse:
-    return PlainTextResponse(text + "\n", status, headers)
+    """It ends the connection: a stranger that reads no answers must not hold one with many requests."""
+    return PlainTextResponse(text + "\n", status, {**(headers or {}), "Connection": "close"})
