@@ -5,10 +5,11 @@ from __future__ import annotations
 import asyncio
 import json
 from collections import Counter, deque
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping, Sequence
+from collections.abc import AsyncGenerator, Awaitable, Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, Final
 
+from uavlinkd.ops import STATUS_SCHEMA
 from uavlinkd.ops.control import ControlError
 from uavlinkd.ops.status_words import Status
 from uavlinkd.system.clock import monotonic
@@ -25,6 +26,8 @@ SAMPLE_S: Final = 4.0
 """Between two points of a plot; also between two questions while no browser looks."""
 SAMPLES: Final = 150
 """Ten minutes."""
+_OTHER_VERSION: Final = "the daemon is of another version than this page: restart the older one of them"
+_NOT_UNDERSTOOD: Final = "the page does not understand the daemon's answer ({}): restart the older one of them"
 
 Ask = Callable[[str], Awaitable[dict[str, Any]]]
 Sample = Mapping[PathKey, tuple[float | None, float, float]]
@@ -74,16 +77,21 @@ class Watcher:
     async def _look(self, now: float) -> None:
         detailed = self._detailed()
         try:
-            self._status = await self._ask(" ".join(["overview", *detailed]))
+            status = await self._ask(" ".join(["overview", *detailed]))
+            if status["schema"] != STATUS_SCHEMA:
+                raise ControlError(_OTHER_VERSION)
+            sample = dict(paths_of(status))
             if now - self._sampled_at >= SAMPLE_S:
                 self._problems = (await self._ask("problems"))["problems"]
-                self._samples.append(dict(paths_of(self._status)))
+                self._samples.append(sample)
                 self._sampled_at = now
         except ControlError as error:
             self._lost = str(error)
+        except Exception as error:  # not a status: the page goes on, and asks again
+            self._lost = _NOT_UNDERSTOOD.format(type(error).__name__)
         else:
-            self._lost = None
-            if set(detailed) != set(self._detailed()):  # the first answer named the peers
+            self._status, self._lost = status, None
+            if not detailed and self._detailed():  # the first answer named the peers
                 await self._look(now)
 
     def _detailed(self) -> list[str]:
@@ -101,7 +109,7 @@ class Watcher:
             self._viewers[peer] -= 1
             self._viewers += Counter()  # forgets those without a viewer
 
-    async def messages(self, peer: str) -> AsyncIterator[bytes]:
+    async def messages(self, peer: str) -> AsyncGenerator[bytes, None]:
         """The events of one browser, which looks at one peer, or at the whole page if that is empty.
 
         A browser that is slow gets the latest message when it has read the one before: the others are left out.
@@ -120,13 +128,16 @@ class Watcher:
 
     def _message(self, peer: str) -> bytes:
         if peer not in self._messages:
-            facts: dict[str, Any] = {"at": monotonic()}
-            if self._lost is not None or self._status is None:
-                facts["lost"] = self._lost
-            else:
-                facts |= view(self._status, self._problems, peer)
-            self._messages[peer] = _event("now", facts)
+            self._messages[peer] = _event("now", {"at": monotonic()} | self._facts(peer))
         return self._messages[peer]
+
+    def _facts(self, peer: str) -> dict[str, Any]:
+        if self._lost is not None or self._status is None:
+            return {"lost": self._lost}
+        try:
+            return view(self._status, self._problems, peer)
+        except Exception as error:
+            return {"lost": _NOT_UNDERSTOOD.format(type(error).__name__)}
 
     def _history(self, peer: str, last: int = SAMPLES) -> dict[str, dict[int, list[Sequence[float | None]]]]:
         """Round trips in seconds, losses and bytes a second of each path, the oldest first; null if unknown."""
