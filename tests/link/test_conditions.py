@@ -27,7 +27,7 @@ from uavlinkd.link.conditions import (
     OpenCondition,
     Phase,
 )
-from uavlinkd.link.event_log import ENDPOINT_DELAY_S, FINDING_DELAY_S, EventLog
+from uavlinkd.link.event_log import ENDED_PROBLEMS, ENDPOINT_DELAY_S, FINDING_DELAY_S, EventLog
 from uavlinkd.link.evidence import History
 from uavlinkd.ops.findings import Finding, Severity, Subject
 
@@ -230,6 +230,39 @@ def test_security_finding_is_an_error(log: EventLog) -> None:
         log.write_findings([*everyday, finding(Severity.SECURITY, "key_on_two_machines")], 1.0 + FINDING_DELAY_S)
     assert len(lines) == LINES_BURST + 1
     assert (lines[-1]["event"], lines[-1]["log_level"]) == ("problem_began", "error")
+
+
+def test_problems_of_the_log_have_their_ages(log: EventLog) -> None:
+    """What the log has, and no more: one that lasts has no end, another one the moment when it was there last."""
+    attack, wrong = finding(Severity.SECURITY, "key_on_two_machines"), finding(Severity.FAULT)
+    log.write_findings([attack, wrong], 10.0)
+    assert log.problems(11.0) == [{**attack.as_json(), "began_s": 1.0, "ended_s": None}]
+    log.write_findings([attack, wrong], 10.0 + FINDING_DELAY_S)
+    log.write_findings([wrong], 15.0)
+    log.check(15.0)
+    assert [(one["cause"], one["ended_s"]) for one in log.problems(15.0)] == [
+        ("key_on_two_machines", None),
+        ("wrong_psk", None),
+    ]
+    log.write_findings([wrong], 25.0)
+    log.check(25.0)
+    assert log.problems(26.0) == [
+        {**attack.as_json(), "began_s": 16.0, "ended_s": 26.0 - 10.0 - FINDING_DELAY_S},
+        {**wrong.as_json(), "began_s": 26.0 - 10.0 - FINDING_DELAY_S, "ended_s": None},
+    ]
+
+
+def test_the_latest_problems_that_ended_are_kept(log: EventLog) -> None:
+    """Memory is bounded, whatever comes and goes. Those that last are there in any case."""
+    lasting = finding(Severity.SECURITY, "key_on_two_machines")
+    for number in range(ENDED_PROBLEMS + 50):
+        now = number * 100.0
+        log.write_findings([lasting, finding(Severity.SECURITY)._replace(name=f"peer{number}")], now)
+        log.write_findings([lasting], now + 50.0)
+        log.check(now + 50.0)
+    *ended, last = log.problems(1e6)
+    assert [one["name"] for one in ended] == [f"peer{number}" for number in range(50, ENDED_PROBLEMS + 50)]
+    assert (last["name"], last["ended_s"]) == ("b", None)
 
 
 def test_log_ends_with_the_state_of_a_link_that_flaps(log: EventLog) -> None:

@@ -1,0 +1,71 @@
+"""What a real daemon answers to the page."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from tests.daemon.conftest import stage
+from tests.daemon.harness import Stage
+from tests.waiting import PATIENCE_S, Stopwatch
+from tests.web.statuses import few_facts, overview
+from uavlinkd.ops.control import MAX_REQUEST_BYTES
+
+__all__ = ["stage"]
+
+
+def lasting(facts: dict[str, Any]) -> dict[str, Any]:
+    """Without ages, rates and other figures of a moment."""
+    return {key: fact for key, fact in facts.items() if not key.endswith("_s")}
+
+
+async def test_an_overview_has_the_details_of_the_named_peers_alone(stage: Stage) -> None:
+    """Its figures are those of the status, in whatever order the peers are named."""
+    hub, one, other = (stage.daemon(name) for name in ("drone0", "drone1", "drone2"))
+    stage.introduce(hub, one)
+    stage.introduce(hub, other)
+    await stage.start(hub, one, other)
+    for named in ((), ("drone1",), ("drone2", "drone1"), ("drone2", "stranger", "drone2")):
+        request, stopwatch = " ".join(["overview", *named]), Stopwatch()
+        while stopwatch.elapsed_s < PATIENCE_S:  # a datagram may come between the two answers
+            some, status = await hub.ask(request), await hub.status()
+            assert some.keys() == status.keys() - {"process"}
+            for name, peer in some["peers"].items():
+                whole = status["peers"][name]
+                if name in named:
+                    assert peer.keys() == whole.keys()
+                    assert peer["paths"][0].keys() == whole["paths"][0].keys()
+                else:
+                    assert peer.keys() == few_facts().keys()
+                    assert peer["paths"][0].keys() == few_facts()["paths"][0].keys() < whole["paths"][0].keys()
+            if all(figures(peer) == figures(status["peers"][name], peer) for name, peer in some["peers"].items()):
+                break
+        else:
+            raise AssertionError(json.dumps([some, status]))
+
+
+def figures(peer: dict[str, Any], like: dict[str, Any] | None = None) -> dict[str, Any]:
+    """Those that both answers have."""
+    like = like or peer
+    paths = [lasting({key: path[key] for key in like["paths"][0]}) for path in peer["paths"]]
+    return lasting({key: peer[key] for key in like}) | {"paths": paths}
+
+
+async def test_a_made_up_overview_is_like_a_real_one(stage: Stage) -> None:
+    """Other tests of the page use it."""
+    one, other = stage.pair()
+    await stage.start(one, other)
+    answer, made_up = await one.ask("overview"), overview()
+    assert answer.keys() == made_up.keys()
+    assert {key: type(fact) for key, fact in answer.items()} == {key: type(fact) for key, fact in made_up.items()}
+    assert (await one.ask("problems"))["problems"] == []
+
+
+async def test_requests_of_the_page_are_what_they_are_and_no_more(stage: Stage) -> None:
+    """No other request begins so, and names cannot exceed the limit unnoticed."""
+    one, other = stage.pair()
+    await stage.start(one, other)
+    for request in ("problems drone1", "overviews", "problem"):
+        assert "unknown request" in (await one.ask(request))["error"]
+    names = " ".join(["x" * 63] * (MAX_REQUEST_BYTES // 64))
+    assert "longer than" in (await one.ask(f"overview {names}"))["error"]
