@@ -21,7 +21,7 @@ from uavlinkd.ops import STATUS_SCHEMA
 from uavlinkd.ops.control import Answer, ControlError
 from uavlinkd.web import watch
 from uavlinkd.web.view import MOST_CARDS, view
-from uavlinkd.web.watch import LONGEST_S, SAMPLES, Watcher
+from uavlinkd.web.watch import LONGEST_S, MOST_DETAILED, SAMPLES, Watcher
 from uavlinkd.web.watch import PATIENCE_S as ANSWER_S
 
 __all__ = ["stage"]
@@ -272,6 +272,19 @@ async def test_the_daemon_is_asked_for_the_details_that_are_shown(count: int) ->
         assert [card["name"] for card in facts["cards"]] == [names[-1]]
         await message(watcher, "stranger", lambda _: True)
         assert not [request for request in daemon.asked if "stranger" in request]
+
+
+async def test_twenty_browsers_see_the_details_of_twenty_peers() -> None:
+    """Beyond that the request stays short; the figures are there all the same."""
+    names = [f"drone{number}" for number in range(200)]
+    daemon = Daemon(*names)
+    async with watcher_of(daemon) as watcher:
+        cards = await asyncio.gather(
+            *(message(watcher, name, lambda _: len(daemon.asked[-1].split()) > MOST_DETAILED) for name in names[:99])
+        )
+        assert [facts["cards"][0]["name"] for facts in cards] == names[:99]
+    asked = {len(request.split()) - 1 for request in daemon.asked if request != "problems"}
+    assert max(asked) == MOST_DETAILED
 
 
 async def test_peers_that_come_and_go_cause_no_more_questions() -> None:

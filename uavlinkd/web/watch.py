@@ -22,6 +22,8 @@ LONGEST_S: Final = 1.5
 PATIENCE_S: Final = 1.2
 SHARE: Final = 0.01
 """Of the time, the daemon may need so much for the answers."""
+MOST_DETAILED: Final = 20
+"""Of so many peers the daemon is asked for everything. A browser that looks at another one sees its figures alone."""
 SAMPLE_S: Final = 4.0
 """Between two points of a plot; also between two questions while no browser looks."""
 SAMPLES: Final = 150
@@ -97,7 +99,9 @@ class Watcher:
     def _detailed(self) -> list[str]:
         """The peers of which a browser shows everything."""
         peers = [] if self._status is None else list(self._status["peers"])
-        return peers if len(peers) <= MOST_CARDS else [name for name in self._viewers if name in peers][:MOST_CARDS]
+        if len(peers) > MOST_CARDS:
+            peers = [name for name in self._viewers if name in peers][:MOST_DETAILED]
+        return peers
 
     @contextmanager
     def _viewer(self, peer: str) -> Iterator[None]:
