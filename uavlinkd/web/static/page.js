@@ -202,6 +202,7 @@ function lose(why) {
 
 function listen() {
   const source = new EventSource(`/events?peer=${encodeURIComponent(peer)}`);
+  source.addEventListener("open", () => { quickest = Infinity; }); // after a reboot the server's clock begins again
   source.addEventListener("now", (event) => {
     const facts = JSON.parse(event.data);
     const late = performance.now() - 1000 * facts.at;
