@@ -68,12 +68,12 @@ function fill(parent, children) {
   while (parent.childNodes.length > children.length) parent.lastChild.remove();
 }
 
-// Figures.
+// Figures. A line does not break before a unit.
 
-function ms(seconds) { return seconds === null ? "-" : `${(1000 * seconds).toFixed(seconds < 0.01 ? 1 : 0)} ms`; }
-function percent(share) { return share === null ? "-" : `${(100 * share).toFixed(0)} %`; }
-function rate(bytes) { return bytes === null ? "-" : bytes < 1000 ? `${Math.round(bytes)} B/s` : `${(bytes / 1000).toFixed(1)} kB/s`; }
-function age(s) { return s === null ? "never" : s < 100 ? `${s.toFixed(s < 10 ? 1 : 0)} s` : s < 6000 ? `${Math.round(s / 60)} min` : `${Math.round(s / 3600)} h`; }
+function ms(seconds) { return seconds === null ? "-" : `${(1000 * seconds).toFixed(seconds < 0.01 ? 1 : 0)}\u00a0ms`; }
+function percent(share) { return share === null ? "-" : `${(100 * share).toFixed(0)}\u00a0%`; }
+function rate(bytes) { return bytes === null ? "-" : bytes < 1000 ? `${Math.round(bytes)}\u00a0B/s` : `${(bytes / 1000).toFixed(1)}\u00a0kB/s`; }
+function age(s) { return s === null ? "never" : s < 100 ? `${s.toFixed(s < 10 ? 1 : 0)}\u00a0s` : s < 6000 ? `${Math.round(s / 60)}\u00a0min` : `${Math.round(s / 3600)}\u00a0h`; }
 function count(number) { return number.toLocaleString("en"); }
 function clock(agoS) { return new Date(Date.now() - 1000 * agoS).toLocaleTimeString(); }
 
