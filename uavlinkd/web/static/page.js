@@ -38,7 +38,8 @@ function el(tag, attributes, ...children) {
   return made;
 }
 
-// Make `old` like `made`, and leave what is alike: a selection, the focus and the scroll position stay.
+// Make `old` like `made`, and leave what is alike: a selection, the focus and the scroll position stay. What a person
+// opened or closed stays so too.
 function morph(old, made) {
   if (old.nodeName !== made.nodeName || (old.dataset && old.dataset.key !== made.dataset.key)) {
     old.replaceWith(made);
@@ -48,9 +49,9 @@ function morph(old, made) {
     if (old.data !== made.data) old.data = made.data;
     return;
   }
-  for (const name of old.getAttributeNames()) if (!made.hasAttribute(name)) old.removeAttribute(name);
+  for (const name of old.getAttributeNames()) if (name !== "open" && !made.hasAttribute(name)) old.removeAttribute(name);
   for (const name of made.getAttributeNames()) {
-    if (old.getAttribute(name) !== made.getAttribute(name)) old.setAttribute(name, made.getAttribute(name));
+    if (name !== "open" && old.getAttribute(name) !== made.getAttribute(name)) old.setAttribute(name, made.getAttribute(name));
   }
   fill(old, [...made.childNodes]);
 }
@@ -116,9 +117,9 @@ function card(facts) {
     el("p", { class: "figures" }, `silent ${age(silent)}, round trip ${ms(roundTrip)}, loss ${percent(loss)}, in ${rate(bytesIn)}, out ${rate(bytesOut)}`),
     el("div", { class: "paths" }, facts.paths.map((path) => onePath(facts.name, path))),
     facts.dropped.length ? el("p", {}, el("b", {}, "dropped: "), facts.dropped.map(([why, times]) => `${count(times)} ${why}`).join(", ")) : null,
-    facts.refused.length ? el("details", {}, el("summary", {}, "refused by this daemon's policy"), list(facts.refused, ["direction", "message", "why", "times"])) : null,
-    facts.reported.length ? el("details", { open: true }, el("summary", {}, "reported by this peer; a captured one can lie"), el("ul", {}, facts.reported.map((text) => el("li", {}, text)))) : null,
-    el("details", {}, el("summary", {}, "session"), el("dl", {}, facts.facts.flatMap(([name, text]) => [el("dt", {}, name), el("dd", {}, text)]))));
+    facts.refused.length ? el("details", { "data-key": "refused" }, el("summary", {}, "refused by this daemon's policy"), list(facts.refused, ["direction", "message", "why", "times"])) : null,
+    facts.reported.length ? el("details", { "data-key": "reported", open: true }, el("summary", {}, "reported by this peer; a captured one can lie"), el("ul", {}, facts.reported.map((text) => el("li", {}, text)))) : null,
+    el("details", { "data-key": "session" }, el("summary", {}, "session"), el("dl", {}, facts.facts.flatMap(([name, text]) => [el("dt", {}, name), el("dd", {}, text)]))));
 }
 
 function onePath(name, path) {
