@@ -18,12 +18,16 @@ _WORDS: Final = {"security": "attack", "fault": "blocked", "warning": "warning"}
 _SHOWN_REFUSALS: Final = 30
 
 
-def paths_of(status: Status) -> Iterator[tuple[PathKey, tuple[float | None, float, float]]]:
-    """Round trip in seconds, worse of the two losses, and bytes a second in both directions, of each path."""
+def paths_of(status: Status) -> Iterator[tuple[PathKey, tuple[float | None, float | None, float]]]:
+    """Round trip in seconds, worse of the two losses, and bytes a second in both directions, of each path.
+
+    The daemon keeps the last figures of a path that is down: these are left out.
+    """
     for name, peer in status["peers"].items():
         for path in peer["paths"]:
             loss, rate = max(path["loss_in"], path["loss_out"]), path["bytes_in_s"] + path["bytes_out_s"]
-            yield (name, path["number"]), (path["round_trip_s"], round(loss, 4), round(rate))
+            measured = (None, None) if path["state"] == "down" else (path["round_trip_s"], round(loss, 4))
+            yield (name, path["number"]), (*measured, round(rate))
 
 
 def view(status: Status, past: Sequence[Mapping[str, Any]], peer: str) -> dict[str, Any]:
@@ -110,6 +114,7 @@ def card(name: str, peer: Status, word: str) -> dict[str, Any]:
 
 
 def _path(path: Status, address: str) -> dict[str, Any]:
+    is_down = path["state"] == "down"
     return {
         "number": path["number"],
         "network": path["network"] or "",
@@ -118,9 +123,9 @@ def _path(path: Status, address: str) -> dict[str, Any]:
         "condition": words.condition(path),
         "state": words.path_state(path),
         "carries": words.carried(path),
-        "rtt": path["round_trip_s"],
-        "jitter": path["jitter_s"],
-        "loss": [path["loss_in"], path["loss_out"]],
+        "rtt": None if is_down else path["round_trip_s"],
+        "jitter": None if is_down else path["jitter_s"],
+        "loss": [None, None] if is_down else [path["loss_in"], path["loss_out"]],
         "rate": [path["bytes_in_s"], path["bytes_out_s"]],
     }
 

@@ -32,7 +32,7 @@ _OTHER_VERSION: Final = "the daemon is of another version than this page: restar
 _NOT_UNDERSTOOD: Final = "the page does not understand the daemon's answer ({}): restart the older one of them"
 
 Ask = Callable[[str], Awaitable[dict[str, Any]]]
-Sample = Mapping[PathKey, tuple[float | None, float, float]]
+Sample = Mapping[PathKey, tuple[float | None, float | None, float]]
 
 
 class Watcher:
