@@ -50,6 +50,10 @@ class Served:
         self.address = address
         self.tls = tls
 
+    @property
+    def url(self) -> str:
+        return f"http://{self.address}/"
+
     async def connect(self, source: str = "127.0.0.1") -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
         host, port = self.address.host, self.address.port
         return await asyncio.open_connection(host, port, ssl=self.tls, local_addr=(source, 0))
@@ -164,10 +168,15 @@ async def page_of(
 
 @asynccontextmanager
 async def served(
-    control_socket: Path, host: str = "127.0.0.1", trusted: ssl.SSLContext | None = None, **settings: Any
+    control_socket: Path,
+    host: str = "127.0.0.1",
+    trusted: ssl.SSLContext | None = None,
+    *,
+    port: int = 0,
+    **settings: Any,
 ) -> AsyncIterator[Served]:
     """The page of the daemon at this socket, as above."""
-    with _complaints() as complaints, Page(control_socket, Address(host, 0), **settings) as page:
+    with _complaints() as complaints, Page(control_socket, Address(host, port), **settings) as page:
         running = asyncio.create_task(page.run())
         host_port = page.url.split("/")[2].rpartition(":")
         try:

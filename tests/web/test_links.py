@@ -1,0 +1,190 @@
+"""Real daemons on the page: paths, problems in the words of ``uavlinkd status``, refusals, members of a relay."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import subprocess
+import sys
+from contextlib import AsyncExitStack
+
+import pytest
+from playwright.async_api import Browser, Locator, expect
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from tests.daemon.fleet import drone_and_ground, relay_for
+from tests.daemon.frames import command_long, heartbeat
+from tests.daemon.harness import Stage
+from tests.daemon.process import DaemonProcess
+from tests.daemon.relay import End, Relay
+from tests.daemon.udp import shown
+from tests.waiting import Stopwatch
+from tests.web.browser import card_of, headline, until_lost, window
+from tests.web.served import served
+from uavlinkd.lab.sim.loopback_ports import free_port
+from uavlinkd.mavlink.policy.gate import Refusal
+from uavlinkd.ops.status_words import problems
+
+pytestmark = [pytest.mark.asyncio(loop_scope="module"), pytest.mark.long]
+
+LOST_S = 3.0
+
+
+async def along_two_paths(stage: Stage) -> tuple[DaemonProcess, DaemonProcess, list[Relay]]:
+    """A linked pair with two networks between them. A network whose ``on_datagram`` does nothing is pulled."""
+    drone, ground, psk = stage.daemon("drone0"), stage.daemon("ground"), stage.psk()
+    networks = [await stage.relay() for _ in range(2)]
+    for network in networks:
+        network.attach(End.A, drone.sockaddr)
+        network.attach(End.B, ground.sockaddr)
+    drone.add_peer(ground, [shown(network.address_for(End.A)) for network in networks], psk)
+    ground.add_peer(drone, [shown(network.address_for(End.B)) for network in networks], psk)
+    await stage.start(drone, ground)
+    return drone, ground, networks
+
+
+def role_of(path: Locator) -> Locator:
+    return path.locator("p b").first
+
+
+async def test_a_pulled_path_is_down_and_the_other_best(browser: Browser) -> None:
+    """The page follows a path that is pulled, and that comes back."""
+    async with Stage() as stage:
+        drone, ground, networks = await along_two_paths(stage)
+        async with served(ground.folder / "control.sock") as web, window(browser, web.url) as page:
+            card = card_of(page, drone.name)
+            await expect(card.locator(".state")).to_have_text("up")
+            await expect(card.locator(".path.usable")).to_have_count(2)
+            await expect(role_of(card.locator(".path").first)).to_have_text("best")
+            paths = [card.locator(".path").filter(has_text=shown(network.address_for(End.B))) for network in networks]
+            pulled, other = paths if await role_of(paths[0]).inner_text() == "best" else reversed(paths)
+            network = networks[paths.index(pulled)]
+            network.on_datagram = lambda end, datagram: None
+            await expect(role_of(pulled)).to_have_text("down: no answer")
+            await expect(pulled).to_contain_text("round trip -, loss - in, - out, ")
+            await expect(role_of(other)).to_have_text("best")
+            await expect(other).to_contain_text("direct, carries all")
+            await expect(headline(page)).to_have_text("1 of 1 peers up")
+            network.on_datagram = network.deliver
+            await expect(card.locator(".path.usable")).to_have_count(2)
+
+
+async def test_a_problem_has_the_words_of_status(browser: Browser) -> None:
+    """A wrong PSK: cause and remedy are those that the terminal shows, and the link is not up."""
+    async with Stage() as stage:
+        drone, ground = stage.daemon("drone0"), stage.daemon("ground")
+        drone.add_peer(ground, [ground.address], stage.psk())
+        ground.add_peer(drone, [drone.address], stage.psk())
+        await stage.start(drone, ground, linked=False)
+        status = await ground.until(
+            lambda status: ["the PSKs differ" in finding["text"] for finding in status["findings"]] == [True]
+        )
+        async with served(ground.folder / "control.sock") as web, window(browser, web.url) as page:
+            shown_problem = page.get_by_role("region", name="Problems", exact=True).get_by_role("paragraph")
+            await expect(shown_problem).to_have_count(1)
+            (line,) = problems(status["findings"])
+            sentence = f"{line.who}: {line.text}. Remedy: {line.remedy}"
+            await expect(shown_problem).to_have_text(f"{line.severity} {sentence}.")
+            await expect(card_of(page, drone.name).locator(".state")).to_have_text("waiting")
+            await expect(headline(page)).to_have_text("0 of 1 peers up")
+            await expect(page.get_by_role("region", name="Log of problems")).to_contain_text(line.remedy)
+        assert sentence in await terminal(ground)
+
+
+async def terminal(daemon: DaemonProcess) -> str:
+    """What ``uavlinkd status`` prints, without line breaks."""
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "uavlinkd", "status", "--socket", str(daemon.folder / "control.sock")),
+        stdout=subprocess.PIPE,
+        env={**os.environ, "COLUMNS": "200"},
+    )
+    output, _ = await process.communicate()
+    return " ".join(output.decode().split())
+
+
+async def test_refused_frames_have_their_message_reason_and_count(browser: Browser) -> None:
+    """Both ends: the drone that refuses, and the ground station that it reports this to."""
+    async with Stage() as stage:
+        drone, ground = drone_and_ground(stage)
+        pilot, autopilot = await stage.client(), await stage.client()
+        into, into_drone = ground.add_endpoint("pilot"), drone.add_endpoint("autopilot")
+        await stage.start(drone, ground)
+        autopilot.send(heartbeat(1), into_drone)
+        for number in range(3):
+            pilot.send(command_long(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, system=9, seq=number), into)
+        refused = {"COMMAND_LONG": {"foreign_system": 3}}
+        await drone.until(lambda status: status["peers"]["ground"]["refused"]["in"] == refused)
+        async with served(drone.folder / "control.sock") as web, window(browser, web.url) as page:
+            card = card_of(page, "ground")
+            await card.get_by_text("refused by this daemon's policy").click()
+            why = Refusal.FOREIGN_SYSTEM.phrase
+            rows = [f"in{message}{why}3" for message in ("COMMAND_LONG", "MAV_CMD_COMPONENT_ARM_DISARM")]
+            await expect(card.locator("tbody").get_by_role("row")).to_have_text(rows)
+            await expect(card.get_by_text(f"dropped: 3 {why}")).to_have_count(1)
+        async with served(ground.folder / "control.sock") as web, window(browser, web.url) as page:
+            await expect(card_of(page, drone.name)).to_contain_text("reported by this peer; a captured one can lie")
+            report = card_of(page, drone.name).get_by_role("listitem")
+            await expect(report).to_have_text(
+                "it refused COMMAND_LONG MAV_CMD_COMPONENT_ARM_DISARM 3 times: foreign system"
+            )
+
+
+async def test_a_daemon_that_hangs_is_lost_within_three_seconds(browser: Browser) -> None:
+    """It holds its socket open, and does not answer."""
+    async with Stage() as stage:
+        drone, ground = stage.pair()
+        await stage.start(drone, ground)
+        async with served(ground.folder / "control.sock") as web, window(browser, web.url) as page:
+            state = card_of(page, drone.name).locator(".state")
+            await expect(state).to_have_text("up")
+            stopwatch = Stopwatch()
+            await ground.send_signal(signal.SIGSTOP)
+            try:
+                await until_lost(page)
+                assert stopwatch.calm_s < LOST_S
+                await expect(state).to_have_text("unknown")
+            finally:
+                await ground.send_signal(signal.SIGCONT)
+            await expect(state).to_have_text("up")
+
+
+async def test_a_page_whose_server_ends_is_lost_and_comes_back(browser: Browser) -> None:
+    """By the browser's own clock. The next server may be on a machine that rebooted: its clock began again."""
+    async with Stage() as stage:
+        drone, ground = stage.pair()
+        await stage.start(drone, ground)
+        socket, port = ground.folder / "control.sock", free_port()
+        async with AsyncExitStack() as windows:
+            async with served(socket, port=port) as web:
+                page = await windows.enter_async_context(window(browser, web.url, is_interrupted=True))
+                state = card_of(page, drone.name).locator(".state")
+                await expect(state).to_have_text("up")
+            await expect(headline(page)).to_contain_text("LOST: the page's server does not answer. What is below was")
+            await expect(state).to_have_text("unknown")
+            await page.evaluate("quickest -= 1e6")
+            async with served(socket, port=port):
+                await expect(state).to_have_text("up")
+
+
+async def test_a_relay_shows_its_members(browser: Browser) -> None:
+    """A table of them, and which are up."""
+    async with Stage() as stage:
+        drone, ground, psk = stage.daemon("drone0"), stage.daemon("ground"), stage.psk()
+        drone.add_peer(ground, [], psk)
+        ground.add_peer(drone, [], psk)
+        relay = relay_for(stage, drone, ground)
+        await stage.start(relay, drone, ground)
+        async with served(relay.folder / "control.sock") as web, window(browser, web.url) as page:
+            members = page.get_by_role("region", name="Members of this relay")
+            states = members.get_by_role("row").locator("td:nth-child(2)")
+            await expect(states).to_have_text(["up", "up"])
+            await expect(members.get_by_role("row").filter(has_text=drone.name)).to_contain_text(drone.address)
+            await expect(headline(page)).to_have_text("relay: 2 of 2 members up")
+            await drone.stop()
+            await expect(members.get_by_role("row").filter(has_text=drone.name).locator(".state")).to_have_text(
+                "lost"
+            )
+            await expect(headline(page)).to_have_text("relay: 1 of 2 members up")
+            await members.get_by_label("Search").fill("GROUND")
+            await expect(states).to_have_text(["up"])

@@ -1,0 +1,80 @@
+"""The page in a browser: a daemon that ends, and text that an attacker chose."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import pytest
+from playwright.async_api import Browser, expect
+
+from tests.daemon.harness import Stage
+from tests.web.browser import card_of, headline, window
+from tests.web.made_up_daemon import make_up
+from tests.web.served import page_of, served
+
+pytestmark = pytest.mark.asyncio(loop_scope="module")
+
+HOSTILE: Final = (
+    "<img src=x onerror=window.ran=1>",
+    "</script><script>window.ran=1</script>",
+    "\u202egnp.enord\u202c \u2067drone\u2069",
+    "javascript:window.ran=1//",
+    "${window.ran=1}' onclick='window.ran=1' \" &amp;",
+    "../../events?peer=%00#",
+)
+
+
+async def test_a_daemon_that_ends_is_lost_and_comes_back(browser: Browser) -> None:
+    """The page keeps no good news, says why, and needs no reload."""
+    async with Stage() as stage:
+        drone, ground = stage.pair()
+        await stage.start(drone, ground)
+        async with served(ground.folder / "control.sock") as web, window(browser, web.url) as page:
+            state = card_of(page, drone.name).locator(".state")
+            await expect(state).to_have_text("up")
+            await expect(headline(page)).to_have_text("1 of 1 peers up")
+            await ground.stop()
+            await expect(headline(page)).to_contain_text("LOST: no daemon answers at")
+            await expect(state).to_have_text("unknown")
+            assert await page.get_by_text("up", exact=True).count() == 0
+            await stage.start(ground)
+            await expect(state).to_have_text("up")
+            await expect(headline(page)).to_have_text("1 of 1 peers up")
+
+
+async def test_text_that_an_attacker_chose_is_text(browser: Browser) -> None:
+    """Names, addresses, problems and reports are shown as they are, run nothing and load nothing."""
+    daemon = await make_up(1)
+    (real,) = daemon.status["peers"].values()
+    (path,) = real["paths"]
+    claim = {"command": None, "count": 3, "last_s": 1.0}
+    daemon.status["peers"] = {
+        text: real
+        | {
+            "role": text,
+            "paths": [path | {"network": text, "address": text}],
+            "refused": {"in": {text: {"foreign_system": 7}}, "out": {}},
+            "refused_there": [claim | {"message": text, "reason": text}],
+        }
+        for text in HOSTILE[:4]
+    }
+    (endpoint,) = daemon.status["endpoints"].values()
+    daemon.status["endpoints"] = {text: endpoint | {"clients": {text: {"last_received_s": 1.0}}} for text in HOSTILE}
+    daemon.status["name"] = HOSTILE[0]
+    for text in HOSTILE:
+        daemon.find(text, text, text)
+    async with page_of(daemon.answer) as web, window(browser, web.url) as page:
+        for text in HOSTILE[:4]:
+            card = card_of(page, text)
+            await expect(card).to_have_count(1)
+            await expect(card.locator("td").get_by_text(text, exact=True)).to_have_count(1)
+        for text in HOSTILE:
+            await expect(page.get_by_text(f"{text}. Remedy: {text}.")).to_have_count(2)  # now, and in the log
+        await expect(page).to_have_title(f"{HOSTILE[0]} - uavlinkd")
+        made = await page.evaluate("document.querySelectorAll('img, iframe, main script, [onclick]').length")
+        assert (made, await page.evaluate("window.ran")) == (0, None)
+        await page.get_by_role("article").get_by_role("link", name=HOSTILE[0], exact=True).click()
+        await expect(page.get_by_role("heading", level=1)).to_have_text(HOSTILE[0])
+        await expect(page.get_by_role("article")).to_have_count(1)
+        assert page.url.startswith(f"{web.url}peer/")
+        assert await page.evaluate("window.ran") is None
