@@ -55,6 +55,25 @@ async def test_frequent_requests_reuse_the_answer(monkeypatch: pytest.MonkeyPatc
     assert answers[0].headers["content-type"] == "text/plain; version=0.0.4; charset=utf-8"
 
 
+@pytest.mark.parametrize("status", [{}, {"schema": 1}, STATUS | {"peers": 5}, STATUS | {"peers": {"drone1": None}}])
+async def test_an_answer_that_is_no_status_is_asked_for_no_more_often(
+    monkeypatch: pytest.MonkeyPatch, status: dict[str, Any]
+) -> None:
+    """A daemon of another version: Prometheus gets the reason, and the log no traceback for each request."""
+    asked = list[str]()
+
+    async def ask(request: str) -> dict[str, Any]:
+        asked.append(request)
+        return status
+
+    monkeypatch.setattr(scrapes, "monotonic", lambda: 100.0)
+    page = scrapes.Scrapes(ask)
+    answers = [await page.answer(REQUEST) for _ in range(9)]
+    assert {answer.status_code for answer in answers} == {503}
+    assert b"restart the older one" in bytes(answers[0].body)
+    assert asked == ["status"]
+
+
 async def query(port: int, expression: str) -> list[str]:
     """The values of an expression in Prometheus; none before it can answer."""
     url = f"http://127.0.0.1:{port}/api/v1/query?query={expression}"

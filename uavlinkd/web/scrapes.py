@@ -11,7 +11,7 @@ from starlette.responses import PlainTextResponse, Response
 from uavlinkd.ops.control import ControlError
 from uavlinkd.system.clock import monotonic
 from uavlinkd.web.metrics import CONTENT_TYPE, exposition
-from uavlinkd.web.watch import Ask
+from uavlinkd.web.watch import NOT_UNDERSTOOD, Ask
 
 CONTENT_AGE_S: Final = 0.5
 """An answer is reused for this long: frequent requests must not take CPU time from the links."""
@@ -33,5 +33,7 @@ class Scrapes:
                     self._answer = Response(exposition(await self._ask("status")), media_type=CONTENT_TYPE)
                 except ControlError as error:
                     self._answer = PlainTextResponse(f"{error}\n", 503)
+                except Exception as error:  # not a status
+                    self._answer = PlainTextResponse(NOT_UNDERSTOOD.format(type(error).__name__) + "\n", 503)
                 self._answered_at = monotonic()
             return self._answer

@@ -29,7 +29,7 @@ SAMPLE_S: Final = 4.0
 SAMPLES: Final = 150
 """Ten minutes."""
 _OTHER_VERSION: Final = "the daemon is of another version than this page: restart the older one of them"
-_NOT_UNDERSTOOD: Final = "the page does not understand the daemon's answer ({}): restart the older one of them"
+NOT_UNDERSTOOD: Final = "the page does not understand the daemon's answer ({}): restart the older one of them"
 
 Ask = Callable[[str], Awaitable[dict[str, Any]]]
 Sample = Mapping[PathKey, tuple[float | None, float | None, float]]
@@ -90,7 +90,7 @@ class Watcher:
         except ControlError as error:
             self._lost = str(error)
         except Exception as error:  # not a status: the page goes on, and asks again
-            self._lost = _NOT_UNDERSTOOD.format(type(error).__name__)
+            self._lost = NOT_UNDERSTOOD.format(type(error).__name__)
         else:
             self._status, self._lost = status, None
             if not detailed and self._detailed():  # the first answer named the peers
@@ -141,7 +141,7 @@ class Watcher:
         try:
             return view(self._status, self._problems, peer)
         except Exception as error:
-            return {"lost": _NOT_UNDERSTOOD.format(type(error).__name__)}
+            return {"lost": NOT_UNDERSTOOD.format(type(error).__name__)}
 
     def _history(self, peer: str, last: int = SAMPLES) -> dict[str, dict[int, list[Sequence[float | None]]]]:
         """Round trips in seconds, losses and bytes a second of each path, the oldest first; null if unknown."""
