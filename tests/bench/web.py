@@ -32,7 +32,7 @@ PEERS, FRAMES_EACH_PER_S = 200, 1.0
 BROWSERS: Final = (0, 1, 20)
 PAGE_PORT: Final = 8797
 LINKED_S: Final = 60.0
-SETTLE_S, SLICE_S = 1.0, 3.0
+SETTLE_S, SLICE_S = 1.0, 4.0
 ASKED: Final = 15
 READ_BYTES: Final = 65536
 QUICK_S: Final = 0.05
@@ -178,7 +178,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("what", nargs="*", choices=("cpu", "memory"), default=("cpu", "memory"))
     parser.add_argument("--peers", type=int, default=PEERS)
-    parser.add_argument("--slices", type=int, default=8, help="with and without the page, in turn")
+    parser.add_argument("--slices", type=int, default=6, help="with and without the page, in turn")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="uavbench-") as name, ExitStack() as running:
         folder = Path(name)
