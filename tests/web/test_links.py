@@ -21,7 +21,7 @@ from tests.daemon.relay import End, Relay
 from tests.daemon.udp import shown
 from tests.waiting import Stopwatch
 from tests.web.browser import card_of, headline, until_lost, window
-from tests.web.served import served
+from tests.web.served import page_of, served
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.ops.status_words import problems
@@ -165,6 +165,16 @@ async def test_a_page_whose_server_ends_is_lost_and_comes_back(browser: Browser)
             await page.evaluate("quickest -= 1e6")
             async with served(socket, port=port):
                 await expect(state).to_have_text("up")
+
+
+async def test_an_event_that_waited_in_a_buffer_is_no_news(browser: Browser) -> None:
+    """Each event says when it was sent. The page compares with the one that travelled fastest."""
+    async with page_of() as web, window(browser, web.url) as page:
+        state = page.get_by_role("article").locator(".state")
+        await expect(state).to_have_text("up")
+        await page.evaluate("quickest -= 4000")
+        await expect(headline(page)).to_contain_text("LOST: the page's server does not answer")
+        await expect(state).to_have_text("unknown")
 
 
 async def test_a_relay_shows_its_members(browser: Browser) -> None:
