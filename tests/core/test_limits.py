@@ -51,17 +51,6 @@ def test_sources_have_their_own_buckets_in_bounded_memory(monkeypatch: pytest.Mo
     assert list(limiter._buckets) == [48, 49, "loud"]
 
 
-def test_asking_for_a_token_takes_none() -> None:
-    """Nor does it track a source: a stranger that only asks has no place in memory."""
-    limiter = SourceLimiter(1.0, 2)
-    assert [limiter.has("a", 0.0) for _ in range(5)] == 5 * [True]
-    assert limiter._buckets == {}
-    assert [limiter.take("a", 0.0) for _ in range(3)] == [True, True, False]
-    assert [limiter.has("a", now) for now in (0.0, 0.9, 1.0)] == [False, False, True]
-    assert limiter.has("b", 0.0)
-    assert [limiter.take("a", 1.0), limiter.has("a", 1.0)] == [True, False]
-
-
 @pytest.mark.parametrize(
     ("one", "other", "is_same"),
     [

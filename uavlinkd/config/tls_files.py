@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from ssl import SSLContext
 
 _MAKE = (
-    "`openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes -days 3650 -subj /CN=relay"
-    " -keyout tls.key -out tls.crt` makes both, and members accept that"
+    "`openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes -days 3650 -subj /CN=uavlinkd"
+    " -keyout tls.key -out tls.crt` makes both"
 )
 
 

@@ -60,10 +60,6 @@ class SourceLimiter:
         self._burst = burst
         self._buckets: dict[Hashable, TokenBucket] = {}
 
-    def has(self, source: Hashable, now: float) -> bool:
-        """Whether the source has a token."""
-        return source not in self._buckets or self._buckets[source].has(now)
-
     def take(self, source: Hashable, now: float, count: float = 1.0) -> bool:
         """Remove this many tokens of the source. With fewer, remove nothing and return False."""
         bucket = self._buckets.pop(source, None) or TokenBucket(self._rate, self._burst, now)

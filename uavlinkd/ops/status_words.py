@@ -56,7 +56,8 @@ class ProblemLine(NamedTuple):
     """One line: a cause and its remedy, of all that have the same problem."""
 
     severity: str
-    names: list[str]
+    peers: list[str]
+    """Empty for the daemon and its endpoints."""
     who: str
     """The peers or endpoints, in words; empty for the daemon."""
     text: str
@@ -95,7 +96,13 @@ def problems(findings: Iterable[Mapping[str, str]]) -> list[ProblemLine]:
         several.setdefault(key, []).append(finding["name"])
     prefixes = {"peer": "", "endpoint": "endpoint "}
     return [
-        ProblemLine(severity, names, prefixes[subject] + some(names) if subject in prefixes else "", text, remedy)
+        ProblemLine(
+            severity,
+            names if subject == "peer" else [],
+            prefixes[subject] + some(names) if subject in prefixes else "",
+            text,
+            remedy,
+        )
         for (severity, subject, text, remedy), names in several.items()
     ]
 

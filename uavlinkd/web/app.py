@@ -29,7 +29,8 @@ def make_app(watch: Watcher, more: Sequence[BaseRoute]) -> Starlette:
 
     async def events(request: Request) -> Response:
         peer = request.query_params.get("peer", "")
-        return StreamingResponse(watch.messages(peer), media_type="text/event-stream")
+        unbuffered = {"X-Accel-Buffering": "no"}  # nginx would collect events
+        return StreamingResponse(watch.messages(peer), headers=unbuffered, media_type="text/event-stream")
 
     def fixed(name: str, media_type: str) -> Route:
         content = resource(name, media_type)

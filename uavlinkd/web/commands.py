@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -45,5 +46,6 @@ def of_the_extra(command: str) -> Iterator[None]:
         yield
     except ModuleNotFoundError as error:
         raise CommandError(
-            f"{command} needs the extra `web` ({error.name} is missing). In a checkout: pip install '.[web]'"
+            f"{command} needs the extra `web` ({error.name} is missing). In a checkout:"
+            f" {sys.executable} -m pip install '.[web]'"
         ) from None

@@ -17,7 +17,8 @@ from uavlinkd.core.limits import SourceLimiter, source_of
 
 WRONG_PER_S: Final = 1 / 10
 WRONG_AT_ONCE: Final = 10
-"""Limits on wrong passwords of one source: an address, or a /64 of IPv6."""
+"""Limits on wrong passwords of one source: an address, or a /64 of IPv6. The right one is always accepted: strangers
+behind the same proxy or NAT must not lock its owner out, and 120 random bits are not guessed."""
 _OF_PROXIES: Final = ("forwarded", "via", "x-real-ip")
 HEADERS: Final[Mapping[str, str]] = {
     # Nothing from elsewhere, no inline script or style, no frame around it, and no text that becomes markup.
@@ -77,12 +78,10 @@ class Guard:
         challenge = {"WWW-Authenticate": 'Basic realm="uavlinkd", charset="UTF-8"'}
         if credentials is None:
             return _refuse(401, "this page has a password", challenge)
-        source, now = source_of(scope["client"][0] if scope["client"] else ""), self._clock()
-        if not self._wrong.has(source, now):
-            return _refuse(429, "too many wrong passwords: wait a minute", {"Retry-After": "60"})
         if equal(sha256(_password(credentials)), self._password_hash or b""):
             return None
-        self._wrong.take(source, now)
+        if not self._wrong.take(source_of(scope["client"][0] if scope["client"] else ""), self._clock()):
+            return _refuse(429, "too many wrong passwords: wait a minute", {"Retry-After": "60"})
         return _refuse(401, "this is not the password", challenge)
 
 

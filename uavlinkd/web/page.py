@@ -6,6 +6,7 @@ import asyncio
 import ssl
 from collections.abc import Sequence
 from pathlib import Path
+from socket import gethostname
 from types import TracebackType
 from typing import Any
 
@@ -55,7 +56,8 @@ class Page:
 
     @property
     def url(self) -> str:
-        return f"{self._scheme}://{Address(*self._listener.getsockname()[:2])}/"
+        address = Address(*self._listener.getsockname()[:2])
+        return f"{self._scheme}://{f'{gethostname()}:{address.port}' if address.is_wildcard else address}/"
 
     async def run(self) -> None:
         """Serve until cancelled."""

@@ -8,6 +8,7 @@ has the most of them.
 from __future__ import annotations
 
 import asyncio
+import gc
 import logging
 import socket
 import ssl
@@ -35,6 +36,8 @@ SEND_BYTES: Final = 65_536
 """A browser that reads slowly gets old messages from the kernel's buffer: it is small."""
 DEAD_S: Final = 15
 """A browser that acknowledges nothing for so long has gone."""
+COLLECTED_EVERY: Final = 64  # connections that ended
+"""One by TLS leaves a circle of objects with 256 kB, and Python looks for these too rarely."""
 _OPTIONS: Final = (
     (socket.SOL_SOCKET, "SO_SNDBUF", SEND_BYTES),
     (socket.IPPROTO_TCP, "TCP_NODELAY", 1),
@@ -123,10 +126,12 @@ class WebServer:
         self._listener = listener
         self._tls = tls
         self._open: dict[asyncio.Task[None], _Place] = {}  # oldest first
+        self._ended = 0
 
     async def run(self) -> None:
         """Accept connections until cancelled."""
         loop, acceptable = asyncio.get_running_loop(), asyncio.Event()
+        gc.freeze()  # what is imported stays: to look for circles among the rest takes 1 ms
         self._listener.setblocking(False)
         loop.add_reader(self._listener, acceptable.set)
         try:
@@ -161,6 +166,9 @@ class WebServer:
     def _forget(self, task: asyncio.Task[None], sock: socket.socket) -> None:
         self._open.pop(task, None)
         sock.close()  # also that of a task that was cancelled before it began
+        self._ended += 1
+        if self._tls is not None and self._ended % COLLECTED_EVERY == 0:
+            gc.collect()
 
     def _make_room(self) -> bool:
         """End a connection without a request. Whether there was one."""

@@ -10,6 +10,7 @@ import ssl
 from base64 import b32encode
 from contextlib import suppress
 from pathlib import Path
+from socket import gethostname
 from typing import Final
 
 import anyio
@@ -39,7 +40,8 @@ def start(options: argparse.Namespace) -> int:
         raise UsageError(f"--listen {error}") from None
     _check(options, address)
     password_hash, tls = _read_hash(options.password_file), _read_tls(options)
-    names, socket = frozenset(name.lower() for name in options.name), control_socket(options)
+    own = gethostname().lower()  # in a browser's address, only this machine has it
+    names, socket = frozenset([own, f"{own}.local", *map(str.lower, options.name)]), control_socket(options)
     with Page(socket, address, names, password_hash, tls) as page:
         _leave_root(socket)
         print(printable(f"the page is at {page.url} until Ctrl-C"), flush=True)
@@ -50,8 +52,10 @@ def start(options: argparse.Namespace) -> int:
 
 def _leave_root(socket: Path) -> None:
     """After ``sudo``, become the user of the control socket: what answers browsers needs no more rights than that."""
-    if os.geteuid() != 0 or not socket.exists():
+    if os.geteuid() != 0:
         return
+    if not socket.exists():
+        raise CommandError(f"there is no {socket}: start the daemon first, or run this as its user and not as root")
     asyncio.run(asyncio.to_thread(anyio.run, anyio.sleep, 0))  # they import parts at first use: not readable later
     owner = socket.stat()
     os.setgroups([])

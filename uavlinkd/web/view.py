@@ -38,7 +38,7 @@ def view(status: Status, past: Sequence[Mapping[str, Any]], peer: str) -> dict[s
     facts: dict[str, Any] = {
         "daemon": status["name"],
         "headline": [part._asdict() for part in words.headline(status)],
-        "problems": [line._asdict() for line in lines if not peer or peer in line.names],
+        "problems": [line._asdict() for line in lines if not peer or not line.peers or peer in line.peers],
         "past": [line for line in past if not peer or line["name"] == peer],
         "cards": [card(name, status["peers"][name], states[name]) for name in names if name in states],
         "count": len(states),
@@ -63,7 +63,7 @@ def _states(status: Status, lines: Sequence[words.ProblemLine]) -> Iterator[tupl
     """The word for each peer, the broken ones first."""
     worst: dict[str, str] = {}
     for line in lines:  # the most severe first
-        for name in line.names:
+        for name in line.peers:
             worst.setdefault(name, line.severity)
     found = {}
     for name, peer in status["peers"].items():

@@ -19,7 +19,7 @@ function showAttacks({ attacks: choice, running, frames, results }) {
     el("p", {}, choice.flatMap(([name, text]) => [el("button", { type: "button", "data-attack": name, disabled: running !== null }, text), " "])),
     el("p", { role: "status" }, words),
     ...(results.length ? [list(results.map(([text, attempts, counted]) => [text, count(attempts), counted || "nothing"]), ["attack", "attempts", "refused or noticed by the daemons"])] : []),
-    el("p", {}, el("strong", { class: frames.altered ? "bad" : "good" }, `${verdict}.`), ` Of ${count(frames.sent)} genuine frames, ${count(frames.delivered)} were.`),
+    el("p", {}, el("strong", { class: frames.altered ? "bad" : "good" }, `${verdict}.`), ` Of ${count(frames.sent)} genuine frames, ${count(frames.delivered)} were delivered.`),
   ]);
 }
 
