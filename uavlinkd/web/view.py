@@ -21,12 +21,13 @@ _SHOWN_REFUSALS: Final = 30
 def paths_of(status: Status) -> Iterator[tuple[PathKey, tuple[float | None, float | None, float]]]:
     """Round trip in seconds, worse of the two losses, and bytes a second in both directions, of each path.
 
-    The daemon keeps the last figures of a path that is down: these are left out.
+    The daemon keeps the last figures of a path that is down, and of a link that is lost: these are left out.
     """
     for name, peer in status["peers"].items():
         for path in peer["paths"]:
             loss, rate = max(path["loss_in"], path["loss_out"]), path["bytes_in_s"] + path["bytes_out_s"]
-            measured = (None, None) if path["state"] == "down" else (path["round_trip_s"], round(loss, 4))
+            is_measured = peer["state"] == "up" and path["state"] != "down"
+            measured = (path["round_trip_s"], round(loss, 4)) if is_measured else (None, None)
             yield (name, path["number"]), (*measured, round(rate))
 
 
@@ -81,14 +82,14 @@ def row(name: str, peer: Status, word: str) -> list[Any]:
     return [name, word, *_figures(peer), peer["path"], len(peer["paths"])]
 
 
-def _figures(part: Status) -> list[float | None]:
-    silent_s, time_s = part["last_received_s"], part["round_trip_s"]
+def _figures(peer: Status) -> list[float | None]:
+    silent_s, time_s, is_up = peer["last_received_s"], peer["round_trip_s"], peer["state"] == "up"
     return [
         None if silent_s is None else round(silent_s, 1),
-        None if time_s is None else round(time_s, 4),
-        round(max(part["loss_in"], part["loss_out"]), 3),
-        round(part["bytes_in_s"]),
-        round(part["bytes_out_s"]),
+        round(time_s, 4) if is_up and time_s is not None else None,
+        round(max(peer["loss_in"], peer["loss_out"]), 3) if is_up else None,
+        round(peer["bytes_in_s"]),
+        round(peer["bytes_out_s"]),
     ]
 
 
@@ -99,7 +100,10 @@ def card(name: str, peer: Status, word: str) -> dict[str, Any]:
         return facts | {"paths": [], "facts": [], "refused": [], "dropped": [], "reported": []}
     session = peer["session"] or {}
     return facts | {
-        "paths": [_path(*item) for item in zip(peer["paths"], addresses(peer["paths"]), strict=True)],
+        "paths": [
+            _path(path, address, is_up=peer["state"] == "up")
+            for path, address in zip(peer["paths"], addresses(peer["paths"]), strict=True)
+        ],
         "facts": [
             ["role", peer["role"] or "none"],
             ["key exchange", session.get("suite", "no session")],
@@ -113,19 +117,19 @@ def card(name: str, peer: Status, word: str) -> dict[str, Any]:
     }
 
 
-def _path(path: Status, address: str) -> dict[str, Any]:
-    is_down = path["state"] == "down"
+def _path(path: Status, address: str, *, is_up: bool) -> dict[str, Any]:
+    is_measured = is_up and path["state"] != "down"
     return {
         "number": path["number"],
         "network": path["network"] or "",
         "address": address,
         "way": "direct" if path["relay"] is None else f"relay {path['relay']}",
-        "condition": words.condition(path),
-        "state": words.path_state(path),
+        "condition": words.condition(path) if is_up else "unknown",
+        "state": words.path_state(path) if is_up else "no link",
         "carries": words.carried(path),
-        "rtt": None if is_down else path["round_trip_s"],
-        "jitter": None if is_down else path["jitter_s"],
-        "loss": [None, None] if is_down else [path["loss_in"], path["loss_out"]],
+        "rtt": path["round_trip_s"] if is_measured else None,
+        "jitter": path["jitter_s"] if is_measured else None,
+        "loss": [path["loss_in"], path["loss_out"]] if is_measured else [None, None],
         "rate": [path["bytes_in_s"], path["bytes_out_s"]],
     }
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 from collections import Counter, deque
-from collections.abc import AsyncGenerator, Awaitable, Callable, Iterator, Mapping, Sequence
+from collections.abc import AsyncGenerator, Awaitable, Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Final
 
@@ -32,7 +32,7 @@ _OTHER_VERSION: Final = "the daemon is of another version than this page: restar
 NOT_UNDERSTOOD: Final = "the page does not understand the daemon's answer ({}): restart the older one of them"
 
 Ask = Callable[[str], Awaitable[dict[str, Any]]]
-Sample = Mapping[PathKey, tuple[float | None, float | None, float]]
+Sample = dict[PathKey, tuple[float | None, float | None, float]]
 
 
 class Watcher:
@@ -77,7 +77,7 @@ class Watcher:
             pass
 
     async def _look(self, now: float) -> None:
-        detailed = self._detailed()
+        detailed, sample = self._detailed(), Sample()
         try:
             status = await self._ask(" ".join(["overview", *detailed]))
             if status["schema"] != STATUS_SCHEMA:
@@ -85,16 +85,15 @@ class Watcher:
             sample = dict(paths_of(status))
             if now - self._sampled_at >= SAMPLE_S:
                 self._problems = (await self._ask("problems"))["problems"]
-                self._samples.append(sample)
-                self._sampled_at = now
         except ControlError as error:
             self._lost = str(error)
         except Exception as error:  # not a status: the page goes on, and asks again
             self._lost = NOT_UNDERSTOOD.format(type(error).__name__)
         else:
             self._status, self._lost = status, None
-            if not detailed and self._detailed():  # the first answer named the peers
-                await self._look(now)
+        if now - self._sampled_at >= SAMPLE_S:  # empty without an answer: a gap
+            self._samples.append(sample)
+            self._sampled_at = now
 
     def _detailed(self) -> list[str]:
         """The peers of which a browser shows everything."""

@@ -7,8 +7,8 @@ const SHAPES = {
   up: "M8 1a7 7 0 1 0 .01 0z", // disc
   warning: "M8 1 15.5 14.5H.5z", // triangle
   blocked: "M1.5 1.5h13v13h-13z", // square
-  lost: "M3 .5 8 5.500 13 .5 15.500 3 10.500 8 15.500 13 13 15.500 8 10.500 3 15.500 .5 13 5.500 8 .5 3z", // cross
   waiting: "M8 1a7 7 0 1 0 .01 0zM8 4.500a3.500 3.500 0 1 1-.01 0z", // ring
+  lost: "M3 .5 8 5.500 13 .5 15.500 3 10.500 8 15.500 13 13 15.500 8 10.500 3 15.500 .5 13 5.500 8 .5 3z", // cross
   attack: "M5 .5h6L15.500 5v6L11 15.500H5L.5 11V5z", // octagon
   unknown: "M8 .5 15.500 8 8 15.500.5 8z", // diamond
 };
@@ -18,13 +18,18 @@ const TABLES = { peers: { order: [1, 1], columns: PEERS }, members: { order: [1,
 const ORDER = Object.keys(SHAPES).reverse();
 const PLOTS = [["round trip", ms], ["loss", percent], ["bytes", rate]];
 
-const peer = location.pathname.startsWith("/peer/") ? decodeURIComponent(location.pathname.slice(6)) : "";
+const peer = location.pathname.startsWith("/peer/") ? decoded(location.pathname.slice(6)) : "";
 const at = (id) => document.getElementById(id);
 let now = null; // the latest event
 let lost = null; // why its facts do not count
 let plotted = {};
 let heardAt = performance.now();
+let source = null; // of the events, while the page is visible
 let quickest = Infinity; // difference between this clock and the server's, in the event that travelled fastest
+
+function decoded(text) {
+  try { return decodeURIComponent(text); } catch { return text; }
+}
 
 // Elements. `attributes` of undefined or false are left out; children are elements, text or null.
 
@@ -76,7 +81,10 @@ function percent(share) { return share === null ? "-" : `${(100 * share).toFixed
 function rate(bytes) { return bytes === null ? "-" : bytes < 1000 ? `${Math.round(bytes)}\u00a0B/s` : `${(bytes / 1000).toFixed(1)}\u00a0kB/s`; }
 function age(s) { return s === null ? "never" : s < 100 ? `${s.toFixed(s < 10 ? 1 : 0)}\u00a0s` : s < 6000 ? `${Math.round(s / 60)}\u00a0min` : `${Math.round(s / 3600)}\u00a0h`; }
 function count(number) { return number.toLocaleString("en"); }
-function clock(agoS) { return new Date(Date.now() - 1000 * agoS).toLocaleTimeString(); }
+function clock(agoS) {
+  const then = new Date(Date.now() - 1000 * agoS), isToday = then.toDateString() === new Date().toDateString();
+  return isToday ? then.toLocaleTimeString() : then.toLocaleString();
+}
 
 function state(word) {
   const shown = lost === null ? word : "unknown";
@@ -134,7 +142,7 @@ function onePath(name, path) {
 
 function list(rows, titles) {
   return el("table", {}, el("thead", {}, el("tr", {}, titles.map((title) => el("th", { scope: "col" }, title)))),
-    el("tbody", {}, rows.map((row) => el("tr", {}, row.map((cell) => el("td", {}, cell))))));
+    el("tbody", {}, rows.map((row) => el("tr", {}, row.map((cell, index) => el("td", { "data-title": titles[index] }, cell))))));
 }
 
 const CELLS = {
@@ -147,7 +155,8 @@ function table(id, rows) {
   const section = at(id), wanted = section.querySelector("input").value.toLowerCase();
   const value = (row) => (columns[column] === "state" ? ORDER.indexOf(row[column]) : row[column]);
   const shown = rows.filter((row) => row.some((cell) => String(cell).toLowerCase().includes(wanted)));
-  shown.sort((a, b) => direction * (value(a) < value(b) ? -1 : value(a) > value(b) ? 1 : 0));
+  const unknown = (row) => value(row) === null; // last, in either direction
+  shown.sort((a, b) => unknown(a) - unknown(b) || direction * (value(a) < value(b) ? -1 : value(a) > value(b) ? 1 : 0));
   const head = columns.map((title, index) => el("th", { scope: "col", "aria-sort": index !== column ? false : direction > 0 ? "ascending" : "descending" },
     el("button", { type: "button", "data-column": String(index) }, title)));
   const body = shown.map((row) => el("tr", { "data-key": row[0] }, row.map((cell, index) => el("td", { class: `c${index}` }, (CELLS[columns[index]] || ((is) => (is === null ? "-" : is)))(cell)))));
@@ -167,7 +176,7 @@ function rest(facts) {
 }
 
 function past(lines) {
-  const newest = [...lines].sort((a, b) => a.began_s - b.began_s).slice(0, 50);
+  const newest = [...lines].sort((a, b) => (b.ended_s === null) - (a.ended_s === null) || a.began_s - b.began_s);
   const rows = newest.map((line) => [clock(line.began_s), line.ended_s === null ? "lasts" : clock(line.ended_s), line.severity, line.name || "-", `${line.text}. Remedy: ${line.remedy}.`]);
   return newest.length ? [el("h2", {}, "Problems in the log"), list(rows, ["began", "ended", "kind", "of", "what"])] : [];
 }
@@ -183,7 +192,7 @@ function render() {
   document.title = `${title} - uavlinkd`;
   at("title").textContent = title;
   const missing = peer && !now.cards.length ? [el("span", { class: "bad" }, `${now.daemon} has no peer of this name`)] : [];
-  const said = peer ? missing : now.headline.map((part) => el("span", { class: part.is_good ? "good" : "bad" }, part.text));
+  const said = [...missing, ...now.headline.map((part) => el("span", { class: part.is_good ? "good" : "bad" }, part.text))];
   fill(at("headline"), lost === null ? said : [el("span", { class: "bad" }, `LOST: ${lost}. What is below was true at ${now.seen}.`)]);
   fill(at("problems"), problems(now.problems));
   fill(at("cards"), now.cards.map(card));
@@ -202,12 +211,13 @@ function lose(why) {
 }
 
 function listen() {
-  const source = new EventSource(`/events?peer=${encodeURIComponent(peer)}`);
+  if (document.hidden) return;
+  source = new EventSource(`/events?peer=${encodeURIComponent(peer)}`);
   source.addEventListener("open", () => { quickest = Infinity; }); // after a reboot the server's clock begins again
   source.addEventListener("now", (event) => {
     const facts = JSON.parse(event.data);
     const late = performance.now() - 1000 * facts.at;
-    quickest = Math.min(quickest, late);
+    quickest = Math.min(quickest + 1, late); // the two clocks may drift by 1 ms an event
     if (late - quickest > LOST_MS) return; // it waited in a buffer
     heardAt = performance.now();
     if (facts.lost !== undefined) {
@@ -227,8 +237,8 @@ function listen() {
       }
     }
   });
-  source.addEventListener("error", () => {
-    if (source.readyState === EventSource.CLOSED) setTimeout(listen, 2000); // refused: the browser gives up
+  source.addEventListener("error", ({ target }) => {
+    if (target === source && target.readyState === EventSource.CLOSED) setTimeout(listen, 2000); // refused: the browser gives up
   });
 }
 
@@ -242,7 +252,12 @@ for (const id of Object.keys(TABLES)) {
     shown();
   });
 }
+document.addEventListener("visibilitychange", () => { // a browser has six connections to a server, for all its tabs
+  source?.close();
+  heardAt = performance.now();
+  listen();
+});
 setInterval(() => {
-  if (performance.now() - heardAt > LOST_MS) lose("the page's server does not answer");
+  if (!document.hidden && performance.now() - heardAt > LOST_MS) lose("the page's server does not answer");
 }, 500);
 listen();
