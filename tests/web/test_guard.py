@@ -186,18 +186,19 @@ async def test_no_answer_has_the_password_in_it(locked: Served) -> None:
 
 
 async def test_wrong_passwords_have_a_limit_for_each_source(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Others still look. After the limit the right password of that source waits too, and only a pause helps."""
+    """The right password is accepted all the time: strangers must not lock its owner out."""
     now = [1000.0]
     monkeypatch.setattr("uavlinkd.web.page.monotonic", lambda: now[0])
     async with page_of(password_hash=HASH) as page:
         statuses = [(await page.ask(Authorization=basic(f"wrong{n}"), source=STRANGER)).status for n in range(15)]
         assert statuses == WRONG_AT_ONCE * [401] + (15 - WRONG_AT_ONCE) * [429]
-        waits = await page.ask(Authorization=basic(PASSWORD), source=STRANGER)
+        waits = await page.ask(Authorization=basic("wrong"), source=STRANGER)
         assert (waits.status, waits.headers["retry-after"]) == (429, "60")
+        assert (await page.ask(Authorization=basic("wrong"))).status == 401, "another source has its own limit"
         assert (await page.ask(source=STRANGER)).status == 401, "a new browser asks for the password"
-        assert (await page.ask(Authorization=basic(PASSWORD))).status == 200
-        now[0] += 1 / guard.WRONG_PER_S
         assert (await page.ask(Authorization=basic(PASSWORD), source=STRANGER)).status == 200
+        now[0] += 1 / guard.WRONG_PER_S
+        assert (await page.ask(Authorization=basic("wrong"), source=STRANGER)).status == 401
 
 
 async def test_right_passwords_and_none_are_not_counted(locked: Served) -> None:

@@ -131,7 +131,6 @@ class WebServer:
     async def run(self) -> None:
         """Accept connections until cancelled."""
         loop, acceptable = asyncio.get_running_loop(), asyncio.Event()
-        gc.freeze()  # what is imported stays: to look for circles among the rest takes 1 ms
         self._listener.setblocking(False)
         loop.add_reader(self._listener, acceptable.set)
         try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import gc
 import os
 import signal
 import ssl
@@ -64,6 +65,7 @@ def _leave_root(socket: Path) -> None:
 
 
 async def _until_ended(page: Page) -> None:
+    gc.freeze()  # what is imported stays: the server looks for circles of objects among the rest
     task = asyncio.current_task()
     assert task is not None
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, task.cancel)
