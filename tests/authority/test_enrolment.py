@@ -127,6 +127,14 @@ def test_impossible_contacts_are_refused(contacts: tuple[Contact, ...]) -> None:
         parse_reply(REPLY._replace(contacts=contacts).line())
 
 
+def test_address_too_long_for_a_line_is_refused() -> None:
+    """Its length has one byte."""
+    longest = "relay." * 42 + "x:1"
+    assert parse_reply(REPLY._replace(addresses=(longest,)).line()).addresses == (longest,)
+    with pytest.raises(FleetError, match="at most 255 characters"):
+        REPLY._replace(addresses=(f"x{longest}",)).line()
+
+
 def test_request_in_place_of_a_reply_is_named() -> None:
     """The error says where it belongs."""
     with pytest.raises(FleetError, match="give it to `uavlinkd fleet sign`"):

@@ -37,6 +37,7 @@ MOST_CONTACTS = 3
 LONGEST_LINE = 4096  # More characters than three contacts need. A terminal accepts no longer line.
 _HEAD = struct.Struct(f">BBBB{KEY_BYTES}s{KEY_BYTES}s{CERTIFICATE_BYTES}sH")
 _CONTACT = struct.Struct(f">{KEY_BYTES}s{CERTIFICATE_BYTES}sB")
+_MOST_ADDRESS = 255  # its length is one byte
 _CUT = "the line is not a whole line of `uavlinkd fleet sign`: it was cut or changed; copy it again, or send a file"
 
 
@@ -107,6 +108,8 @@ class Contact(NamedTuple):
 
 
 def _encoded(addresses: tuple[str, ...]) -> bytes:
+    if any(len(text) > _MOST_ADDRESS for text in addresses):
+        raise FleetError(f"an address in a line has at most {_MOST_ADDRESS} characters: write a shorter one")
     return bytes([len(addresses)]) + b"".join(bytes([len(text)]) + text.encode() for text in addresses)
 
 

@@ -11,10 +11,12 @@ from starlette.responses import PlainTextResponse, Response
 from uavlinkd.ops.control import ControlError
 from uavlinkd.system.clock import monotonic
 from uavlinkd.web.metrics import CONTENT_TYPE, exposition
-from uavlinkd.web.watch import NOT_UNDERSTOOD, Ask
+from uavlinkd.web.watch import NOT_UNDERSTOOD, SHARE, Ask
 
-CONTENT_AGE_S: Final = 0.5
-"""An answer is reused for this long: frequent requests must not take CPU time from the links."""
+LEAST_AGE_S: Final = 0.5
+MOST_AGE_S: Final = 4.0
+"""An answer is reused for so long that the daemon needs :data:`SHARE` of the time for it, between these: frequent
+requests must not take CPU time from the links."""
 
 
 class Scrapes:
@@ -23,17 +25,18 @@ class Scrapes:
     def __init__(self, ask: Ask) -> None:
         self._ask = ask
         self._answer = Response()
-        self._answered_at = -CONTENT_AGE_S
+        self._old_at = 0.0
         self._asking = asyncio.Lock()
 
     async def answer(self, _: Request) -> Response:
         async with self._asking:
-            if monotonic() >= self._answered_at + CONTENT_AGE_S:
+            if (began := monotonic()) >= self._old_at:
                 try:
                     self._answer = Response(exposition(await self._ask("status")), media_type=CONTENT_TYPE)
                 except ControlError as error:
                     self._answer = PlainTextResponse(f"{error}\n", 503)
                 except Exception as error:  # not a status
                     self._answer = PlainTextResponse(NOT_UNDERSTOOD.format(type(error).__name__) + "\n", 503)
-                self._answered_at = monotonic()
+                ended = monotonic()
+                self._old_at = ended + min(MOST_AGE_S, max(LEAST_AGE_S, (ended - began) / SHARE))
             return self._answer

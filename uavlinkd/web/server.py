@@ -118,7 +118,6 @@ class WebServer:
             proxy_headers=False,
             ws="none",
             h11_max_incomplete_event_size=MAX_HEADER_BYTES,
-            timeout_keep_alive=int(REQUEST_S),
         )
         self._config.load()
         self._state = ServerState()

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import re
-import shutil
 import signal
 from pathlib import Path
 
 import pytest
-from playwright.async_api import async_playwright, expect
+from playwright.async_api import expect
 
 from tests.lab.sim.test_demo_web import folder, page
-from tests.needs import need
-from tests.waiting import PATIENCE_S
+from tests.web.browser import open_browser, window
 from uavlinkd.lab.sim.demo_web import ATTACKS
 
 __all__ = ["folder"]  # a fixture
@@ -20,17 +18,12 @@ __all__ = ["folder"]  # a fixture
 
 @pytest.mark.long
 async def test_each_attack_in_a_browser(folder: Path) -> None:
-    """The buttons, what the page then says, and that it notices the end of the demo. The browser has no complaint."""
-    chromium = shutil.which("chromium")
-    need(chromium is not None, "Chromium (Debian: chromium)")
-    expect.set_options(timeout=1000 * PATIENCE_S)
-    complaints: list[str] = []
-    async with page(folder=folder) as (process, url), async_playwright() as playwright:
-        browser = await playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
-        shown = await browser.new_page()
-        shown.on("console", lambda message: complaints.append(message.text))
-        shown.on("pageerror", lambda error: complaints.append(str(error)))
-        await shown.goto(url)
+    """The buttons, what the page then says, and that it notices the end of the demo."""
+    async with (
+        page(folder=folder) as (process, url),
+        open_browser() as browser,
+        window(browser, url, is_interrupted=True) as shown,
+    ):
         attacks = shown.get_by_role("region", name="Attacks")
         row = attacks.get_by_role("row").nth(1).get_by_role("cell")
         for text in ATTACKS:
@@ -41,7 +34,5 @@ async def test_each_attack_in_a_browser(folder: Path) -> None:
             assert (await row.nth(2).inner_text())[0].isdigit(), text
             await expect(attacks).to_contain_text("No forged, altered or replayed frame was delivered.")
         await expect(shown.get_by_role("article").locator(".state")).to_have_text(re.compile("up|warning"))
-        assert complaints == []
         process.send_signal(signal.SIGINT)
         await expect(shown.get_by_text("The demo does not answer")).to_be_visible()
-        await browser.close()
