@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import asyncio.sslproto
+import gc
 import socket
 import ssl
 from asyncio import StreamReader, StreamWriter
@@ -153,6 +155,25 @@ async def test_half_a_tls_handshake_ends_the_connection(tmp_path: Path, rest: by
             writer.write(rest)
             assert (await page.ask()).status == 200
             assert await ended(reader) == b""
+
+
+async def test_ended_connections_by_tls_do_not_fill_the_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each one leaves a circle of objects with a buffer of 256 kB."""
+    monkeypatch.setattr(server, "COLLECTED_EVERY", 8)
+    write_tls_files(tmp_path)
+    async with page_of(tls=load_tls(tmp_path / CERTIFICATE, tmp_path / TLS_KEY)) as page:
+        gc.disable()
+        try:
+            for _ in range(80):
+                async with connected(Served(page.address, None)) as (reader, writer):
+                    writer.write(b"no TLS, but enough bytes to be refused as such")
+                    await ended(reader)
+            left = sum(isinstance(one, asyncio.sslproto.SSLProtocol) for one in gc.get_objects())
+        finally:
+            gc.enable()
+        assert left < 20
 
 
 # Too many connections.
