@@ -88,6 +88,7 @@ async def test_udp_comes_first(stage: Stage) -> None:
     assert scene.drone.events("relay_connected") == []
 
 
+@pytest.mark.long
 async def test_relay_that_restarts(stage: Stage) -> None:
     """Its members connect again, and the link is back."""
     scene = Scene(stage)

@@ -157,6 +157,7 @@ async def test_half_a_tls_handshake_ends_the_connection(tmp_path: Path, rest: by
             assert await ended(reader) == b""
 
 
+@pytest.mark.long
 async def test_ended_connections_by_tls_do_not_fill_the_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -409,6 +410,7 @@ def busy(monkeypatch: pytest.MonkeyPatch) -> BusyDaemon:
     return BusyDaemon()
 
 
+@pytest.mark.long
 async def test_a_browser_that_does_not_read_gets_the_newest_message_afterwards(busy: BusyDaemon) -> None:
     """Nothing is kept for it but what the kernel has already; the others are held up by nothing."""
     async with page_of(busy.answer) as page:

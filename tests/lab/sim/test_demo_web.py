@@ -88,6 +88,7 @@ async def first(url: str, condition: Callable[[dict[str, Any]], bool]) -> dict[s
     raise AssertionError("the events ended")
 
 
+@pytest.mark.long
 async def test_a_started_attack_is_refused_and_counted(folder: Path) -> None:
     """One at a time; it ends by itself, and Ctrl-C ends the demo although a browser looks on."""
     async with page(folder=folder) as (process, url):
@@ -130,6 +131,7 @@ async def test_another_site_cannot_attack(folder: Path) -> None:
         assert [name for name, _ in event["attacks"]] == NAMES
 
 
+@pytest.mark.long
 async def test_the_demo_ends_after_its_seconds(folder: Path) -> None:
     """Its last line is the summary."""
     async with page("--seconds", "1", "--json", folder=folder) as (process, _):
@@ -166,7 +168,7 @@ def test_without_the_extra_the_remedy_is_named() -> None:
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr.startswith("uavlinkd demo --web needs the extra `web` (starlette")
-    assert done.stderr.endswith(" is missing). In a checkout: pip install '.[web]'\n")
+    assert done.stderr.endswith(" -m pip install '.[web]'\n")
 
 
 def test_the_page_of_a_daemon_only_reads() -> None:
