@@ -91,7 +91,9 @@ _REQUIREMENTS = """
 import json, sys, tomllib
 with open(sys.argv[1], "rb") as file:
     project = tomllib.load(file)["project"]
-print(json.dumps([*project["dependencies"], *project["optional-dependencies"]["lab"]]))
+extras = project["optional-dependencies"]
+wanted = [*project["dependencies"], *extras["lab"], *extras["web"]]
+print(json.dumps([one for one in wanted if not one.startswith("uavlinkd[")]))
 """
 
 
