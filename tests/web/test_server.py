@@ -419,7 +419,7 @@ async def test_a_browser_that_does_not_read_gets_the_newest_message_afterwards(
         socket.IPPROTO_TCP,
         "TCP_USER_TIMEOUT",
         int(1000 * PATIENCE_S),
-    )  # 400 answers take long on a busy machine
+    )
     monkeypatch.setattr(server, "_OPTIONS", [*server._OPTIONS, later])
     async with page_of(busy.answer) as page:
         reader, writer = await slow_reader(page)
