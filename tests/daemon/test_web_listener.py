@@ -10,6 +10,7 @@ from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager, suppress
 from typing import Any
 
+import pytest
 from websockets.asyncio.client import ClientConnection, connect
 
 from tests.daemon.harness import Stage
@@ -119,6 +120,7 @@ async def _ask(port: int, request: str) -> bytes:
     return answer
 
 
+@pytest.mark.long
 async def test_member_talks_in_messages_of_a_websocket(stage: Stage) -> None:
     """The first message is an initiation, the first answer its response. The connection stays while it is proved."""
     relay, member, port = _relay(stage)
@@ -139,6 +141,7 @@ async def test_member_talks_in_messages_of_a_websocket(stage: Stage) -> None:
     assert relay.events("sends_failed") == []
 
 
+@pytest.mark.long
 async def test_strangers_get_a_page_and_no_more(stage: Stage) -> None:
     """Without messages of a member, a connection ends after 5 s."""
     relay, _, port = _relay(stage)

@@ -7,6 +7,7 @@ import json
 import logging
 import ssl
 import tempfile
+from base64 import b64encode
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping
 from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
@@ -16,11 +17,14 @@ import h11
 
 from tests.waiting import PATIENCE_S
 from tests.web.statuses import overview
+from uavlinkd.core.crypto import sha256
 from uavlinkd.ops.control import Answer, ControlServer
 from uavlinkd.system.addresses import Address
 from uavlinkd.web import server
 from uavlinkd.web.page import Page
 
+PASSWORD = "abcdef-ghijkl-mnopqr-stuvwx"
+HASH = sha256(PASSWORD.replace("-", "").encode())
 Facts = dict[str, Any]
 Reaction = Callable[[str], Answer | Awaitable[Answer]]
 
@@ -28,6 +32,10 @@ Reaction = Callable[[str], Answer | Awaitable[Answer]]
 def peaceful(request: str) -> Answer:
     """A daemon whose only peer is up."""
     return {"problems": []} if request == "problems" else overview()
+
+
+def basic(password: str, user: str = "me") -> str:
+    return f"Basic {b64encode(f'{user}:{password}'.encode()).decode()}"
 
 
 def is_answered(facts: Facts) -> bool:

@@ -15,8 +15,7 @@ import pytest
 
 from tests.tls_files import write_tls_files
 from tests.waiting import PATIENCE_S
-from tests.web.served import Served, is_answered, peaceful
-from tests.web.test_guard import basic
+from tests.web.served import Served, basic, is_answered, peaceful
 from uavlinkd.cli import main
 from uavlinkd.core.crypto import sha256
 from uavlinkd.lab.child_processes import end_with_parent

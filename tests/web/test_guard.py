@@ -5,40 +5,18 @@ from __future__ import annotations
 import asyncio
 import ssl
 from base64 import b64encode
-from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
 
 from tests.tls_files import CERTIFICATE, TLS_KEY, write_tls_files
-from tests.web.served import Served, is_answered, page_of
+from tests.web.served import HASH, PASSWORD, Served, basic, is_answered, page_of
 from uavlinkd.config.tls_files import load_tls
-from uavlinkd.core.crypto import sha256
 from uavlinkd.web import guard
 from uavlinkd.web.guard import HEADERS, WRONG_AT_ONCE
 
-PASSWORD = "abcdef-ghijkl-mnopqr-stuvwx"
-HASH = sha256(PASSWORD.replace("-", "").encode())
 STRANGER = "127.0.0.2"
 TARGETS = ("/", "/peer/drone1", "/events", "/page.js", "/absent")
-
-
-def basic(password: str, user: str = "me") -> str:
-    return f"Basic {b64encode(f'{user}:{password}'.encode()).decode()}"
-
-
-@pytest.fixture
-async def page() -> AsyncIterator[Served]:
-    """A page without a password."""
-    async with page_of() as page:
-        yield page
-
-
-@pytest.fixture
-async def locked() -> AsyncIterator[Served]:
-    """A page with a password, which also has a name."""
-    async with page_of(password_hash=HASH, names=frozenset({"links.example"})) as page:
-        yield page
 
 
 async def test_a_browser_gets_the_page_and_its_events(page: Served) -> None:

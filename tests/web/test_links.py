@@ -20,7 +20,7 @@ from tests.daemon.process import DaemonProcess
 from tests.daemon.relay import End, Relay
 from tests.daemon.udp import shown
 from tests.waiting import Stopwatch
-from tests.web.browser import card_of, headline, until_lost, window
+from tests.web.browser import card_of, headline, linked_pair, until_lost, window
 from tests.web.served import page_of, served
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.mavlink.policy.gate import Refusal
@@ -132,21 +132,16 @@ async def test_refused_frames_have_their_message_reason_and_count(browser: Brows
 
 async def test_a_daemon_that_hangs_is_lost_within_three_seconds(browser: Browser) -> None:
     """It holds its socket open, and does not answer."""
-    async with Stage() as stage:
-        drone, ground = stage.pair()
-        await stage.start(drone, ground)
-        async with served(ground.folder / "control.sock") as web, window(browser, web.url) as page:
-            state = card_of(page, drone.name).locator(".state")
-            await expect(state).to_have_text("up")
-            stopwatch = Stopwatch()
-            await ground.send_signal(signal.SIGSTOP)
-            try:
-                await until_lost(page)
-                assert stopwatch.calm_s < LOST_S
-                await expect(state).to_have_text("unknown")
-            finally:
-                await ground.send_signal(signal.SIGCONT)
-            await expect(state).to_have_text("up")
+    async with linked_pair(browser) as (_, ground, page, state):
+        stopwatch = Stopwatch()
+        await ground.send_signal(signal.SIGSTOP)
+        try:
+            await until_lost(page)
+            assert stopwatch.calm_s < LOST_S
+            await expect(state).to_have_text("unknown")
+        finally:
+            await ground.send_signal(signal.SIGCONT)
+        await expect(state).to_have_text("up")
 
 
 async def test_a_page_whose_server_ends_is_lost_and_comes_back(browser: Browser) -> None:

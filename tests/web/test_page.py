@@ -7,10 +7,9 @@ from typing import Final
 import pytest
 from playwright.async_api import Browser, expect
 
-from tests.daemon.harness import Stage
-from tests.web.browser import card_of, headline, window
+from tests.web.browser import card_of, headline, linked_pair, window
 from tests.web.made_up_daemon import make_up
-from tests.web.served import page_of, served
+from tests.web.served import page_of
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
 
@@ -26,20 +25,15 @@ HOSTILE: Final = (
 
 async def test_a_daemon_that_ends_is_lost_and_comes_back(browser: Browser) -> None:
     """The page keeps no good news, says why, and needs no reload."""
-    async with Stage() as stage:
-        drone, ground = stage.pair()
-        await stage.start(drone, ground)
-        async with served(ground.folder / "control.sock") as web, window(browser, web.url) as page:
-            state = card_of(page, drone.name).locator(".state")
-            await expect(state).to_have_text("up")
-            await expect(headline(page)).to_have_text("1 of 1 peers up")
-            await ground.stop()
-            await expect(headline(page)).to_contain_text("LOST: no daemon answers at")
-            await expect(state).to_have_text("unknown")
-            assert await page.get_by_text("up", exact=True).count() == 0
-            await stage.start(ground)
-            await expect(state).to_have_text("up")
-            await expect(headline(page)).to_have_text("1 of 1 peers up")
+    async with linked_pair(browser) as (stage, ground, page, state):
+        await expect(headline(page)).to_have_text("1 of 1 peers up")
+        await ground.stop()
+        await expect(headline(page)).to_contain_text("LOST: no daemon answers at")
+        await expect(state).to_have_text("unknown")
+        assert await page.get_by_text("up", exact=True).count() == 0
+        await stage.start(ground)
+        await expect(state).to_have_text("up")
+        await expect(headline(page)).to_have_text("1 of 1 peers up")
 
 
 async def test_text_that_an_attacker_chose_is_text(browser: Browser) -> None:

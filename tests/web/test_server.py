@@ -16,9 +16,8 @@ import pytest
 
 from tests.tls_files import CERTIFICATE, TLS_KEY, write_tls_files
 from tests.waiting import PATIENCE_S, until
-from tests.web.served import Events, Served, is_answered, page_of, parsed
+from tests.web.served import PASSWORD, Events, Served, basic, is_answered, page_of, parsed
 from tests.web.statuses import overview
-from tests.web.test_guard import HASH, PASSWORD, basic
 from uavlinkd.config.tls_files import load_tls
 from uavlinkd.ops.control import Answer
 from uavlinkd.web import server, watch
@@ -28,19 +27,6 @@ STRANGER, OTHER = "127.0.0.2", "127.0.0.3"
 IN_QUEUE = 25
 """So many connect at once. The kernel would let more wait for a second."""
 Connection = tuple[StreamReader, StreamWriter]
-
-
-@pytest.fixture
-async def page() -> AsyncIterator[Served]:
-    async with page_of() as page:
-        yield page
-
-
-@pytest.fixture
-async def locked() -> AsyncIterator[Served]:
-    """A page with a password."""
-    async with page_of(password_hash=HASH) as page:
-        yield page
 
 
 @pytest.fixture
@@ -324,7 +310,7 @@ async def test_head_has_no_body(page: Served) -> None:
     "method", ["POST", "PUT", "DELETE", "PATCH", "OPTIONS", "TRACE", "CONNECT", "QUERY", "get", "X" * 99]
 )
 async def test_only_reading_is_possible(page: Served, method: str) -> None:
-    """An unknown method is none; no answer repeats the request."""
+    """An unknown method is refused; no answer repeats the request."""
     for target in ("/", "/events", "/page.js"):
         reply = await page.ask(target, method, Origin=f"http://{page.address}", X_Secret="do not repeat")
         assert reply.status == 405

@@ -19,33 +19,19 @@ def make_app(watch: Watcher, more: Sequence[BaseRoute]) -> Starlette:
     """The resources, ``more`` before the page's own. Content is read once: no path of a request leads to a file."""
     folder = files("uavlinkd.web") / "static"
 
-    def resource(name: str, media_type: str) -> Response:
-        return Response((folder / name).read_bytes(), media_type=media_type)
-
-    page = resource("index.html", "text/html")
-
-    async def show(_: Request) -> Response:
-        return page
+    def fixed(path: str, name: str, media_type: str) -> Route:
+        return Route(path, Response((folder / name).read_bytes(), media_type=media_type), methods=["GET"])
 
     async def events(request: Request) -> Response:
         peer = request.query_params.get("peer", "")
         unbuffered = {"X-Accel-Buffering": "no"}  # nginx would collect events
         return StreamingResponse(watch.messages(peer), headers=unbuffered, media_type="text/event-stream")
 
-    def fixed(name: str, media_type: str) -> Route:
-        content = resource(name, media_type)
-
-        async def answer(_: Request) -> Response:
-            return content
-
-        return Route(f"/{name}", answer)
-
     return Starlette(
         routes=[
             *more,
-            Route("/", show),
-            Route("/peer/{name}", show),
+            *(fixed(path, "index.html", "text/html") for path in ("/", "/peer/{name}")),
+            *(fixed(f"/{name}", name, media_type) for name, media_type in _TYPES.items()),
             Route("/events", events),
-            *(fixed(*item) for item in _TYPES.items()),
         ]
     )

@@ -77,13 +77,13 @@ class Watcher:
             pass
 
     async def _look(self, now: float) -> None:
-        detailed, sample = self._detailed(), Sample()
+        sample, is_due = Sample(), now - self._sampled_at >= SAMPLE_S
         try:
-            status = await self._ask(" ".join(["overview", *detailed]))
+            status = await self._ask(" ".join(["overview", *self._detailed()]))
             if status["schema"] != STATUS_SCHEMA:
                 raise ControlError(_OTHER_VERSION)
             sample = dict(paths_of(status))
-            if now - self._sampled_at >= SAMPLE_S:
+            if is_due:
                 self._problems = (await self._ask("problems"))["problems"]
         except ControlError as error:
             self._lost = str(error)
@@ -91,7 +91,7 @@ class Watcher:
             self._lost = NOT_UNDERSTOOD.format(type(error).__name__)
         else:
             self._status, self._lost = status, None
-        if now - self._sampled_at >= SAMPLE_S:  # empty without an answer: a gap
+        if is_due:  # empty without an answer: a gap
             self._samples.append(sample)
             self._sampled_at = now
 

@@ -146,7 +146,7 @@ function list(rows, titles) {
 }
 
 const CELLS = {
-  state: (word) => state(word), silent: age, since: age, "round trip": ms, loss: percent, in: rate, out: rate,
+  state, silent: age, since: age, "round trip": ms, loss: percent, in: rate, out: rate,
   peer: (name) => el("a", { href: `/peer/${encodeURIComponent(name)}` }, name), path: (text) => text || "-",
 };
 
@@ -159,7 +159,7 @@ function table(id, rows) {
   shown.sort((a, b) => unknown(a) - unknown(b) || direction * (value(a) < value(b) ? -1 : value(a) > value(b) ? 1 : 0));
   const head = columns.map((title, index) => el("th", { scope: "col", "aria-sort": index !== column ? false : direction > 0 ? "ascending" : "descending" },
     el("button", { type: "button", "data-column": String(index) }, title)));
-  const body = shown.map((row) => el("tr", { "data-key": row[0] }, row.map((cell, index) => el("td", { class: `c${index}` }, (CELLS[columns[index]] || ((is) => (is === null ? "-" : is)))(cell)))));
+  const body = shown.map((row) => el("tr", { "data-key": row[0] }, row.map((cell, index) => el("td", {}, (CELLS[columns[index]] || ((is) => (is === null ? "-" : is)))(cell)))));
   section.hidden = !rows.length;
   morph(section.querySelector("table"), el("table", {}, el("thead", {}, el("tr", {}, head)), el("tbody", {}, body)));
 }
