@@ -125,7 +125,7 @@ def test_envelopes_along_a_relay_are_shorter() -> None:
     assert [made.has_relayed for made in (linked(LTE, MESH), path_set(), paths)] == [False, False, True]
 
 
-def test_envelopes_hold_one_class_before_a_new_relayed_path_has_answered() -> None:
+def test_classes_matter_before_a_new_relayed_path_has_answered() -> None:
     """It carries the critical ones again then. Meanwhile the other path may be dead."""
     paths = linked(LTE)
     paths.configure([LTE, LTE_A], 2.0)
@@ -243,7 +243,7 @@ def test_no_other_envelope_is_sent_again_and_along_no_other_path(pair: Pair) -> 
 def test_new_handle_takes_the_place_of_the_only_one(pair: Pair) -> None:
     """At once, and critical envelopes are sent again there: a member's connection by TLS was reset."""
     peer, node = pair.a.peer, pair.a.node
-    assert peer.paths.is_multiple, "an envelope holds one class"
+    assert peer.paths.is_multiple, "critical envelopes are remembered"
     sent = send_critical(pair, 3.0)
     node.set_paths(peer, [LTE_A2], 3.1)
     pair.a.timeout(3.1)

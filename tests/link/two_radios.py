@@ -15,7 +15,7 @@ from uavlinkd.core.constants import NEVER
 from uavlinkd.core.crypto import KeyPair, Secret
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Deliver, Output, PathChanged, PathStateChanged, SessionEstablished, Transmit
-from uavlinkd.core.path import Path
+from uavlinkd.core.path import Path, relayed
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.core.timers import Schedule
@@ -36,6 +36,8 @@ class Radio(NamedTuple):
     loss: float = 0.0
     budget_bits_s: int = 0
     """0: none. Both ends have the same."""
+    is_relayed: bool = False
+    """Whether the path leads through a relay."""
 
 
 class Sent(NamedTuple):
@@ -134,7 +136,7 @@ class Network:
         self._rng = random.Random(seed)
         self._arriving: list[tuple[float, int, Callable[[], None]]] = []
         self._number = 0
-        self.alpha.link.set_paths([path_of(number, "bravo") for number in range(len(radios))], 0.0)
+        self.alpha.link.set_paths([self._path_to(number, self.bravo) for number in range(len(radios))], 0.0)
 
     def transmit(self, sender: End, datagram: bytes, path: Path) -> None:
         """Put a datagram on the air."""
@@ -142,8 +144,13 @@ class Network:
         if self._rng.random() < radio.loss:
             return
         receiver = self.bravo if sender is self.alpha else self.alpha
-        source = path_of(path.socket, sender.name)
+        source = self._path_to(path.socket, sender)
         self.at(self.now + radio.delay_s, lambda: receiver.perform(receiver.node.receive(datagram, source, self.now)))
+
+    def _path_to(self, number: int, end: End) -> Path:
+        if self.radios[number].is_relayed:
+            return relayed(number, "relay", 1 + (end is self.bravo))
+        return path_of(number, end.name)
 
     def at(self, when: float, action: Callable[[], None]) -> None:
         """Do something later."""

@@ -121,7 +121,7 @@ class PathSet(PathSlots):
         self.reports_single = False
         """Whether the condition of a path is reported even if it is the only one."""
         self.is_multiple = False
-        """Whether critical frames go along several paths: then an envelope holds frames of one class."""
+        """Whether the class of a frame matters: it decides about its paths, or about a relay's next handle."""
         self.routes = _NO_ROUTES
         """The paths of each class; all empty before a path is known."""
         self.echo_route: Route = ()
@@ -328,9 +328,8 @@ class PathSet(PathSlots):
         There must be a path.
         """
         route = self.routes[cls]
-        if cls is Class.CRITICAL:  # bit-identical copies along the whole route
-            most = c.CRITICAL_ENVELOPE_LIMIT if self.is_multiple else c.MAX_ENVELOPE_LIMIT
-            return min(most, *(self.network_limit(state) for state in route))
+        if cls is Class.CRITICAL and len(route) > 1:  # bit-identical copies along the whole route
+            return min(c.CRITICAL_ENVELOPE_LIMIT, *(self.network_limit(state) for state in route))
         return min(route[0].envelope_limit.limit, self.network_limit(route[0]))
 
     def carries(self, state: PathState, size: int) -> bool:

@@ -15,6 +15,7 @@ from uavlinkd.core.constants import CRITICAL_ENVELOPE_LIMIT, NEVER
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Output, Transmit
 from uavlinkd.core.path_state import PathCondition
+from uavlinkd.core.paths import Route
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.settings import Class, Redundancy
 from uavlinkd.link.copies import BEGIN_LOSS, Copies, Repair
@@ -22,10 +23,10 @@ from uavlinkd.link.networks import COPIES_SHARE, NetworkBudget, carrier_bytes
 from uavlinkd.mavlink.dialect import IDS
 from uavlinkd.mavlink.egress.bucket import Bucket
 from uavlinkd.mavlink.egress.budgeted import EgressSettings, EnvelopeShape
-from uavlinkd.mavlink.egress.by_class import PeerEgress, split_by_class
+from uavlinkd.mavlink.egress.by_class import PeerEgress
 from uavlinkd.mavlink.flows import FlowKey, flow_key
 from uavlinkd.mavlink.frames import Frame
-from uavlinkd.mavlink.payloads import ParameterAnswers
+from uavlinkd.mavlink.payloads import VALUE_KIND, ParameterAnswers
 
 RAW = itemgetter(0)
 """The bytes of a frame."""
@@ -78,8 +79,7 @@ class PeerOutput:
         if self.egress is not None:
             self.egress.put(frames, now - waited_s, is_split=self._peer.paths.is_multiple or self.repair.is_on)
             return True
-        for cls, part in split_by_class(frames, self.answers.class_of, now):
-            self._send_class(part, cls, now)
+        self._send_runs(frames, now)
         return bool(self.copies.waiting)
 
     def send_waiting(self, now: float) -> None:
@@ -87,11 +87,9 @@ class PeerOutput:
         peer = self._peer
         if self.egress is not None:
             self.charge(now)
-            cls, batch = self.egress.take(now)
-            while batch:
-                self._send_class(batch, cls, now)
+            while batch := self.egress.take(now)[1]:
+                self._send_runs(batch, now)
                 self.charge(now)
-                cls, batch = self.egress.take(now)
         if self.copies.waiting:
             usable = {
                 state.path for state in peer.paths.states if not state.is_off and state not in self.repair.left_out
@@ -189,16 +187,27 @@ class PeerOutput:
 
     # Envelopes.
 
-    def _send_class(self, frames: Sequence[Frame], cls: Class, now: float) -> None:
-        """Send frames of one class, in envelopes of their own."""
-        if cls is Class.CRITICAL:
+    def _send_runs(self, frames: Sequence[Frame], now: float) -> None:
+        """Send frames in their order. Consecutive ones that go along the same paths, a run, share envelopes.
+
+        Critical frames that are copied or repeated have envelopes of their own.
+        """
+        routes, repeats = self._peer.paths.routes, self.repair.is_on
+        is_apart = repeats or len(routes[Class.CRITICAL]) > 1
+        runs: list[tuple[bool | Route, set[Class], list[Frame]]] = []
+        for frame in frames:
+            kind = frame.header.kind
+            cls = kind.cls if kind is not VALUE_KIND else self.answers.class_of(frame, now)
             # Newer states replace repeats of older ones, which must not contain events then.
-            groups = _split_states(frames) if self.repair.is_on else (frames,)
-            for group in groups:
-                for part in self._envelopes(group):
-                    self._send_part(part, cls, now)
-        else:
-            self._send_part(frames, cls, now)
+            run: bool | Route = (repeats and kind.is_state) if is_apart and cls is Class.CRITICAL else routes[cls]
+            if not runs or run != runs[-1][0]:
+                runs.append((run, set(), []))
+            runs[-1][1].add(cls)
+            runs[-1][2].append(frame)
+        for run, classes, part in runs:
+            cls = next(cls for cls in Class if cls in classes)  # the most important one
+            for envelope in self._envelopes(part) if isinstance(run, bool) else (part,):
+                self._send_part(envelope, cls, now)
 
     def _envelopes(self, frames: Sequence[Frame]) -> Iterator[Sequence[Frame]]:
         """Frames that share an envelope, so that it is known which of them are in a copy that waits."""
@@ -260,10 +269,3 @@ def _by_datagram(outputs: Sequence[Output]) -> dict[bytes, list[Transmit]]:
         if isinstance(output, Transmit):
             transmits.setdefault(output.datagram, []).append(output)
     return transmits
-
-
-def _split_states(frames: Sequence[Frame]) -> list[Sequence[Frame]]:
-    """Events, and then states, in envelopes of their own."""
-    events = [frame for frame in frames if not frame.header.kind.is_state]
-    states = [frame for frame in frames if frame.header.kind.is_state]
-    return [group for group in (events, states) if group]
