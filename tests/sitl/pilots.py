@@ -171,7 +171,7 @@ class Pilot:
     async def take_off(self, height_m: float = HEIGHT_M) -> None:
         """Arm as soon as the vehicle is ready, take off if it flies, and wait until it is there."""
         station, system = self.station, self.system
-        await station.until(self._is_ready, READY_S, "ready to arm")
+        await self.until_ready()
         if not self.kind.is_px4:  # not before: it reads the switch of the radio control after its start
             await self.set_mode(Mode.GUIDED)
         altitude_m, anywhere = height_m, 0.0
@@ -188,6 +188,10 @@ class Pilot:
         self._home = self.place
         if self.kind.flies:
             await station.until(lambda: self.place.z > 0.9 * height_m, LEG_S, f"{height_m} m above home")
+
+    async def until_ready(self) -> None:
+        """Wait until the vehicle may be armed."""
+        await self.station.until(self._is_ready, READY_S, "ready to arm")
 
     def _is_ready(self) -> bool:
         """Whether the vehicle knows its position, and its checks before arming pass."""

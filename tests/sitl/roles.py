@@ -17,7 +17,7 @@ from typing import Any
 from pymavlink.dialects.v20 import all as mavlink
 
 from tests.sitl.ledger import name_of
-from tests.sitl.pilots import COPTER, OWN, Mode, Pilot, Place
+from tests.sitl.pilots import COPTER, Mode, Pilot, Place
 from tests.sitl.roles_frames import ROLES_TESTED, RoleFrames
 from tests.sitl.station import RequestError, Station
 from tests.sitl.tables import Item, download_mission, download_parameters, upload_mission
@@ -29,8 +29,8 @@ FRAMES = 5000
 BATCH = 10
 """Frames until the autopilot has to answer: its input has room for them."""
 SEED = 11
-SETTLE_S = 30.0
-"""Until the estimate of a real autopilot is steady: home and origin move before."""
+STEADY_TRIES = 12
+"""How many states of a vehicle may differ from the one before, until it is steady."""
 ANSWERED_S = 5.0
 """After the last frame, answers to all of them have been sent."""
 TRIES = 60
@@ -65,7 +65,7 @@ class Snapshot:
 async def roles(world: World, pilot: Pilot) -> Figures:
     """Send frames of each role on the ground and in the air; then let the ground station fall silent meanwhile."""
     await pilot.request_streams()
-    await _settle(pilot)
+    await pilot.until_ready()
     for plan, items in _plans(pilot).items():
         try:
             await upload_mission(world.station, pilot.system, items, plan=plan)
@@ -77,8 +77,7 @@ async def roles(world: World, pilot: Pilot) -> Figures:
         if place == "air":
             await pilot.take_off()
             await pilot.set_mode(Mode.GUIDED)
-            await _settle(pilot)
-        before = await snapshot(world.station, pilot)
+        before = await steady(world.station, pilot)
         for role in ROLES_TESTED:
             results.append({"role": role, "place": place, **await _attack(world, pilot, role)})
             after = await snapshot(world.station, pilot)
@@ -90,10 +89,6 @@ async def roles(world: World, pilot: Pilot) -> Figures:
             await _lose_station(world, pilot, role)
     await pilot.return_and_land()
     return {"attacks": results}
-
-
-async def _settle(pilot: Pilot) -> None:
-    await asyncio.sleep(0.0 if pilot.kind is OWN else SETTLE_S)
 
 
 async def _attack(world: World, pilot: Pilot, role: str) -> Figures:
@@ -145,6 +140,17 @@ async def _lose_station(world: World, pilot: Pilot, role: str) -> None:
             raise FlightError(f"{role}: the failsafe did not trip", {})
         await _send(world, pilot, frames)
     station.beats = True
+
+
+async def steady(station: Station, pilot: Pilot) -> Snapshot:
+    """Wait until nothing changes by itself from one snapshot to the next: neither home and origin nor the streams."""
+    before, changes = await snapshot(station, pilot), [""]
+    for _ in range(STEADY_TRIES):
+        after = await snapshot(station, pilot)
+        if not (changes := differences(before, after)):
+            return after
+        before = after
+    raise FlightError(f"not steady: {'; '.join(changes)}", {})
 
 
 async def snapshot(station: Station, pilot: Pilot) -> Snapshot:
