@@ -12,6 +12,7 @@ import contextlib
 import io
 import json
 import sys
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -23,27 +24,46 @@ from uavlinkd.lab.evaluation.frame import NOTHING, ReportSection, Table, to_mark
 from uavlinkd.lab.sim.real_autopilot import Firmware, RealAutopilotError, binary_of
 
 WHO = ("autopilot", "version", "condition", "daemons", "seconds", "error")
+WHICH = ("scenario", "autopilot", "condition", "daemons")
 
 
 def report(records: list[Record]) -> str:
-    """The page: a table for each scenario, with what was flown and all figures, then what was not flown."""
+    """The page: the figures of each scenario, a table for each list of figures, then what was not flown."""
     sections = []
+    lists: defaultdict[str, list[tuple[Sequence[str], Mapping[str, object]]]] = defaultdict(list)
     for scenario in SCENARIOS:
         of_it = [record for record in records if record.scenario == scenario.name]
         of_it.sort(key=lambda one: (one.kind, list(BY_NAME).index(one.condition), not one.with_daemons))
-        figures = [dict(flat(record.figures)) for record in of_it]
-        columns = dict.fromkeys(name for row in figures for name in row)
-        rows = [
-            [
-                *(record.kind, record.version, record.condition, str(record.with_daemons), str(record.seconds)),
-                *((record.error or "")[:300], *(str(row.get(name, NOTHING)) for name in columns)),
-            ]
-            for record, row in zip(of_it, figures, strict=True)
-        ]
-        sections += [ReportSection(scenario.name, [Table([*WHO, *columns], rows)])] if rows else []
+        rows: list[tuple[Sequence[str], Mapping[str, object]]] = []
+        for record in of_it:
+            figures = dict(flat(record.figures))
+            which = (record.condition, str(record.with_daemons))
+            for name, listed in tables(figures).items():
+                lists[name] += [((scenario.name, record.kind, *which), dict(flat(row))) for row in listed]
+                del figures[name]
+            error = (record.error or "")[:300]
+            rows.append(((record.kind, record.version, *which, str(record.seconds), error), figures))
+        sections += [ReportSection(scenario.name, [table(WHO, rows)])] if rows else []
+    sections += [ReportSection(f"All {name}", [table(WHICH, rows)]) for name, rows in lists.items()]
     missing = set(map(str, runs(tuple(kind for kind in KINDS if kind != "own")))) - {str(one.run) for one in records}
     sections.append(ReportSection("Not flown", text=[", ".join(sorted(missing))]))
     return to_markdown("Real autopilots at the ends of real daemons", (), sections, ())
+
+
+def table(who: Sequence[str], rows: Sequence[tuple[Sequence[str], Mapping[str, object]]]) -> Table:
+    """A table with a column for each figure that any of the rows has."""
+    columns = dict.fromkeys(name for _, figures in rows for name in figures)
+    texts = [[*of, *(str(figures.get(name, NOTHING)) for name in columns)] for of, figures in rows]
+    return Table([*who, *columns], texts)
+
+
+def tables(figures: Mapping[str, Any]) -> Mapping[str, list[Mapping[str, Any]]]:
+    """Those figures that are a list of figures by name."""
+    return {
+        name: value
+        for name, value in figures.items()
+        if isinstance(value, list) and value and isinstance(value[0], dict)
+    }
 
 
 def flat(figures: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, object]]:
