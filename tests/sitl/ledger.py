@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
 
 from pymavlink.dialects.v20 import all as mavlink
@@ -103,6 +103,12 @@ def number_of(frame: bytes) -> int:
     return frame[5] if frame[0] == 0xFE else int.from_bytes(frame[7:10], "little")
 
 
+def source_of(frame: bytes) -> tuple[int, int]:
+    """The system and the component that sent a frame: MAVLink numbers and signs the frames of each by themselves."""
+    system, component = frame[3:5] if frame[0] == 0xFE else frame[5:7]
+    return system, component
+
+
 def split(data: bytes) -> tuple[list[bytes], int]:
     """The MAVLink frames in bytes by their lengths alone, and the number of bytes that belong to no frame.
 
@@ -129,13 +135,13 @@ def of_class(passings: Sequence[Passing], cls: Class) -> list[Passing]:
     return [passing for passing in passings if KINDS.get(number_of(passing.frame), UNKNOWN).cls is cls]
 
 
-def compare_messages(sent: Sequence[Passing], received: Sequence[Passing], begin: float, end: float) -> Comparison:
-    """As :func:`compare`, for links of several paths: there order counts among frames of one message only."""
+def compare_by(
+    key: Callable[[bytes], Hashable], sent: Sequence[Passing], received: Sequence[Passing], begin: float, end: float
+) -> Comparison:
+    """As :func:`compare`, but order counts among frames of one key only, such as those of one sender."""
     result = Comparison()
-    for number in {number_of(passing.frame) for passing in (*sent, *received)}:
-        before, after = (
-            [passing for passing in passings if number_of(passing.frame) == number] for passings in (sent, received)
-        )
+    for wanted in {key(passing.frame) for passing in (*sent, *received)}:
+        before, after = ([one for one in passings if key(one.frame) == wanted] for passings in (sent, received))
         result.add(compare(before, after, begin, end))
     return result
 

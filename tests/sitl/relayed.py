@@ -4,30 +4,22 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Sequence
-from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 from time import monotonic
 
-from pymavlink.dialects.v20 import all as mavlink
-
 from tests.daemon.frames import sender_of
 from tests.daemon.process import DaemonProcess
-from tests.sitl.flights import LEG_M, flight, frames_pass_again, modes
-from tests.sitl.ledger import SETTLED_S, Comparison, Passing, compare, compare_messages, of_class
+from tests.sitl.flights import BACK_WITHIN_S, LEG_M, flight, frames_pass_again, modes
+from tests.sitl.ledger import SETTLED_S, Comparison, Passing, compare, compare_by, number_of, of_class
 from tests.sitl.pilots import Mode, Pilot
-from tests.sitl.station import AUTOPILOT, Station
 from tests.sitl.transfers import Figures, FlightError, parameters_and_mission
 from tests.sitl.world import GROUND, World
 from uavlinkd.core.settings import Class
 
 KILLS = 3
-REQUEST_EVERY_S = 0.1
-"""A request and its acknowledgement are critical frames."""
 CALM_S = 3.0
 """Frames pass for so long before a relay is killed, and after a link is back."""
-BACK_WITHIN_S = 2.0
-"""With one relay: from when it listens until frames pass in both directions."""
 STREAM_GAP_S = 0.5
 """With two relays."""
 
@@ -38,7 +30,7 @@ async def relayed(world: World, pilot: Pilot) -> Figures:
     figures |= await flight(world, pilot)
     await pilot.set_parameters(pilot.kind.failsafe)
     await pilot.take_off()
-    async with requesting(world.station, pilot.system):
+    with world.station.requesting(pilot.system):
         killed = _one_of_two_killed if len(world.relays) > 1 else _killed_and_started
         figures["kills"] = [kill async for kill in killed(world, pilot)]
     await pilot.return_and_land()
@@ -91,27 +83,6 @@ async def _carrying(world: World) -> DaemonProcess:
     return next(relay for relay in world.relays if relay.name == name)  # no direct path
 
 
-@asynccontextmanager
-async def requesting(station: Station, system: int) -> AsyncIterator[None]:
-    """Have the station send requests in a steady rhythm: one heartbeat per second shows little."""
-
-    async def request() -> None:
-        while True:
-            parameters = (mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION, *[0.0] * 6)
-            station.send(
-                mavlink.MAVLink_command_long_message(
-                    system, AUTOPILOT, mavlink.MAV_CMD_REQUEST_MESSAGE, 0, *parameters
-                )
-            )
-            await asyncio.sleep(REQUEST_EVERY_S)
-
-    task = asyncio.create_task(request())
-    try:
-        yield
-    finally:
-        task.cancel()
-
-
 # What a kill did to frames.
 
 
@@ -140,7 +111,7 @@ async def _judged(world: World, pilot: Pilot, began: float) -> Figures:
     down, up = ways(world)
     whole, critical = Comparison(), Comparison()
     for way in (down, up):
-        whole.add(compare_messages(way.sent, way.received, began, end))
+        whole.add(compare_by(number_of, way.sent, way.received, began, end))
         critical.add(compare(way.only(Class.CRITICAL).sent, way.only(Class.CRITICAL).received, began, end))
     flown = [mode for at, mode in modes(world.vehicles[0]) if at > began]
     return {

@@ -11,6 +11,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import all as mavlink
 
+from tests.sitl.downloads import downloads
 from tests.sitl.flights import flight, follow_me, outages, restarts, two_radios, two_vehicles
 from tests.sitl.pilots import COPTER, OWN, PX4, ROVER, Kind, Pilot
 from tests.sitl.radio import BY_NAME, CLEAN
@@ -26,6 +27,9 @@ from uavlinkd.lab.sim.real_autopilot import Firmware
 KINDS: Mapping[str, Kind] = {"ardupilot": COPTER, "px4": PX4, "rover": ROVER, "own": OWN}
 ALL_KINDS = tuple(KINDS)
 ALL_CONDITIONS = tuple(BY_NAME)
+
+UNEQUAL = ({"delay_s": 0.005}, {"delay_s": 0.05})
+"""Two paths that differ by 45 ms."""
 
 Scene = Callable[[World, list[Pilot]], Awaitable[Figures]]
 
@@ -43,11 +47,6 @@ class Scenario(Layout):
     is_direct: bool = False
     """Whether it is flown without daemons only."""
 
-    @property
-    def needs_daemons(self) -> bool:
-        """Whether it cannot be flown without daemons."""
-        return self.two_radios or self.relays > 0
-
 
 def _alone(scene: Callable[[World, Pilot], Awaitable[Figures]]) -> Scene:
     return lambda world, pilots: scene(world, pilots[0])
@@ -57,22 +56,23 @@ SCENARIOS = (
     Scenario("parameters-mission", _alone(parameters_and_mission), ALL_KINDS, ALL_CONDITIONS),
     Scenario("flight", _alone(flight), ALL_KINDS, ("clean", "loss10", "loss30", "slow", "delay")),
     Scenario("log-file", _alone(log_and_file)),
-    Scenario(
-        "signing",
-        lambda world, pilots: signing(world, pilots[0], world.maintain),
-        kinds=("ardupilot",),
-        has_maintenance_port=True,
-    ),
+    Scenario("signing", _alone(signing), ("ardupilot",), has_maintenance_port=True),
     Scenario("two-vehicles", two_vehicles, ("ardupilot", "px4", "own"), vehicles=2),
     Scenario(
         "follow-me", lambda world, pilots: follow_me(world, *pilots), kinds=("ardupilot",), vehicles=2, swarm=True
     ),
-    Scenario("outages", _alone(outages), can_cut=True),
+    Scenario("outages", _alone(outages), radios=({},)),
     Scenario("restarts", _alone(restarts)),
-    Scenario("two-radios", _alone(two_radios), two_radios=True),
+    Scenario("two-radios", _alone(two_radios), radios=({}, {})),
     Scenario("relay", _alone(relayed), ("ardupilot", "px4", "own"), relays=1),
     Scenario("roles", _alone(roles), ("ardupilot", "px4", "own"), is_direct=True),
     Scenario("two-relays", _alone(relayed), ("ardupilot", "px4", "own"), relays=2),
+    Scenario("relay-tls", _alone(relayed), ("ardupilot", "own"), relays=1, by_tls=True),
+    Scenario("outages-tls", _alone(outages), ("ardupilot",), relays=1, by_tls=True),
+    Scenario("downloads", _alone(downloads), ("ardupilot",), has_maintenance_port=True),
+    Scenario("downloads-relay", _alone(downloads), ("ardupilot",), has_maintenance_port=True, relays=1),
+    Scenario("downloads-paths", _alone(downloads), ("ardupilot",), has_maintenance_port=True, radios=UNEQUAL),
+    Scenario("downloads-tls", _alone(downloads), ("ardupilot",), has_maintenance_port=True, relays=1, by_tls=True),
 )
 SCENARIO_BY_NAME = {scenario.name: scenario for scenario in SCENARIOS}
 

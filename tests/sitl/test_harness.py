@@ -11,14 +11,17 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+from pymavlink.dialects.v20 import all as mavlink
 
 from tests.daemon.frames import frame, heartbeat
-from tests.sitl.ledger import Passing, compare, compare_messages, split
+from tests.sitl.downloads import judged
+from tests.sitl.ledger import Passing, compare, compare_by, number_of, source_of, split
 from tests.sitl.pilots import Place
 from tests.sitl.relayed import problem_of
 from tests.sitl.roles import LIMITS_M, Snapshot, differences
 from tests.sitl.roles_frames import ROLES_TESTED, RoleFrames
 from tests.sitl.scenarios import Run, fly
+from tests.sitl.transfers import Figures
 from uavlinkd.mavlink.dialect import MESSAGES, name_of
 from uavlinkd.mavlink.frames import SplitCounters, parse_frame, split_datagram
 from uavlinkd.mavlink.policy.compilation import Policy
@@ -66,14 +69,33 @@ def test_altered_frame_differs_from_an_equal_one() -> None:
     assert (result.missing.total(), result.reordered) == (1, 0)
 
 
-def test_frame_of_another_message_may_overtake() -> None:
-    """On a link of several paths, a heartbeat may arrive before telemetry that was sent first."""
-    beat = Passing(SENT[0].at + 0.01, heartbeat(1))
-    sent, received = [SENT[0], beat, SENT[1]], [Passing(beat.at + 0.01, beat.frame), *arrived(0, 1)]
-    assert compare(sent, received, 10.0, 12.0).reordered == 1
-    assert compare_messages(sent, received, 10.0, 12.0).is_exact
+def test_order_counts_for_each_key() -> None:
+    """A heartbeat overtakes telemetry: of another sender it may, of the same one only if its message is the key."""
+    own, other = (Passing(SENT[0].at + 0.01, heartbeat(system)) for system in (1, 2))
+    for beat, by_source in ((own, 1), (other, 0)):
+        sent, received = [SENT[0], beat, SENT[1]], [Passing(beat.at + 0.01, beat.frame), *arrived(0, 1)]
+        assert compare(sent, received, 10.0, 12.0).reordered == 1
+        assert compare_by(source_of, sent, received, 10.0, 12.0).reordered == by_source
+        assert compare_by(number_of, sent, received, 10.0, 12.0).is_exact
     swapped = [Passing(passing.at + 1, passing.frame) for passing in (SENT[1], SENT[0])]
-    assert compare_messages(sent, swapped, 10.0, 12.0).reordered == 1
+    assert compare_by(number_of, SENT[:2], swapped, 10.0, 12.0).reordered == 1
+
+
+def test_overtaken_frame_is_judged() -> None:
+    """pymavlink counts 256 lost frames for one that arrives late, or rejects its signature and counts one."""
+    codec = mavlink.MAVLink(None, 1, 1)
+    for signing, rejected, loss_percent in ((None, 0, 96.2), ((b"k" * 32, 10**12), 1, 10.0)):
+        if signing:
+            codec.signing.secret_key, codec.signing.timestamp = signing
+            codec.signing.sign_outgoing = True
+        frames = []
+        for number in range(250, 260):
+            codec.seq = number % 256
+            frames.append(bytes(mavlink.MAVLink_system_time_message(0, 0).pack(codec)))
+        order: Figures = {"frames": 10, "overtaken": 0, "packet_loss_percent": 0.0, "rejected": 0}
+        assert judged(frames, signing) == order
+        late = judged([frames[0], frames[2], frames[1], *frames[3:]], signing)
+        assert late == order | {"overtaken": 1, "packet_loss_percent": loss_percent, "rejected": rejected}
 
 
 CALM = {"failsafe": False, "altered": 0, "duplicated": 0, "reordered": 0, "critical_lost": 0, "stream_gap_s": 0.2}

@@ -320,14 +320,29 @@ def holds(folder: Path, data: bytes) -> bool:
     return False
 
 
-async def signing(world: World, pilot: Pilot, maintenance: Callable[[bytes], Awaitable[None]]) -> Figures:
+def new_key() -> tuple[bytes, int]:
+    """A signing key and the clock at its begin, in 10 us since 2015."""
+    return os.urandom(32), int((asyncio.get_running_loop().time() + SIGNING_SINCE_S) * 1e5)
+
+
+async def give_key(world: World, setup: Any) -> None:
+    """Send the vehicle its signing key on its maintenance port, and wait until its frames are signed."""
+    station = world.station
+    await world.maintain(bytes(setup.pack(mavlink.MAVLink(None, station.system, 190))))
+    seen = len(station.received)
+    await station.until(
+        lambda: any(is_signed(passing.frame) for passing in station.received[seen:]), 30.0, "a signed frame"
+    )
+
+
+async def signing(world: World, pilot: Pilot) -> Figures:
     """Give the vehicle a signing key on its maintenance port, then exchange signed frames only.
 
     The daemons withhold SETUP_SIGNING, and pass signed frames unaltered: the vehicle ignores an unsigned command.
     """
     station, system = world.station, pilot.system
     await pilot.request_streams()
-    key, clock = os.urandom(32), int((asyncio.get_running_loop().time() + SIGNING_SINCE_S) * 1e5)
+    key, clock = new_key()
     setup = mavlink.MAVLink_setup_signing_message(system, AUTOPILOT, list(key), clock)
 
     async def refused() -> Figures:
@@ -339,11 +354,7 @@ async def signing(world: World, pilot: Pilot, maintenance: Callable[[bytes], Awa
     withheld = sum(n for what, n in before["frames"]["withheld"].items() if what.startswith("SETUP_SIGNING"))
     if world.daemons and withheld != 1:
         raise FlightError(f"the daemons withheld {withheld} SETUP_SIGNING, not 1", before)
-    await maintenance(bytes(setup.pack(mavlink.MAVLink(None, station.system, 190))))
-    seen = len(station.received)
-    await station.until(
-        lambda: any(is_signed(passing.frame) for passing in station.received[seen:]), 30.0, "a signed frame"
-    )
+    await give_key(world, setup)
     ignored = await is_ignored(world, system)
     station.sign_with(key, clock + 1000)
 

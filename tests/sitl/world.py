@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import Counter
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, field
 from time import monotonic
@@ -25,9 +25,11 @@ from tests.daemon.fleet import AN_OPERATOR, a_member, a_vehicle, make_relay
 from tests.daemon.frames import sender_of
 from tests.daemon.harness import Stage
 from tests.daemon.process import DaemonProcess, Status
+from tests.daemon.tls import listen_for_tls
 from tests.daemon.udp import Sockaddr, open_socket, shown
 from tests.kernel_queues import cpu_s
-from tests.sitl.ledger import SETTLED_S, Comparison, Passing, compare, compare_messages, split
+from tests.namespaces import Namespace
+from tests.sitl.ledger import SETTLED_S, Comparison, Passing, compare, compare_by, source_of, split
 from tests.sitl.radio import Condition, Radio
 from tests.sitl.simulators import Simulator
 from tests.sitl.station import Station
@@ -130,6 +132,13 @@ class _Face(asyncio.DatagramProtocol):
 GROUND, AUTOPILOT_ENDPOINT = "ground", "autopilot"
 LINK_S = 120.0
 """How long a simulator may take to send its first heartbeat."""
+_CUT = """table inet cut {
+    chain input {
+        type filter hook input priority 0
+        meta l4proto tcp drop
+    }
+}"""
+"""Dropped where they arrive: the sender sees nothing of it, as on a path without network."""
 
 
 @dataclass(slots=True)
@@ -146,14 +155,19 @@ class Vehicle:
 class Layout:
     """How vehicles and station are connected."""
 
-    can_cut: bool = False
-    """Whether the radio must be there, to be cut."""
     swarm: bool = False
     """Whether the vehicles are peers of each other, as swarm members."""
-    two_radios: bool = False
-    """Whether there are two radios to each vehicle. It needs daemons."""
+    radios: Sequence[Mapping[str, object]] = ()
+    """The impairments of each radio that is there under every condition. Several need daemons."""
     relays: int = 0
     """How many relays are between the vehicles and the station, in place of radios. They need daemons."""
+    by_tls: bool = False
+    """Whether the relays are reached by TLS alone. The flight has a network namespace of its own, to be cut."""
+
+    @property
+    def needs_daemons(self) -> bool:
+        """Whether it cannot be flown without daemons."""
+        return len(self.radios) > 1 or self.relays > 0
 
 
 @dataclass(slots=True)
@@ -165,18 +179,14 @@ class World:
     station: Station
     vehicles: list[Vehicle] = field(default_factory=list)
     ground: DaemonProcess | None = None
-    radio: Radio | None = None
-    second_radio: Radio | None = None
-    """Of a vehicle with two radios. Both carry its link all the time."""
+    radios: list[Radio] = field(default_factory=list)
+    """The radios between vehicles and station. Each carries every link all the time."""
+    network: Namespace | None = None
+    """Where all of this is, if not on the loopback interface of the machine."""
     relays: list[DaemonProcess] = field(default_factory=list)
     """The only ways from the vehicles to the station, if there are any."""
     maintenance: Tap | None = None
     """The other end of the autopilot's second port."""
-
-    @property
-    def radios(self) -> list[Radio]:
-        """The radios between vehicles and station."""
-        return [radio for radio in (self.radio, self.second_radio) if radio]
 
     @property
     def daemons(self) -> list[DaemonProcess]:
@@ -191,6 +201,20 @@ class World:
                 LINK_S,
                 f"a heartbeat of vehicle {vehicle.system}",
             )
+
+    async def cut(self) -> None:
+        """Drop every datagram of the radios, or every packet of TCP, in both directions."""
+        if self.network is not None:
+            self.network.nft(_CUT)
+        for radio in self.radios:
+            await radio.cut()
+
+    async def restore(self) -> None:
+        """End :meth:`cut`."""
+        if self.network is not None:
+            self.network.nft("delete table inet cut")
+        for radio in self.radios:
+            await radio.restore()
 
     async def maintain(self, frame: bytes) -> None:
         """Send a frame to the autopilot on its second port."""
@@ -246,15 +270,14 @@ class Measurement:
 
     def _compare(self, end: float) -> tuple[Comparison, Comparison]:
         world = self._world
-        compared = compare_messages if len(world.radios) + len(world.relays) > 1 else compare
         down, up = Comparison(), Comparison()
         for vehicle in world.vehicles:
             system, station = vehicle.system, world.station
             received = [passing for passing in station.received if sender_of(passing.frame) == system]
-            down.add(compared(vehicle.tap.from_autopilot, received, self._begin, end))
+            down.add(compare_by(source_of, vehicle.tap.from_autopilot, received, self._begin, end))
             sent = [passing for passing in station.sent if passing.target in (0, system)]
             arrived = [passing for passing in vehicle.tap.to_autopilot if sender_of(passing.frame) == station.system]
-            up.add(compared(sent, arrived, self._begin, end))
+            up.add(compare(sent, arrived, self._begin, end))
         return down, up
 
 
@@ -286,16 +309,17 @@ async def flying(
     ``simulators``: one for each vehicle, not yet started. ``maintenance_port``: where a simulator sends MAVLink on a
     second port.
     """
-    assert with_daemons or not (condition.needs_daemons or layout.two_radios or layout.relays)
+    assert with_daemons or not (condition.needs_daemons or layout.needs_daemons)
     async with AsyncExitStack() as stack:
+        network = stack.enter_context(Namespace()) if layout.by_tls else None
+        if network is not None:
+            stack.enter_context(network.entered())
         stage = await stack.enter_async_context(Stage())
-        world = World(stage, condition, await stack.enter_async_context(Station()))
-        if condition.radio or layout.can_cut or layout.two_radios:
-            world.radio = Radio(stage.folder, condition.radio)
-            stack.push_async_callback(world.radio.stop)
-        if layout.two_radios:
-            world.second_radio = Radio(stage.folder, condition.radio, 1, "second-radio")
-            stack.push_async_callback(world.second_radio.stop)
+        world = World(stage, condition, await stack.enter_async_context(Station()), network=network)
+        for number, impairments in enumerate(layout.radios or [{}] * bool(condition.radio)):
+            radio = Radio(stage.folder, {**impairments, **condition.radio}, number, f"radio{number}")
+            stack.push_async_callback(radio.stop)
+            world.radios.append(radio)
         if maintenance_port is not None:
             world.maintenance = Tap()
             await world.maintenance.open(maintenance_port)
@@ -306,7 +330,7 @@ async def flying(
             stack.callback(tap.close)
             world.vehicles.append(Vehicle(simulator.system, tap, simulator))
         if with_daemons:
-            await _start_daemons(world, swarm=layout.swarm, relays=layout.relays)
+            await _start_daemons(world, layout)
         else:
             await _connect_directly(world, swarm=layout.swarm)
         for vehicle in world.vehicles:
@@ -316,7 +340,7 @@ async def flying(
         yield world
 
 
-async def _start_daemons(world: World, *, swarm: bool, relays: int) -> None:
+async def _start_daemons(world: World, layout: Layout) -> None:
     stage = world.stage
     ground = world.ground = stage.daemon(GROUND)
     ground.add_endpoint("station", f"udpout:{shown(world.station.address)}")
@@ -326,20 +350,24 @@ async def _start_daemons(world: World, *, swarm: bool, relays: int) -> None:
         ways = [radio.connect(drone.name, drone.sockaddr, ground.sockaddr) for radio in world.radios]
         to_ground, to_drone = zip(*(ways or [(ground.sockaddr, drone.sockaddr)]), strict=True)
         psk = stage.psk()
-        drone.add_peer(ground, [] if relays else list(map(shown, to_ground)), psk, **AN_OPERATOR)
-        ground.add_peer(drone, [] if relays else list(map(shown, to_drone)), psk, **a_vehicle(vehicle.system))
-    for one, other in _pairs(world.vehicles) if swarm else ():
+        drone.add_peer(ground, [] if layout.relays else list(map(shown, to_ground)), psk, **AN_OPERATOR)
+        ground.add_peer(drone, [] if layout.relays else list(map(shown, to_drone)), psk, **a_vehicle(vehicle.system))
+    for one, other in _pairs(world.vehicles) if layout.swarm else ():
         assert one.daemon is not None
         assert other.daemon is not None
         psk = stage.psk()
         one.daemon.add_peer(other.daemon, [other.daemon.address], psk, **a_member(other.system))
         other.daemon.add_peer(one.daemon, [one.daemon.address], psk, **a_member(one.system))
-    for number in range(1, relays + 1):
+    for number in range(1, layout.relays + 1):
         relay = stage.daemon(f"relay{number}")
         make_relay(relay, *world.daemons)
+        if layout.by_tls:
+            url = listen_for_tls(relay)
+            for daemon in world.daemons:
+                daemon.config["relay"][-1]["addresses"] = [url]
         world.relays.append(relay)
     for daemon in world.daemons:
-        daemon.config["link"].update(world.condition.link, **({"confidential": True} if relays else {}))
+        daemon.config["link"].update(world.condition.link, **({"confidential": True} if layout.relays else {}))
     for radio in world.radios:
         await radio.start()
     await stage.start(*world.relays, linked=False)
@@ -349,10 +377,10 @@ async def _start_daemons(world: World, *, swarm: bool, relays: int) -> None:
 async def _connect_directly(world: World, *, swarm: bool) -> None:
     for vehicle in world.vehicles:
         vehicle.tap.onward = world.station.address
-        if world.radio:
-            vehicle.tap.onward, _ = world.radio.connect(f"drone{vehicle.system}", None, world.station.address)
-    if world.radio:
-        await world.radio.start()
+        for radio in world.radios:
+            vehicle.tap.onward, _ = radio.connect(f"drone{vehicle.system}", None, world.station.address)
+    for radio in world.radios:
+        await radio.start()
     for one, other in _pairs(world.vehicles) if swarm else ():
         one.tap.listeners.append(other.tap)
         other.tap.listeners.append(one.tap)
