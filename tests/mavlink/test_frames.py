@@ -42,15 +42,21 @@ def test_frame_comes_out_byte_for_byte(raw: bytes, split: Split) -> None:
     assert (counters.frames, counters.garbage_bytes, counters.faults) == (1, 0, {})
 
 
+@splitters
+@pytest.mark.parametrize("version", [1, 2])
 @pytest.mark.parametrize("more", [0, 1, 200])
-def test_payload_longer_than_its_definition_is_unknown(more: int) -> None:
-    """A MAVLink 2 frame may be as long as the definition with its extensions; beyond that it passes unread."""
-    longest = MESSAGES[76][3]
-    raw = build(76, bytes(30) + b"\x07\x09\x00" + bytes(longest - 33 + more))
-    (frame,) = split_datagram(raw, SplitCounters())
+def test_message_that_grew_by_extension_fields_is_read_by_the_known_ones(
+    more: int, version: int, split: Split
+) -> None:
+    """Its checksum fits, so the known fields are where they were: receivers ignore what is behind them."""
+    counters, longest = SplitCounters(), MESSAGES[76][3]
+    payload = bytes(28) + b"\x16\x00\x07\x09\x00" + bytes(longest - 33) + b"\xfd" * more
+    raw = build(76, payload, version=version)
+    (frame,) = split(raw, counters)
     assert frame.raw == raw
-    assert frame.header.is_known == (more == 0)
-    assert frame.header.target_system == (7 if more == 0 else 0)
+    header = frame.header
+    assert (header.is_known, header.command, header.target_system, header.target_component) == (True, 22, 7, 9)
+    assert (counters.unknown, counters.garbage_bytes) == (0, 0)
 
 
 @shapes
@@ -144,10 +150,9 @@ def test_message_with_another_dialects_definition_passes_unread(split: Split) ->
     assert counters.unknown == 1
 
 
-def test_mavlink1_payload_of_another_length_is_another_definition() -> None:
-    """MAVLink 1 cuts nothing, so a payload too short or too long is not read by the known layout."""
-    for length in (8, 10):
-        assert not read(build(0, bytes(length), version=1)).header.is_known
+def test_mavlink1_payload_without_the_known_fields_is_another_definition() -> None:
+    """MAVLink 1 cuts nothing, so a payload that is too short is not read by the known layout."""
+    assert [read(build(0, bytes(length), version=1)).header.is_known for length in (8, 9)] == [False, True]
 
 
 @forgiving

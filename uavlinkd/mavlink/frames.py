@@ -14,8 +14,11 @@ other versions of its messages. Their CRC_EXTRA cannot be known. But only one ch
 all, and a checksum with a few flipped bits almost never does. So at a place where a frame is expected (at the start,
 and directly after a frame), a frame that fits some CRC_EXTRA passes, unread, as unknown. At other places it does not
 pass: stray bytes must not be taken for a frame and swallow the next one. The receiver knows the dialect and checks
-the frame again. A frame whose payload is longer than its message's definition with extensions is unknown too: it
-cannot be known how the receiver reads the rest.
+the frame again.
+
+CRC_EXTRA covers the fields of a definition without its extensions. So a frame whose checksum fits is that message,
+however long its payload is: a newer definition has more extension fields behind the known ones. Receivers with an
+older definition ignore these too.
 
 Bytes that are not a frame are skipped up to the next possible start byte, as MAVLink's own parsers do. Each run of
 such bytes is one fault, with the reason of its first byte.
@@ -168,9 +171,6 @@ def parse_frames(
                 break
             key = data[position + 5 : payload_at]
             message = sender_messages.get(key) or add_sender_message(key)
-            if length > message.longest:
-                key += OTHER_DEFINITION
-                message = sender_messages.get(key) or add_sender_message(key)
         elif start == MAVLINK1:
             if size - position < MIN_FRAME_BYTES:
                 fault = FrameFault.TRUNCATED
@@ -184,14 +184,14 @@ def parse_frames(
                 break
             key = data[position + 3 : payload_at]
             row = MESSAGES.get(key[2])
-            if row is not None and not row[2] <= length <= row[3]:
+            if row is not None and length < row[2]:
                 key += OTHER_DEFINITION  # MAVLink 1 cuts nothing from payloads
             message = sender_messages.get(key) or add_sender_message(key)
         else:
             fault = FrameFault.NOT_MAVLINK
             break
 
-        definition, _, header, unknown = message
+        definition, header, unknown = message
         checksum = mcrf4xx(data[position + 1 : checksum_at])
         step = (data[checksum_at] | data[checksum_at + 1] << 8) ^ (checksum >> 8)
         if definition is None or step != CHECKSUM_STEP[(checksum ^ definition[1]) & 0xFF]:

@@ -48,14 +48,13 @@ class SenderMessage(NamedTuple):
 
     definition: Row | None
     """The row of :data:`.dialect.MESSAGES`; None if the dialect does not define the message."""
-    longest: int  # the longest payload by this definition, in bytes; 255 without one
     known: Header | None
     """The header of a frame by this definition; None if its payload holds a target or a command."""
     unknown: Header  # the header of a frame by another definition
 
 
 OTHER_DEFINITION: Final = b"?"
-"""Follows the key of a message whose payload has a length that the table's definition does not allow."""
+"""Follows the key of a MAVLink 1 message whose payload lacks fields of the table's definition."""
 
 sender_messages: Final[dict[bytes, SenderMessage]] = {}
 """By the header's bytes from system to message id, 5 in MAVLink 2 and 3 in MAVLink 1. The oldest first."""
@@ -69,13 +68,12 @@ def add_sender_message(key: bytes) -> SenderMessage:
     system, component = key[0], key[1]
     msgid = key[2] if is_mavlink1 else int.from_bytes(key[2:5], "little")
     definition = None if len(key) in (4, 6) else MESSAGES.get(msgid)
-    longest = 255 if definition is None else definition[3]
     unknown = Header(msgid, system, component, is_known=False, is_mavlink1=is_mavlink1)
     has_target = definition is None or definition[4] is not None or definition[6] is not None
     known = None if has_target else replace(unknown, is_known=True)
     if len(sender_messages) >= MAX_SENDER_MESSAGES:
         del sender_messages[next(iter(sender_messages))]
-    message = sender_messages[key] = SenderMessage(definition, longest, known, unknown)
+    message = sender_messages[key] = SenderMessage(definition, known, unknown)
     return message
 
 

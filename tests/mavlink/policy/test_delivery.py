@@ -100,20 +100,21 @@ def test_every_crc_extra_counts_where_unknown_messages_pass() -> None:
 
 
 @pytest.mark.parametrize(
-    ("opener", "victim", "is_separated"),
+    ("opener", "length", "victim", "is_separated"),
     [
-        (HOME_POSITION, ARM, True),  # an old autopilot lacks it, and resumes in its signature
-        (LINK_NODE_STATUS, ARM, True),  # ArduPilot lacks it
-        (ATTITUDE, ARM, False),  # no receiver rejects it
-        (ATTITUDE, MODE_V1, True),  # a receiver of MAVLink 1 only rejects all of MAVLink 2
+        (HOME_POSITION, 28, ARM, True),  # an old autopilot lacks it, and resumes in its signature
+        (LINK_NODE_STATUS, 28, ARM, True),  # ArduPilot lacks it
+        (ATTITUDE, 28, ARM, False),  # no receiver rejects it
+        (ATTITUDE, 29, ARM, True),  # some receivers reject a payload longer than their definition
+        (ATTITUDE, 28, MODE_V1, True),  # a receiver of MAVLink 1 only rejects all of MAVLink 2
     ],
 )
 def test_open_header_of_another_source_swallows_no_urgent_frame(
-    opener: int, victim: bytes, is_separated: bool
+    opener: int, length: int, victim: bytes, is_separated: bool
 ) -> None:
     """A parser that resumes in the member's signature leaves it before the operator's command begins."""
     client, member, operator = Client(), source(allow_in=["LINK_NODE_STATUS"]), source("operator", [255])
-    opening = v2(opener, bytes(27) + b"\1", signature=bytes(3) + hidden_header(ATTITUDE, 255))
+    opening = v2(opener, bytes(length - 1) + b"\1", signature=bytes(3) + hidden_header(ATTITUDE, 255))
     assert client.send(opening, member)
     assert client.send(victim, operator)
     resumed = len(opening) - 10  # at the hidden header

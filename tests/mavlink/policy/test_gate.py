@@ -27,7 +27,7 @@ from tests.samples import (
     read,
 )
 from uavlinkd.mavlink.dialect import COMMANDS, GROUPS, MESSAGES
-from uavlinkd.mavlink.frames import Frame
+from uavlinkd.mavlink.frames import Frame, payload_bytes
 from uavlinkd.mavlink.policy import gate as gates
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import ANY_OTHER, Gate, Refusal
@@ -229,6 +229,24 @@ def test_name_allows_the_dialects_definition_only() -> None:
             assert verdicts == {True: None, False: Refusal.UNKNOWN_MESSAGE}
     assert incoming(allow_in=[30]).check(foreign(30), 0.0) is None
     assert incoming(deny_in=["ATTITUDE"]).check(foreign(30), 0.0) is Refusal.MESSAGE_NOT_ALLOWED
+
+
+def grown(one: Frame, version: int) -> Frame:
+    """The same message by a newer definition: with one more field behind those of the dialect."""
+    payload = payload_bytes(one, 0, 255).ljust(MESSAGES[one.header.msgid][3], b"\0") + b"\7"
+    return read(build(one.header.msgid, payload, one.header.system, version=version))
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_extension_fields_change_no_verdict(role: str) -> None:
+    """Every message that grew passes or is refused by the fields that the dialect has: message, command, type."""
+    frames = [blank(msgid) for msgid, row in MESSAGES.items() if row[3] < 255]
+    frames += [command_long(TAKEOFF), command_long(TERMINATE), command_int(TERMINATE), mission_item(TAKEOFF)]
+    frames += [heartbeat(), heartbeat(kind=GCS)]
+    gate = compiled({"role": role, "deny_in": ["MAV_CMD_DO_FLIGHTTERMINATION"]}).incoming
+    for one in frames:
+        verdicts = [gate.permits(grown(one, version)) for version in (1, 2)[one.header.msgid > 255 :]]
+        assert set(verdicts) == {gate.permits(one)}, one.header
 
 
 def test_mavlink1_can_be_refused() -> None:

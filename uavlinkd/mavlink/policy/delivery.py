@@ -28,7 +28,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final, final
 
-from uavlinkd.mavlink.dialect import Lane
+from uavlinkd.mavlink.dialect import MESSAGES, Lane
 from uavlinkd.mavlink.frames import MAVLINK1, MAX_FRAME_BYTES, Frame
 from uavlinkd.mavlink.headers import Header
 from uavlinkd.mavlink.policy import hidden
@@ -166,7 +166,9 @@ class DeliveredStream:
         is_alone = is_alone or len(self._tail) <= len(frame.raw)
         header = frame.header
         msgid = header.msgid
-        is_rare = not header.is_known or msgid > LAST_COMMON_ID or msgid in NOT_COMMON_IDS
+        is_common = header.is_known and msgid <= LAST_COMMON_ID and msgid not in NOT_COMMON_IDS
+        # Some receivers reject a payload that is longer than their definition: MAVLINK_CHECK_MESSAGE_LENGTH.
+        is_rare = not is_common or frame.raw[1] > MESSAGES[msgid][3]
         self._has_rare = is_rare or (self._has_rare and not is_alone)
         self._has_mavlink2 = not header.is_mavlink1 or (self._has_mavlink2 and not is_alone)
 

@@ -91,7 +91,7 @@ class Refusal(Reason):
     )
     UNKNOWN_MESSAGE = (
         "unknown_message",
-        "the dialect does not define the message, or not with this length: a list may allow its number",
+        "the dialect does not define the message, or not in this form: a list may allow its number",
         "unknown to the dialect",
     )
     COMMAND_NOT_ALLOWED = (

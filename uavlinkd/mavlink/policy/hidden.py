@@ -7,7 +7,8 @@ this module finds them. It knows no policy and keeps no state.
 
 What the parsers of the reference C library accept, and so what counts as a frame here:
 
-* MAVLink 1 and 2, of any payload length. ``mavlink_parse_char`` compares no length with the definition.
+* MAVLink 1 and 2, of any payload length. ``mavlink_parse_char`` compares no length with the definition, unless
+  it was compiled with ``MAVLINK_CHECK_MESSAGE_LENGTH``: then it rejects a longer frame, and resumes inside it.
 * MAVLink 1 from 0xFD on. Where ``mavlink_parse_char`` rejects a MAVLink 1 frame whose last byte is 0xFD, it takes
   this byte for a start and reads on in MAVLink 1. The byte may be a delivered frame's own start.
 * incompat_flags of 0 or 1. Any other value makes a parser give up at that byte.
