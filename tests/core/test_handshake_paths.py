@@ -6,7 +6,21 @@ from dataclasses import replace
 
 import pytest
 
-from tests.core.harness import ELSEWHERE, Pair, datagrams, exchange, of, only, probe_in, quiet, reasons, stray
+from tests.core.harness import (
+    ELSEWHERE,
+    KEY_B,
+    Pair,
+    datagrams,
+    exchange,
+    flipped,
+    of,
+    only,
+    probe_in,
+    quiet,
+    reasons,
+    repaired,
+    stray,
+)
 from tests.core.radios import Radios, at_a, at_b
 from uavlinkd.core import constants as c
 from uavlinkd.core import establish, wire
@@ -65,7 +79,7 @@ def test_copies_of_an_initiation_get_the_same_response_once_along_each_path() ->
 
 
 def test_response_goes_along_a_bounded_number_of_paths_until_it_is_confirmed() -> None:
-    """An attacker that copies an initiation from many addresses gets no more. Then a recording is a replay."""
+    """An attacker that copies an initiation from many addresses gets no more, and is noticed."""
     radios = Radios()
     message = initiation(radios)[0]
     response = only(datagrams(radios.b.node.receive(message, at_a(0), 0.0)))
@@ -74,7 +88,28 @@ def test_response_goes_along_a_bounded_number_of_paths_until_it_is_confirmed() -
     assert answered == [number < c.COPIES_OF_A_RESPONSE - 1 for number in range(len(places))]
     confirmation = datagrams(radios.a.node.receive(response, at_b(0), 0.0))[0]
     radios.b.node.receive(confirmation, at_a(0), 0.0)
-    assert reasons(radios.b.node.receive(message, at_a(1), 0.1)) == [DropReason.REPLAYED_INITIATION]
+    late = [only(reasons(radios.b.node.receive(message, place, 0.1))) for place in places]
+    assert late[: c.COPIES_OF_A_RESPONSE - 1] == [DropReason.DUPLICATE] * (c.COPIES_OF_A_RESPONSE - 1)
+    assert set(late[c.COPIES_OF_A_RESPONSE - 1 :]) == {DropReason.REPLAYED_INITIATION}
+
+
+def test_slow_copy_of_an_initiation_is_no_replay() -> None:
+    """It comes after the confirmation along the fast path. An altered one, or one that is too late, is a replay."""
+    radios = Radios()
+    message = initiation(radios)
+    response = only(datagrams(radios.b.node.receive(message[0], at_a(0), 0.0)))
+    confirmation = datagrams(radios.a.node.receive(response, at_b(0), 0.0))[0]
+    radios.b.node.receive(confirmation, at_a(0), 0.01)
+    late = 0.01 + c.INITIATION_COPIES_S
+    altered = repaired(flipped(message[1], 60), KEY_B.public)
+    for datagram, now, reason in (
+        (message[1], 0.05, DropReason.DUPLICATE),
+        (message[1], late - 0.02, DropReason.DUPLICATE),
+        (altered, late - 0.02, DropReason.REPLAYED_INITIATION),
+        (message[1], late, DropReason.REPLAYED_INITIATION),
+    ):
+        out = radios.b.node.receive(datagram, at_a(1), now)
+        assert (datagrams(out), reasons(out)) == ([], [reason])
 
 
 def test_second_response_is_a_duplicate() -> None:

@@ -105,7 +105,7 @@ def replayed_initiation(pair: Pair, now: float) -> list[Output]:
     initiation = made_initiation()
     assert datagrams(pair.b.receive(initiation, now), wire.RESPONSE)
     pair.b.peer.sessions.expire(now + c.UNCONFIRMED_LIFETIME_S)
-    return pair.b.receive(initiation, now)
+    return pair.b.receive(initiation, now + c.INITIATION_COPIES_S)
 
 
 def duplicate(pair: Pair, now: float) -> list[Output]:
@@ -475,7 +475,7 @@ def test_replays_and_strangers_cost_few_key_exchanges(monkeypatch: pytest.Monkey
     replays = [(replay, place) for replay in (initiation, initiation[:-1] + b"\1") for place in (AT_A, ELSEWHERE)]
     for replay, place in replays:
         assert pair.b.receive(replay, 1.0, place)[-1] == Dropped(DropReason.DUPLICATE, pair.b.peer, place)
-    later = 1.0 + c.UNCONFIRMED_LIFETIME_S
+    later = 1.0 + c.INITIATION_COPIES_S
     pair.b.timeout(later)
     for replay, place in replays:
         assert pair.b.receive(replay, later, place) == [Dropped(DropReason.REPLAYED_INITIATION, None, place)]
@@ -495,7 +495,7 @@ def test_memory_for_initiations_is_bounded_and_belongs_to_each_peer(monkeypatch:
         assert datagrams(pair.b.receive(initiation, 1.0), wire.RESPONSE)
     pair.b.receive(repaired(flipped(made_initiation(), 60), KEY_B.public), 1.0)
     for number in range(10):
-        node._handshakes.remember(noisy, number.to_bytes(32, "big"))
+        node._handshakes.remember(noisy, number.to_bytes(32, "big"), bytes(16), 1.0)
     assert len(memory) == 6
     for initiation in made[1:]:
         assert reasons(pair.b.receive(initiation, 2.0)) == [DropReason.DUPLICATE]

@@ -30,7 +30,7 @@ CHECKS_THE_SEQUEL: Final = 0xF0
 """Set in a script's first byte. Then the genuine datagram follows at the end, and the link must work."""
 BUDGET: Final = 8
 """Handshake messages of a script that reach a key exchange."""
-_OF_COPIES = {"datagrams_received", "bytes_received", "duplicates", "received"}
+_OF_COPIES = {"datagrams_received", "bytes_received", "duplicates", "received", "late_copies"}
 _SPENT = ONLY_COUNTED | {"_cookied", "_sources"} | _OF_COPIES
 _DEADLINES = {"deadlines", "next_at", "scheduled_at", "_heap", "_pushed"}
 _SPENT_WITH_COOKIES = _SPENT | {"_received_cookies", "cookied", "retry_at", "cookies_taken", *_DEADLINES}

@@ -69,7 +69,6 @@ def test_replay_storm_delivers_nothing_twice_and_leaves_the_links_as_they_are(se
             # An old envelope from the address of a peer is a late copy, from any other address a replay.
             assert copies[DropReason.REPLAYED] > 5
             assert copies[DropReason.LATE_COPY] > 5
-        assert sum(drone.drops["replayed_initiation"] for drone in (a, b, c)) > 10
 
 
 @pytest.mark.parametrize(

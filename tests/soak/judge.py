@@ -13,7 +13,7 @@ JUDGED_FROM_S = 600.0
 MAY_GROW_SHARE = 0.01
 """Memory is flat if it grows by less than this over the last three quarters of the run, by a straight line,"""
 MAY_GROW_KB = 256.0
-"""or by less than this. A peer's last 1,024 initiations are remembered (some 200 bytes each), a rekey adds one: with
+"""or by less than this. A peer's last 1,024 initiations are remembered (some 250 bytes each), a rekey adds one: with
 new keys each two seconds that memory is full after 34 minutes."""
 LOST_BY_RADIO = ("lost", "lost_in_burst", "lost_in_outage", "queue_full", "too_many_in_flight")
 

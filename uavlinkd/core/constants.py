@@ -129,8 +129,10 @@ USABLE_PER_PEER = 3
 COOKIED_ANSWERS_PER_S = 20
 """Responses a second to one peer with cookies, from all addresses: so it cannot use up the session indices."""
 REMEMBERED_INITIATIONS = 1024
-"""Ephemerals of a peer's authentic initiations: an exact replay costs a look-up, no key exchange. Some 200 bytes
-each: with 200 peers 40 MB, and not before 34 hours of flight."""
+"""A peer's authentic initiations: an exact replay costs a look-up, no key exchange. Some 250 bytes each: with 200
+peers 50 MB, and not before 34 hours of flight."""
+INITIATION_COPIES_S = 60.0
+"""A copy may come so late: mobile networks hold datagrams back for up to a minute. A later one is a recording."""
 INITIATIONS = Rate(50.0, 50)
 """Messages a second that may reach a key exchange without a cookie. Beyond that we are under load."""
 INITIATIONS_BURST_PER_PEER = 2

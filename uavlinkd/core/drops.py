@@ -121,7 +121,8 @@ class DropReason(Reason):
     )
     REPLAYED_INITIATION = (
         "replayed_initiation",
-        "the daemon read this initiation before: a sender replays it",
+        "the daemon read this initiation before, too long ago or too often for a copy along a slow path: an attacker"
+        " replays it",
         "replayed handshakes",
         Attention.SECURITY,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
+from dataclasses import dataclass
 
 from uavlinkd.core import constants as c
 from uavlinkd.core import establish, handshake, wire
@@ -21,6 +22,17 @@ from uavlinkd.core.timers import Schedule
 _WAITING_KINDS = frozenset((bytes((wire.INITIATION,)), bytes((wire.RESPONSE,))))
 _MAVLINK_STARTS = frozenset((0xFD, 0xFE))
 _NOT_OUR_VERSION = frozenset((DropReason.MALFORMED, DropReason.BAD_MAC1))
+
+
+@dataclass(slots=True)
+class Remembered:
+    """An authentic initiation that was read, to recognise its copies."""
+
+    peer: Peer
+    mac1: bytes
+    read_at: float
+    late_copies: int = 0
+    """How often it came again while no session waited for its confirmation."""
 
 
 class HandshakeReceiver:
@@ -43,8 +55,8 @@ class HandshakeReceiver:
         self.admission = admission
         self.peers: dict[bytes, Peer] = {}
         """By their public key."""
-        self.remembered: dict[bytes, Peer] = {}
-        """By the ephemeral of an authentic initiation: its sender."""
+        self.remembered: dict[bytes, Remembered] = {}
+        """By the ephemeral of the initiation."""
         self.admit: Callable[[bytes, bytes, float], Peer] | None = None
         """Returns the peer with this static key that showed this certificate. Raises Drop."""
         self._indices = indices
@@ -81,10 +93,10 @@ class HandshakeReceiver:
         """All that :meth:`source_of` returns for initiations along a path."""
         return [(path, has_cookie) for has_cookie in (False, True)]
 
-    def remember(self, peer: Peer, ephemeral: bytes) -> None:
+    def remember(self, peer: Peer, ephemeral: bytes, mac1: bytes, now: float) -> None:
         """An authentic initiation of this peer came, with this ephemeral."""
         # A memory for each peer: no peer can make us forget what another sent.
-        self.remembered[ephemeral] = peer
+        self.remembered[ephemeral] = Remembered(peer, mac1, now)
         peer.remembered.append(ephemeral)
         if len(peer.remembered) > c.REMEMBERED_INITIATIONS:
             self.remembered.pop(peer.remembered.pop(0), None)
@@ -101,10 +113,10 @@ class HandshakeReceiver:
         initiation = wire.parse_initiation(datagram)
         self.admission.read(path, now)
         self._check_mac1(datagram)
-        sender = self.remembered.get(initiation.ephemeral)
-        if sender is not None:  # before the budget: one recording must not use it up
-            self._facts.check_network(sender, path)
-            return self._answer_copy(sender, datagram, path, now)
+        remembered = self.remembered.get(initiation.ephemeral)
+        if remembered is not None:  # before the budget: one recording must not use it up
+            self._facts.check_network(remembered.peer, path)
+            return self._answer_copy(remembered, datagram, path, now)
         message = Message(datagram, initiation.sender_index, path, self.cookies)
         self.admission.admit(message, now, is_response=False)
         received = handshake.receive_initiation(self.identity, initiation)
@@ -115,7 +127,7 @@ class HandshakeReceiver:
             raise Drop(DropReason.UNKNOWN_PEER, received.public_key)
         # Before it is remembered: otherwise a line could use up what this peer sends along its own network.
         self._facts.check_network(peer, path)
-        self.remember(peer, initiation.ephemeral)
+        self.remember(peer, initiation.ephemeral, mac1_of(datagram), now)
         try:
             out = self._answer(peer, received, message, now)
         except CookieRequired as drop:
@@ -125,14 +137,19 @@ class HandshakeReceiver:
         self._schedule.update(peer)
         return out
 
-    def _answer_copy(self, peer: Peer, datagram: bytes, path: Path, now: float) -> list[Output]:
-        """An initiation of this peer that was read before: it sends one along several paths."""
-        mac1 = mac1_of(datagram)
+    def _answer_copy(self, remembered: Remembered, datagram: bytes, path: Path, now: float) -> list[Output]:
+        """An initiation that was read before: its peer sends it along several paths, and one may be slow."""
+        peer = remembered.peer
+        if not equal(remembered.mac1, mac1_of(datagram)):
+            raise Drop(DropReason.REPLAYED_INITIATION)
         for waiting in peer.sessions.unconfirmed.values():
-            if equal(waiting.initiation_mac1, mac1):
+            if waiting.initiation_mac1 == remembered.mac1:
                 out = establish.answer_copy(peer, waiting, path, now)
                 return [*out, peer.drop_datagram(DropReason.DUPLICATE, path)]
-        raise Drop(DropReason.REPLAYED_INITIATION)
+        remembered.late_copies += 1
+        if now >= remembered.read_at + c.INITIATION_COPIES_S or remembered.late_copies >= c.COPIES_OF_A_RESPONSE:
+            raise Drop(DropReason.REPLAYED_INITIATION)
+        return [peer.drop_datagram(DropReason.DUPLICATE, path)]
 
     def _answer(self, peer: Peer, received: handshake.Received, message: Message, now: float) -> list[Output]:
         suite = received.initiation.suite
