@@ -10,6 +10,7 @@ from functools import partial
 import pytest
 from structlog.testing import capture_logs
 
+from tests.daemon.udp import open_socket
 from tests.needs import need
 from tests.waiting import PATIENCE_S
 from uavlinkd.endpoints.sockets import BindError, is_here, send_from_new_port, udp_socket
@@ -49,6 +50,24 @@ def test_datagram_from_a_new_port_comes_from_the_same_address(host: str) -> None
         with udp_socket(Address(host, source[1])):
             send_from_new_port(sock, b"two", receiver.getsockname())
             assert receiver.recvfrom(64)[1][1] != source[1]
+
+
+def test_wildcard_socket_answers_from_the_address_that_was_asked() -> None:
+    """Also from a new port. An address that the kernel prefers anyway is not part of the sender's address."""
+    with udp_socket(Address("0.0.0.0", free_port())) as sock, open_socket("127.0.0.1") as asker:
+        sock.settimeout(PATIENCE_S)
+        asker.settimeout(PATIENCE_S)
+        port = sock.getsockname()[1]
+        for own in ("127.0.0.2", "127.0.0.1"):
+            asker.sendto(b"question", (own, port))
+            size, sender = sock.recvfrom_into(bytearray(64))
+            assert (size, sender[:2]) == (8, asker.getsockname())
+            assert sender[2:] == (() if own == "127.0.0.1" else (own,))
+            sock.sendto(b"answer", sender)
+            assert asker.recvfrom(64) == (b"answer", (own, port))
+            send_from_new_port(sock, b"token", sender)
+            data, source = asker.recvfrom(64)
+            assert (data, source[0], source[1] == port) == (b"token", own, False)
 
 
 # An address that is not there yet: a drone's network comes up after its daemon, or never.

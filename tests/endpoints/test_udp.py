@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import socket
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 
 import pytest
 
@@ -14,6 +14,7 @@ from uavlinkd.endpoints.ports import CLIENT_SILENT_S, CLIENTS_PER_ENDPOINT, Loca
 from uavlinkd.endpoints.reader import Datagrams, Reader
 from uavlinkd.endpoints.sockets import udp_socket
 from uavlinkd.endpoints.udp import CLIENT_IDLE_S, LOCAL_DATAGRAM_BYTES, UdpServer
+from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.mavlink.frames import MAX_GAP_S
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic
@@ -163,6 +164,20 @@ async def test_a_forgotten_client_is_not_sent_to(server: UdpServer, client: Make
     read(server, 1001.0)
     (again,) = server.ports
     assert again.delivered is port.delivered
+
+
+async def test_client_is_answered_from_the_own_address_that_it_asked() -> None:
+    """It stays one client when it asks another one."""
+    server = UdpServer("autopilot", udp_socket(Address("0.0.0.0", free_port())), Recorder())
+    with closing(server), open_socket("127.0.0.1") as one:
+        for number, own in enumerate(("127.0.0.2", "127.0.0.1", "127.0.0.3")):
+            one.connect((own, address_of(server)[1]))  # it receives from there only
+            one.send(heartbeat())
+            read(server)
+            write(server.ports[0], [frame(number)], 1.0)
+            assert one.recv(2048) == frame(number)
+            assert names(server.ports) == [name_of(one)]
+        assert len(recorder(server).open) == 1
 
 
 async def test_new_clients_cannot_displace_active_ones(server: UdpServer, client: Make) -> None:

@@ -10,8 +10,11 @@ from uavlinkd.core import wire
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.suites import Suite
 
-SocketAddress = tuple[str, int] | tuple[str, int, int, int]
-"""An Internet address as the kernel takes and gives it: host and port; for IPv6 also flow label and interface."""
+SocketAddress = tuple[str, int] | tuple[str, int, int, int] | tuple[str, int, str] | tuple[str, int, int, int, str]
+"""An Internet address as the kernel takes and gives it: host and port; for IPv6 also flow label and interface.
+
+A last text is the own address that was asked, if the kernel would answer from another one: that is another path.
+"""
 
 SERIAL_HOST = "serial"
 """The host of the only path along a serial network: ``Path(socket, (SERIAL_HOST, 0))``."""
@@ -64,8 +67,13 @@ class Path(NamedTuple):
 
     @property
     def place(self) -> SocketAddress:
-        """Where the peer is, whichever socket reaches it. Each line is a place of its own."""
-        return (SERIAL_HOST, self.socket) if self.is_serial else self.address
+        """Where the peer is, whichever socket and own address reach it. Each line is a place of its own."""
+        return (SERIAL_HOST, self.socket) if self.is_serial else remote_of(self.address)
+
+
+def remote_of(address: SocketAddress) -> SocketAddress:
+    """An address without the own address that was asked."""
+    return address[:-1] if isinstance(address[-1], str) else address
 
 
 def relayed(socket: int, relay: str, handle: int) -> Path:

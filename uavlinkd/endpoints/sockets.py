@@ -13,6 +13,7 @@ from typing import Any, Final, NamedTuple
 
 import structlog
 
+from uavlinkd.endpoints.wildcard import WildcardSocket, sibling
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.error_meanings import ADDRESS_NOT_HERE_YET, meaning_of
 from uavlinkd.system.interfaces import find_interface
@@ -22,7 +23,6 @@ BUFFER_BYTES = 1 << 20
 """Requested for the receive buffer and the send buffer: room for hundreds of envelopes of the default size. The
 kernel may grant less (net.core.rmem_max)."""
 
-_INTERFACE_NAME_BYTES = 16  # IFNAMSIZ: linux/if.h
 _FREEBIND = {
     socket.AF_INET: (socket.IPPROTO_IP, 15),  # IP_FREEBIND, which Python does not name: linux/in.h
     socket.AF_INET6: (socket.IPPROTO_IPV6, 78),  # IPV6_FREEBIND: linux/in6.h
@@ -46,7 +46,9 @@ def new_socket(address: Address, kind: socket.SocketKind) -> Iterator[tuple[sock
         family, _, proto, _, sockaddr = socket.getaddrinfo(
             address.host, address.port, type=kind, flags=socket.AI_NUMERICHOST | socket.AI_PASSIVE
         )[0]
-        sock = socket.socket(family, kind, proto)
+        # Others ask at a port that is configured. From any other port this machine asks first.
+        is_asked = kind is socket.SOCK_DGRAM and address.is_wildcard and address.port and sys.platform == "linux"
+        sock = (WildcardSocket if is_asked else socket.socket)(family, kind, proto)
     except OSError as error:
         raise BindError(f"cannot use {address}: {error.strerror or error}") from None
     try:
@@ -76,10 +78,9 @@ def send_from_new_port(sock: socket.socket, datagram: bytes, target: tuple[Any, 
     Raises OSError: the kernel's error.
     """
     host, _, *rest = sock.getsockname()
-    with socket.socket(sock.family, socket.SOCK_DGRAM) as other:
-        if sys.platform == "linux":
-            if interface := sock.getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, _INTERFACE_NAME_BYTES):
-                other.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, interface)
+    if isinstance(target[-1], str):  # the own address that was asked
+        host, target = target[-1], target[:-1]
+    with sibling(sock) as other:
         other.setblocking(False)
         other.bind((host, 0, *rest))
         other.sendto(datagram, target)

@@ -14,7 +14,7 @@ from math import inf
 
 import structlog
 
-from uavlinkd.core.path import SocketAddress
+from uavlinkd.core.path import SocketAddress, remote_of
 from uavlinkd.endpoints.ports import (
     CLIENT_SILENT_S,
     CLIENTS_PER_ENDPOINT,
@@ -214,10 +214,14 @@ class UdpEndpoint(Endpoint):
         reports = self._reports.take()
         for address, number in reports:
             self.failures[errno.errorcode.get(number, "OSError")] += 1
-            if number == errno.ECONNREFUSED and (port := self._ports.get(address)) is not None:
+            if number == errno.ECONNREFUSED and (port := self._port_at(address)) is not None:
                 self._on_refused(port)
         self._reader.renew()
         return bool(reports)
+
+    def _port_at(self, remote: SocketAddress) -> UdpPort | None:
+        """The client at an address, whichever own address it asked."""
+        return next((port for port in self._ports.values() if remote_of(port.address) == remote), None)
 
     def _on_refused(self, port: UdpPort) -> None:
         """No process listens at a client's address."""
@@ -247,6 +251,11 @@ class UdpServer(UdpEndpoint):
                 self.handler.on_port_silent(port)
 
     def _admit(self, address: SocketAddress, now: float) -> UdpPort | None:
+        if (port := self._port_at(remote_of(address))) is not None:  # it asks another own address now
+            del self._ports[port.address]
+            port.address = address
+            self._ports[address] = port
+            return port
         if len(self._ports) >= CLIENTS_PER_ENDPOINT:
             silent = min(self._ports.values(), key=lambda port: port.received_at or -inf)
             if silent.received_at is None or now - silent.received_at < CLIENT_SILENT_S:

@@ -13,7 +13,7 @@ from typing import Final, Generic, TypeVar
 
 from uavlinkd.core.drops import Detail, DropReason
 from uavlinkd.core.outputs import Dropped
-from uavlinkd.core.path import RELAY_HOST, SocketAddress, relay_name
+from uavlinkd.core.path import RELAY_HOST, SocketAddress, relay_name, remote_of
 from uavlinkd.core.peer import Peer
 from uavlinkd.endpoints.ports import Endpoint
 from uavlinkd.link.peer_link import PeerLink
@@ -95,7 +95,7 @@ class Evidence:
         """A datagram was dropped."""
         reason, peer, path, _, detail = dropped
         if reason in _HINTS:
-            address = None if path is None else path.address
+            address = None if path is None else remote_of(path.address)
             if detail == self._own_key:
                 self.own_key_elsewhere = now, address
                 return
@@ -107,7 +107,8 @@ class Evidence:
 
         With :data:`REPORTED` before it, an ICMP message says that a datagram did not arrive.
         """
-        self._add(error, self._target(address, now), address, "", now)
+        remote = None if address is None else remote_of(address)
+        self._add(error, self._target(remote, now), remote, "", now)
 
     def seen(self, kind: str, link: PeerLink, now: float) -> Sighting | None:
         """The newest evidence of this kind about a peer, or from its addresses or hosts."""
@@ -180,7 +181,7 @@ def _places_of(link: PeerLink) -> list[Place]:
 def _addresses_of(peer: Peer) -> list[Place]:
     """The addresses of a peer or relay: those of the configuration, then learned ones."""
     configured = [path.address for path in peer.paths.configured]
-    learned = [state.path.address for state in peer.paths.states]
+    learned = [remote_of(state.path.address) for state in peer.paths.states]
     return [("address", address) for address in (*configured, *learned)]
 
 

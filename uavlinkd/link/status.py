@@ -369,6 +369,7 @@ def _path_status(link: PeerLink | RelayLink, state: PathState, way_of: WayOf, no
     relay_address = way_of(state.path)[1]
     return _path_now(link, state, way_of) | {
         "relay_address": None if relay_address is None else str(Address.of(relay_address)),
+        "own_address": own if isinstance(own := state.path.address[-1], str) else None,
         "is_configured": state.is_configured,
         "state_s": now - state.since,
         "carries": [cls.value for cls, route in peer.paths.routes.items() if peer.is_up and state in route],
