@@ -23,7 +23,7 @@ from uavlinkd.link.networks import COPIES_SHARE, NetworkBudget, carrier_bytes
 from uavlinkd.mavlink.dialect import IDS
 from uavlinkd.mavlink.egress.bucket import Bucket
 from uavlinkd.mavlink.egress.budgeted import EgressSettings, EnvelopeShape
-from uavlinkd.mavlink.egress.by_class import PeerEgress
+from uavlinkd.mavlink.egress.peer_egress import PeerEgress
 from uavlinkd.mavlink.flows import FlowKey, flow_key
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.mavlink.payloads import VALUE_KIND, ParameterAnswers
@@ -59,13 +59,13 @@ class PeerOutput:
         self.answers = ParameterAnswers()
         """Requests of the peer, whose answers are critical."""
         self._on_sent = on_sent
-        self.egress = PeerEgress(settings, now, self.answers.class_of) if settings.is_needed else None
+        self.egress = PeerEgress(settings, now) if settings.is_needed else None
         """Frames that wait; None if frames never wait."""
         self.copies = Copies(budgets, now)
         self.repair = Repair()
         """Whether critical envelopes are repeated."""
         self._charged = 0, 0  # datagrams and bytes that the budget was charged for
-        self._networks: dict[Class, list[Bucket | None]] = {}
+        self._networks: list[Bucket | None] = []
         self._critical_limit = CRITICAL_ENVELOPE_LIMIT  # of the payload; set for each session
         self._stream_bytes = 0
         self._measured_at = now
@@ -77,7 +77,7 @@ class PeerOutput:
         Returns whether :meth:`send_waiting` has something to do.
         """
         if self.egress is not None:
-            self.egress.put(frames, now - waited_s, is_split=self._peer.paths.is_multiple or self.repair.is_on)
+            self.egress.put(frames, now - waited_s)
             return True
         self._send_runs(frames, now)
         return bool(self.copies.waiting)
@@ -87,7 +87,7 @@ class PeerOutput:
         peer = self._peer
         if self.egress is not None:
             self.charge(now)
-            while batch := self.egress.take(now)[1]:
+            while batch := self.egress.take(now):
                 self._send_runs(batch, now)
                 self.charge(now)
         if self.copies.waiting:
@@ -130,8 +130,8 @@ class PeerOutput:
         if self.egress is not None:
             self.egress.clear(now)  # and leave the lines of other peers
         self._settings = settings
-        self.egress = PeerEgress(settings, now, self.answers.class_of) if settings.is_needed else None
-        self._networks = {}
+        self.egress = PeerEgress(settings, now) if settings.is_needed else None
+        self._networks = []
         self._charged = self._sent()
 
     def follow(self, now: float) -> None:
@@ -151,19 +151,15 @@ class PeerOutput:
             self.egress.set_shape(EnvelopeShape(limit, seal, carrier_bytes(path)))
 
     def _follow_networks(self, now: float) -> None:
-        all_routes = self._peer.paths.routes.items()
-        routes = {cls: [state for state in route if state.works] or route for cls, route in all_routes}
-        buckets = {number: budget.all for number, budget in self._budgets.items()}
-        networks = {
-            cls: [buckets.get(state.path.socket) for state in (route if cls is Class.CRITICAL else route[:1])]
-            for cls, route in routes.items()
-        }
-        if networks == self._networks or not networks[Class.CRITICAL]:
+        route = self._peer.paths.routes[Class.CRITICAL]
+        route = tuple(state for state in route if state.works) or route
+        budgets = [self._budgets.get(state.path.socket) for state in route]
+        networks = [None if budget is None else budget.all for budget in budgets]
+        if networks == self._networks or not networks:
             return
         self._networks = networks
-        is_limited = any(None not in buckets for buckets in networks.values())
-        if self.egress is None and is_limited:
-            self.egress = PeerEgress(self._settings, now, self.answers.class_of)
+        if self.egress is None and networks[0] is not None:
+            self.egress = PeerEgress(self._settings, now)
         if self.egress is not None:
             self.egress.set_networks(networks, now)
 

@@ -11,34 +11,25 @@ from uavlinkd.core.settings import Class
 from uavlinkd.mavlink.dialect import name_of
 from uavlinkd.mavlink.egress.bucket import Bucket
 from uavlinkd.mavlink.egress.budgeted import EgressSettings, EnvelopeShape
-from uavlinkd.mavlink.egress.by_class import PeerEgress
+from uavlinkd.mavlink.egress.peer_egress import PeerEgress
 from uavlinkd.mavlink.flows import FlowKey, flow_key
 from uavlinkd.mavlink.frames import Frame
-from uavlinkd.mavlink.payloads import ParameterAnswers
 
 SHAPE = EnvelopeShape(payload_limit=1200, seal_bytes=23, carrier_bytes=28)
 SLOW = EgressSettings(budget_bits_s=4000)
-CLASS_OF = ParameterAnswers().class_of
 
 
 class Link:
     """One egress, and the wire behind it: each envelope is sent and accounted for at once."""
 
-    def __init__(
-        self, settings: EgressSettings, shape: EnvelopeShape = SHAPE, *networks: Bucket | None, is_split: bool = False
-    ) -> None:
-        """``networks``: the best path's first; ``is_split``: the peer has several paths."""
-        self.egress = PeerEgress(settings, 0.0, CLASS_OF)
+    def __init__(self, settings: EgressSettings, shape: EnvelopeShape = SHAPE, *networks: Bucket | None) -> None:
+        """``networks``: the best path's first."""
+        self.egress = PeerEgress(settings, 0.0)
         self.egress.set_shape(shape)
         self.shape = shape
-        self.is_split = is_split
         self.networks = networks
         if networks:
-            first = networks[:1]
-            along = {Class.CRITICAL: networks, Class.STREAM: first, Class.BULK: first}
-            self.egress.set_networks(along, 0.0)
-        self.classes: list[Class] = []
-        """Of the envelopes."""
+            self.egress.set_networks(networks, 0.0)
         self.sent: list[tuple[float, bytes]] = []
         self.envelopes: list[tuple[float, list[bytes]]] = []
         self.wire: list[tuple[float, int]] = []
@@ -49,19 +40,17 @@ class Link:
         for raw in raws(frames):
             assert raw not in self.offered, "frames of a test differ in their bytes"
             self.offered[raw] = now
-        self.egress.put(frames, now, is_split=self.is_split)
+        self.egress.put(frames, now)
         self.flush(now)
 
     def flush(self, now: float) -> None:
-        cls, batch = self.egress.take(now)
-        while batch:
+        while batch := self.egress.take(now):
             sent = raws(batch)
-            self.classes.append(cls)
             self.envelopes.append((now, sent))
             self.sent += [(now, raw) for raw in sent]
-            along = self.networks if cls is Class.CRITICAL else self.networks[:1]
+            is_critical = all(frame.header.kind.cls is Class.CRITICAL for frame in batch)
+            along = self.networks if is_critical else self.networks[:1]
             self.transmit(self.shape.seal_bytes + sum(map(len, sent)), now, along)
-            cls, batch = self.egress.take(now)
 
     def transmit(self, datagram_bytes: int, now: float, along: Sequence[Bucket | None] = ()) -> None:
         self.egress.spend(datagram_bytes, now)

@@ -32,7 +32,7 @@ def test_frames_share_an_envelope_after_the_delay() -> None:
         link.put(waiting, now=n * 0.01)
     assert not link.sent
     assert link.egress.next_deadline() == 0.05
-    assert link.egress.take(0.0499)[1] == []
+    assert link.egress.take(0.0499) == []
     link.flush(0.05)
     assert link.envelopes == [(0.05, raws(frames))]
     assert link.egress.next_deadline() == inf
@@ -148,7 +148,7 @@ def test_invented_flows_do_not_displace_the_known() -> None:
 
 def egress_of(link: Link) -> Egress:
     """The queue of a link with a budget."""
-    (queue,) = link.egress._queues.values()
+    queue = link.egress._queue
     assert isinstance(queue, Egress)
     return queue
 

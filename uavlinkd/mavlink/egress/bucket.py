@@ -5,7 +5,7 @@ second of the budget, or one largest frame in an envelope if that is more. So a 
 these frames than that.
 
 Peers that share the bucket of a network take turns. A queue of frames that waits for the bucket is in line, with
-the price of its next envelope. Critical frames go first, otherwise the queue that waited longest. Without turns, the
+the price of its next envelope. Urgent frames go first, otherwise the queue that waited longest. Without turns, the
 queue with the cheapest envelopes would leave nothing to the others. Sans-IO: ``now`` is monotonic seconds.
 """
 
@@ -99,9 +99,9 @@ class Bucket:
 
 
 class Supply:
-    """What the frames of one class to one peer may use: the peer's own bucket, and that of any one of the networks.
+    """What some frames to one peer may use: the peer's own bucket, and that of any one of the networks.
 
-    ``own``: None for a peer without a budget. ``networks``: those along which the class may go; None for a network
+    ``own``: None for a peer without a budget. ``networks``: those along which the frames may go; None for a network
     without a budget, which always has room.
     """
 

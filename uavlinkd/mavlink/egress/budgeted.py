@@ -11,7 +11,8 @@ IP and UDP header, envelope, handshakes and echoes too.
 
 While the bucket covers all waiting frames, they leave in their order of arrival. When it does not:
 
-* Urgent frames go first, of each sender in turn. They share an envelope with other waiting frames.
+* Urgent frames go first, of each sender in turn, along any network with room. If the best path's network has room,
+  they share an envelope with other waiting frames.
 * The rest of the budget is divided equally, by bytes, between events and states, while both wait.
 * Of a state only the newest frame waits. The older one is counted as THINNED. The flow that was sent the longest time
   ago is next, so all flows are thinned alike and none starves. Events keep their order within a flow; flows take
@@ -89,8 +90,8 @@ class Egress:
     none. Charge every datagram that is sent to the peer to its buckets before the next take: taking alone costs
     nothing. Call :meth:`take` again at :meth:`next_deadline`, which any call may change.
 
-    ``supply``: what the frames may use. ``totals``: counts dropped frames, for several queues together.
-    ``is_critical``: all its frames are.
+    ``supply``: what the frames may use. ``urgent_supply``: what urgent ones may use, which is more if their copies
+    go along further networks. ``totals``: counts dropped frames.
     """
 
     def __init__(
@@ -99,14 +100,13 @@ class Egress:
         now: float,
         shape: EnvelopeShape,
         supply: Supply,
+        urgent_supply: Supply,
         totals: Counter[EgressDrop],
-        *,
-        is_critical: bool = False,
     ) -> None:
         self.settings = settings
         self.totals = totals
         self.supply = supply
-        self._is_critical = is_critical
+        self._urgent_supply = urgent_supply
         self._now = now
         self._level = supply.level if supply.networks or supply.own is None else supply.own.level
         self._bytes = supply.level(now)  # what may be spent now
@@ -139,12 +139,15 @@ class Egress:
         next_one = lanes.next if self._is_short(0) else lanes.first
         first = next_one()
         if first is None or now < self._due_at():
-            self.supply.leave(self)
+            self._leave()
             return []
         price = self._price(first) - _SLACK_BYTES
-        room = self.supply.room_for(self, price, now, is_urgent=self._is_urgent(first))
+        supply = self._supply_of(first)
+        room = supply.room_for(self, price, now, is_urgent=_is_urgent(first.frame))
         if not room:
             return []
+        if supply is not self.supply and self.supply.level(now) < price:
+            next_one = lanes.next_urgent  # another network than the best path's has room
         room = min(self.shape.payload_limit, room + _SLACK_BYTES - self.shape.overhead)
         batch: list[Waiting] = []
         size = 0
@@ -165,22 +168,18 @@ class Egress:
         first = self.lanes.next()
         if first is None:
             return inf
-        wait_s = self.supply.wait_s(self, self._price(first), self._now, is_urgent=self._is_urgent(first))
+        supply = self._supply_of(first)
+        wait_s = supply.wait_s(self, self._price(first), self._now, is_urgent=_is_urgent(first.frame))
         return max(self._due_at(), self._now + wait_s)
-
-    @property
-    def is_blocked(self) -> bool:
-        """Whether frames wait for the budget, and not for others to share an envelope with."""
-        return self.queued_frames > 0 and self._now >= self._due_at()
 
     def pop_all(self) -> list[tuple[Frame, float]]:
         """Take out all frames that wait, each with the time since when."""
-        self.supply.leave(self)
+        self._leave()
         return [(waiting.frame, waiting.put_at) for waiting in self.lanes.pop_all()]
 
     def clear(self, now: float) -> None:
         self._advance(now)
-        self.supply.leave(self)
+        self._leave()
         self.lanes.clear()
 
     # The budget.
@@ -189,9 +188,12 @@ class Egress:
         self._now = max(self._now, now)
         self._bytes = self._level(self._now)
 
-    def _is_urgent(self, first: Waiting) -> bool:
-        """Whether frames of other peers let these go first."""
-        return self._is_critical or first.flow.lane is Lane.URGENT
+    def _supply_of(self, first: Waiting) -> Supply:
+        return self._urgent_supply if _is_urgent(first.frame) else self.supply
+
+    def _leave(self) -> None:
+        self.supply.leave(self)
+        self._urgent_supply.leave(self)
 
     def _is_short(self, more_bytes: int) -> bool:
         """Whether the bucket holds less than the cost of the waiting frames and of this many bytes more."""
@@ -235,8 +237,6 @@ class Coalescer:
     An :class:`Egress` without a budget sends the same envelopes, but its lanes and flows cost more: a frame takes 11
     to 14 µs of CPU time there, and 0.6 to 1.9 µs here (Python 3.11).
     """
-
-    is_blocked = False  # frames never wait for a budget here
 
     def __init__(self, settings: EgressSettings, shape: EnvelopeShape, totals: Counter[EgressDrop]) -> None:
         self.settings = settings
