@@ -59,6 +59,7 @@ def peer(state: str, **facts: object) -> dict[str, Any]:
         "waiting_dropped": {},
         "refused": {},
         "role": None,
+        "envelopes_received": 30_000,
         **dict.fromkeys(LinkProblem, 0),
         **facts,
     }
@@ -140,6 +141,7 @@ BY_TLS = {**USED, "paths": [{"network": "TLS"}]}
             {},
             "rssi 200/190, noise 50/60, modem 10 % full",
         ),
+        ({}, {"envelopes_out_of_order": 12}, "overtaken: 12 of 30,000 envelopes, 0.04 % (repair, "),
         ({"has_no_client": True}, {}, "1 of 1 peers up, no endpoint has a client"),
         ({"contested": ["a", "b"]}, {}, "1 of 1 peers up, two machines use one key with a, b"),
         (

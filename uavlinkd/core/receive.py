@@ -84,8 +84,6 @@ def receive_envelope(
     elif not peer.is_up and not is_superseded:
         out += freshness.question(peer, session, now)
 
-    if counter != session.window.highest:
-        traffic.out_of_order += 1
     if state.condition is not PathCondition.USABLE and payload[:1] != _PROBE:
         is_asked = peer.paths.has_several or not state.is_configured  # else by echo requests
         least_s = peer.paths.facts.least_probe_s(path)
@@ -101,6 +99,8 @@ def receive_envelope(
         out += controlled
         if not payload:
             return out
+    if counter != session.window.highest:
+        traffic.out_of_order += 1
     if is_superseded:
         out += peer.drop(DropReason.DELAYED, 1)
     elif not is_new:

@@ -49,8 +49,7 @@ class LinkProblem(Reason):
     ENVELOPES_MISSING = "envelopes_missing", "envelopes did not arrive: the radio is bad, or an attacker drops them"
     ENVELOPES_OUT_OF_ORDER = (
         "envelopes_out_of_order",
-        "envelopes arrived after later ones: the network has several paths, or an attacker reorders them",
-        "out of order",
+        "envelopes with frames arrived after later ones: the network has several paths, or an attacker reorders them",
     )
     PATHS_UNPROVEN = (
         "paths_unproven",

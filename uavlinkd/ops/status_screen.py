@@ -111,6 +111,8 @@ def _peers(status: Status, width: int) -> list[RenderableType]:
             problems.append(Text(f"{name} repair: on for {_age(repair['on_s'])}, {words.repair_line(repair)}"))
         if dropped := words.listed(words.peer_drops(peer)):
             problems.append(Text(f"{name} dropped: {dropped}"))
+        if overtaken := words.overtaken(peer):
+            problems.append(Text(f"{name} overtaken: {overtaken}"))
         session = peer["session"] or {}
         age = _age(peer["handshake_s"]) if session else "-"
         paths.add_row(Text(name), Text(peer["path"] or "-"), session.get("suite", "-"), session.get("mode", "-"), age)
