@@ -34,7 +34,7 @@ _ROWS = [
     (GOOD, GOOD, {}),
     (GOOD, GOOD + OTHER_PEER, {"peers_added": ["drone2"]}),
     (GOOD + OTHER_PEER, GOOD, {"peers_removed": ["drone2"]}),
-    (GOOD, GOOD + 'deny_in = ["PING"]\n', {"peers_changed": ["drone1"]}),
+    (GOOD, GOOD + "rate_in = { PING = 0 }\n", {"peers_changed": ["drone1"]}),
     (GOOD, GOOD + "tag_bits = 96\n", {"peers_removed": ["drone1"], "peers_added": ["drone1"]}),
     (GOOD, GOOD + 'redundancy = "all"\n', {"peers_removed": ["drone1"], "peers_added": ["drone1"]}),
     (networks(LTE + MESH), networks(LTE + MESH, f"[{BY_MESH}]"), {"peers_changed": ["drone1"]}),

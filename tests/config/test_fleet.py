@@ -134,11 +134,11 @@ def test_observer_sends_only_requests(tmp_path: Path) -> None:
 def test_policy_of_a_role_adds_to_the_usual_one(tmp_path: Path) -> None:
     """Unless it is complete by itself."""
     added = (
-        '[[fleet_role]]\nname = "vehicle"\ndeny_in = ["PING"]\n'
+        '[[fleet_role]]\nname = "vehicle"\nrate_in = { PING = 0 }\n'
         '[[fleet_role]]\nname = "operator"\nallow_in = []\nallow_out = []\n'
     )
     assert _fleet(tmp_path, member_file(fleet(more=added))).policies == {
-        _VEHICLE: {"role": "swarm-member", "deny_in": ("PING",)},
+        _VEHICLE: {"role": "swarm-member", "rate_in": {"PING": 0}},
         _OPERATOR: {"allow_in": (), "allow_out": ()},
         _OBSERVER: {"role": "observer"},
     }
@@ -235,7 +235,7 @@ _ROWS = [
     (fleet(more='operator = "pinned"') + _ROLE, "fleet_role[0].name (operator)", 'with operator = "pinned"'),
     (fleet(certificate(_RELAY)) + _ROLE, "fleet_role[0].name (operator)", "a relay carries no frames"),
     (fleet(certificate(_OPERATOR)) + _ROLE, "fleet_role[0].role (operator)", "allow_out"),
-    (fleet() + _ROLE + 'deny_in = ["no"]', "fleet_role[0].deny_in[0] (operator)", "no such group"),
+    (fleet() + _ROLE + 'allow_in = ["no"]', "fleet_role[0].allow_in[0] (operator)", "no such group"),
     (fleet(more='call = ["relay"]'), "fleet.call[0]", "'vehicle', 'operator' or 'observer'"),
     (fleet(more='call = ["operator"]\noperator = "pinned"'), "fleet.call", "no link here"),
     (fleet(more='deny = ["V 3"]'), "fleet.deny[0]", "1 to 21 of a-z"),
@@ -287,7 +287,7 @@ def test_readable_links_of_members_are_warned_of(tmp_path: Path) -> None:
         (fleet(more="require_bulletin = 2"), {"fleet_changed": ["required_bulletin"]}),
         (fleet(more='call = []\ndeny = ["v3"]'), {"fleet_changed": ["call", "denied"]}),
         (fleet(more='operator = "pinned"'), {"fleet_changed": ["call", "policies"]}),
-        (fleet(more=_ROLE + 'deny_in = ["PING"]'), {"fleet_changed": ["policies"]}),
+        (fleet(more=_ROLE + "rate_in = { PING = 0 }"), {"fleet_changed": ["policies"]}),
         (fleet(certificate(serial=9), news=bulletin(2)), {"fleet_changed": ["own", "bulletin"]}),
         (fleet() + _GS, {"peers_added": ["gs"], "fleet_changed": ["contacts"]}),
         (fleet() + _R1, {"relays_added": ["r1"], "fleet_changed": ["contacts", "relays"]}),

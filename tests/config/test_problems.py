@@ -353,7 +353,7 @@ _HEX = base64.b64decode(_SECRET).hex()
         *(f'{GOOD}{key} = ["{_SECRET}"]\n' for key in ("psk_file", "suites")),
         f'{GOOD}"{_SECRET}" = 1\n',
         f'{GOOD}allow_in = ["{_SECRET}", ["{_SECRET}"]]\n',
-        f'{GOOD}deny_in = ["command:{_SECRET}"]\n',
+        f'{GOOD}allow_in = ["command:{_SECRET}"]\n',
         f'{GOOD}rate_in = {{ "{_SECRET}" = 1 }}\n',
         f'{GOOD}rate_in = {{ ATTITUDE = {{ "{_SECRET}" = 1 }} }}\n',
         *(f'{key} = "{_SECRET}"\n{GOOD}' for key in ("private_key", "control_socket", "link")),

@@ -119,8 +119,7 @@ async def test_it_receives_only_what_its_role_allows(stage: Stage) -> None:
 CAMERA_POLICY: dict[str, Any] = {
     "system_ids": [1],
     "allow_in": ["heartbeat", "payload-reports", "COMMAND_ACK"],
-    "allow_out": ["heartbeat", "COMMAND_LONG", "camera"],
-    "deny_out": ["MAV_CMD_COMPONENT_ARM_DISARM"],
+    "allow_out": ["heartbeat", "MAV_CMD_IMAGE_START_CAPTURE", "camera"],
     "ground_station": False,
 }
 

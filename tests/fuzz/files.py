@@ -34,7 +34,7 @@ WORDS: Final = tuple(
         *("[link]\n", "[[peer]]\n", "\n[peer]\n", "\n[endpoint]\n", "[[endpoint]]\n", "[routing]\n"),
         *("[recording]\n", "[log]\n", "[peer]\n", "[endpoint]\n"),
         *("name = ", "public_key = ", "addresses = ", "url = ", "suites = ", "system_ids = ", "role = ", "listen = "),
-        *("psk_file = ", "tag_bits = ", "rate_in = {", "allow_in = [", "deny_out = [", "keepalive_s = "),
+        *("psk_file = ", "tag_bits = ", "rate_in = {", "allow_in = [", "allow_out = [", "keepalive_s = "),
         *("budget_bits_s = ", "true", "nan", "inf", "-1", "1e999", "9" * 40, '"', "'''", "[[", "{", "}", "]"),
         *("\n", ","),
         *("=", "\\u0000", "\0", "1979-05-27T07:32:00Z", "udpin:", "udpout:[::]:1", "serial:/dev/x:1", "tcpin:"),

@@ -179,8 +179,8 @@ POLICIES: Final[tuple[dict[str, object], ...]] = (
     {"system_ids": [1, 2, 3], "allow_in": ["telemetry", "HEARTBEAT", "30", "MAV_CMD_NAV_TAKEOFF"], "mavlink1": False},
     {
         "system_ids": "all",
-        "deny_in": ["MAV_CMD_DO_FLIGHTTERMINATION"],
-        "deny_out": ["files"],
+        "allow_in": ["mission", "files-read"],
+        "rate_out": {"files": 0},
         "rate_in": {"ATTITUDE": 2},
     },
     {"system_ids": [6], "role": "operator", "ground_station": False},

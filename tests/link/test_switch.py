@@ -158,9 +158,9 @@ def test_a_new_rule_holds_for_the_next_frame(stage: Stage) -> None:
         return stage.delivered()
 
     assert delivered() == (0, 1, 1)
-    stage.switch.set_policy(stage.b.port, policy(deny_out=["ATTITUDE"]))
+    stage.switch.set_policy(stage.b.port, policy(rate_out={"ATTITUDE": 0}))
     assert (delivered(), delivered()) == ((0, 0, 1), (0, 0, 1))
-    assert stage.withheld == [("b", Refusal.MESSAGE_NOT_ALLOWED)] * 2
+    assert stage.withheld == [("b", Refusal.RATE_LIMITED)] * 2
     stage.switch.set_policy(stage.b.port, policy())
     assert delivered() == (0, 1, 1)
     stage.switch.set_policy(stage.a.port, policy(system_ids=[7]))
@@ -222,7 +222,7 @@ def test_refused_frame_does_not_make_the_same_frame_of_another_port_a_duplicate(
     scene.switch.remove(scene.a.port)
     scene.a = Client("a", StreamPort)
     scene.switch.add(scene.a.port, policy())
-    scene.switch.set_policy(scene.b.port, policy(role="operator", system_ids=[255], deny_in=["SET_MODE"]))
+    scene.switch.set_policy(scene.b.port, policy(role="operator", system_ids=[255], rate_in={"SET_MODE": 0}))
     beat = made(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3), 255)
     (opening,) = split_datagram(opening_before(beat.raw), SplitCounters())
     scene.forward(scene.b.port, [opening, beat], 1.0)

@@ -125,16 +125,16 @@ def test_key_of_another_daemon_is_printed_whole(tmp_path: Path, section: str, ti
 
 _POLICIES: dict[str, dict[str, object]] = {
     **{role: {"role": role} for role in ROLES},
-    "all but commands": {"role": "all", "deny_in": ["commands"], "deny_out": ["commands", "shell"]},
-    "nothing": {"allow_in": ["all"], "deny_in": ["all"], "allow_out": []},
+    "all but commands": {"role": "all", "rate_in": {"commands": 0}, "rate_out": {"commands": 0, "shell": 0}},
+    "nothing": {"allow_in": [], "allow_out": []},
     "a mission's half": {
         "allow_in": ["mission-reads", "PING", "PARAM_SET"],
-        "deny_in": ["MISSION_ACK"],
+        "rate_in": {"MISSION_ACK": 0},
         "allow_out": ["all"],
     },
     "some of telemetry": {
         "allow_in": ["telemetry"],
-        "deny_in": ["position", "STATUSTEXT", "RAW_IMU"],
+        "rate_in": {"position": 0, "STATUSTEXT": 0, "RAW_IMU": 0},
         "allow_out": ["files-read"],
     },
 }

@@ -22,6 +22,7 @@ from uavlinkd.config import schema
 from uavlinkd.config.model import ConfigError, Problem
 from uavlinkd.core.certificates import MemberRole
 from uavlinkd.core.crypto import Secret, x25519_public_key
+from uavlinkd.mavlink.policy.settings import INSTEAD_OF_DENIAL
 
 
 class Values(NamedTuple):
@@ -255,6 +256,7 @@ _REMOVED = {
         "to change a key, write the new public key into the other ends' files, restart the daemon whose key it is,"
         " and reload the others at the same time; in a fleet, `uavlinkd fleet rotate NAME` writes the files",
     ),
+    **dict.fromkeys(("deny_in", "deny_out"), INSTEAD_OF_DENIAL),
     "metrics": "delete [metrics]; `uavlinkd web` serves http://127.0.0.1:8790/metrics",
 }
 """Keys and sections that files of earlier versions may have."""

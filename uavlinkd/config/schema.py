@@ -304,9 +304,7 @@ class PolicySection(Section):
     role: Any = Field(default=None, examples=['"swarm-member"'])
     system_ids: Any = Field(default=None, examples=["[2]"])
     allow_in: Any = _MESSAGES
-    deny_in: Any = _MESSAGES
     allow_out: Any = _MESSAGES
-    deny_out: Any = _MESSAGES
     rate_in: Any = _RATES
     rate_out: Any = _RATES
     mavlink1: Any = Field(default=None, examples=["false"])

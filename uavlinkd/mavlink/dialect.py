@@ -2,7 +2,7 @@
 
 `dialect.json` has the numbers of each message and command: `tests.mavlink.dialect_generate` writes it.
 
-A *group* is a tuple of message names that a policy can allow or deny by one word. Groups may share messages.
+A *group* is a tuple of message names that a policy can allow by one word. Groups may share messages.
 Each message of the dialect is in at least one group, and in ``all``.
 
 Groups follow the effect of a message on an autopilot. This matters for messages with two uses: DISTANCE_SENSOR is
@@ -160,9 +160,11 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
         "OPEN_DRONE_ID_SYSTEM OPEN_DRONE_ID_OPERATOR_ID OPEN_DRONE_ID_MESSAGE_PACK OPEN_DRONE_ID_ARM_STATUS "
         "OPEN_DRONE_ID_SYSTEM_UPDATE"
     ),
-    # Messages that carry a MAV_CMD to execute now or to cancel, the older SET_MODE, and the answer to them.
+    # Messages that carry a MAV_CMD to execute now or to cancel, the answer to them, and messages that do what a
+    # command does: the mode, the current mission item, home and origin.
     "commands": _names(
-        "COMMAND_LONG COMMAND_INT COMMAND_ACK COMMAND_CANCEL SET_MODE COMMAND_INT_STAMPED COMMAND_LONG_STAMPED"
+        "COMMAND_LONG COMMAND_INT COMMAND_ACK COMMAND_CANCEL SET_MODE COMMAND_INT_STAMPED COMMAND_LONG_STAMPED "
+        "MISSION_SET_CURRENT SET_HOME_POSITION SET_GPS_GLOBAL_ORIGIN"
     ),
     # A vehicle's answers to an operator: commands, parameters, missions, logs.
     "answers": _names(
@@ -183,12 +185,11 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     ),
     # Requests for parameters only. Not OSD_PARAM_SHOW_CONFIG: one for screen 5 ends ArduCopter 4.7.
     "parameter-reads": _names(_PARAMETER_READS),
-    # Missions, fences, rally points, home and origin, in both directions.
+    # Transfers of missions, fences and rally points, and reports of them, home and origin, in both directions.
     "mission": _names(
-        f"{_MISSION_READS} MISSION_WRITE_PARTIAL_LIST MISSION_ITEM MISSION_SET_CURRENT MISSION_CURRENT MISSION_COUNT "
+        f"{_MISSION_READS} MISSION_WRITE_PARTIAL_LIST MISSION_ITEM MISSION_CURRENT MISSION_COUNT "
         "MISSION_CLEAR_ALL MISSION_ITEM_REACHED MISSION_ITEM_INT MISSION_CHECKSUM SAFETY_SET_ALLOWED_AREA "
-        "SAFETY_ALLOWED_AREA FENCE_POINT FENCE_STATUS RALLY_POINT SET_HOME_POSITION HOME_POSITION "
-        "SET_GPS_GLOBAL_ORIGIN GPS_GLOBAL_ORIGIN"
+        "SAFETY_ALLOWED_AREA FENCE_POINT FENCE_STATUS RALLY_POINT HOME_POSITION GPS_GLOBAL_ORIGIN"
     ),
     # Requests to read a mission only.
     "mission-reads": _names(_MISSION_READS),
@@ -244,6 +245,8 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     # Reading files and logs only: the reading requests of FILE_TRANSFER_PROTOCOL and their answers
     # (`policy.settings.READING_OPCODES`).
     "files-read": _names(_FILES_READ),
+    # The answers to a file transfer, without its requests.
+    "file-answers": ("FILE_TRANSFER_PROTOCOL",),
     # Bytes for a shell, a serial port, a bus or other software: a policy cannot inspect their effect.
     "shell": _names(
         "SERIAL_CONTROL TUNNEL V2_EXTENSION CAN_FRAME CANFD_FRAME CAN_FILTER_MODIFY DEVICE_OP_READ "

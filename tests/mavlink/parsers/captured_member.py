@@ -31,7 +31,7 @@ CAST: Final[Mapping[str, Mapping[str, object]]] = {
     "other member": {"role": "swarm-member", "system_ids": [3]},
     "vehicle": {"role": "vehicle", "system_ids": [2]},
     "observer": {"role": "observer", "system_ids": [200], "allow_in": ["REQUEST_EVENT"]},
-    "operator": {"role": "operator", "system_ids": [255], "deny_in": ["MAV_CMD_DO_FLIGHTTERMINATION"]},
+    "operator": {"system_ids": [255], "allow_in": ["heartbeat", "files", "parameters"], "allow_out": ["all"]},
     "operator without MAVLink 1": {"role": "operator", "system_ids": [255], "mavlink1": False},
     "private dialect": {"role": "swarm-member", "system_ids": [7], "allow_in": [54321, 150]},
     "everything": EVERYTHING,
@@ -225,7 +225,7 @@ def attacks_on(dialect: str) -> tuple[MemberAttack, ...]:
             for goal in GOALS
         ),
         legal_lengths(observer),
-        signed_unknown("operator: denied command", CAST["operator"], GROUND, operator, file, terminate()),
+        signed_unknown("operator: a command", CAST["operator"], GROUND, operator, file, terminate()),
         signed_unknown("vehicle: command to the ground station", CAST["vehicle"], MEMBER, vehicle, file, arm_station),
         signed_unknown(
             "no policy: SETUP_SIGNING", CAST["everything"], GROUND - 1, operator, file, setup_signing(GROUND)

@@ -16,7 +16,7 @@ from uavlinkd.mavlink.policy.gate import Refusal
 
 LETS_UNKNOWN_PASS: Final = frozenset({"private dialect"})
 """For these every CRC_EXTRA counts."""
-CLIENTS: Final[Sequence[Mapping[str, object]]] = ({}, {"deny_out": ["HEARTBEAT", "MAV_CMD_COMPONENT_ARM_DISARM"]})
+CLIENTS: Final[Sequence[Mapping[str, object]]] = ({}, {"rate_out": {"HEARTBEAT": 0}})
 """The policies of the endpoints."""
 STARTS: Final = (0xFD, 0xFE)
 _MOST_FRAMES: Final = 6

@@ -23,7 +23,7 @@ _GOALS = ("flight termination", "forced arming", "SETUP_SIGNING", "SET_MODE", "a
 BEFORE: dict[str, frozenset[str]] = {
     **{f"observer: {goal}, {how}": _RESUMES for goal in _GOALS for how in ("signed", "checksum")},
     "observer: legal lengths": _MAVLINK1_TOO | _OF_MAVLINK1,
-    "operator: denied command": _RESUMES,
+    "operator: a command": _RESUMES,
     "vehicle: command to the ground station": _RESUMES,
     "no policy: SETUP_SIGNING": _RESUMES,
     "vehicle: restart in MAVLink 1": _MAVLINK1_TOO,

@@ -63,12 +63,11 @@ def passing(gate: Gate) -> set[str]:
     return {name for name, msgid in ID.items() if gate.check(blank(msgid), 0.0) is None}
 
 
-@pytest.mark.parametrize("data", [{}, {"deny_in": ["shell"]}, {"role": "all", "system_ids": "all"}])
+@pytest.mark.parametrize("data", [{}, {"role": "all", "system_ids": "all"}])
 def test_open_policy_passes_everything_but_signing_keys(data: dict[str, object]) -> None:
     """The wire to a local client is trusted: an endpoint needs no role and no list. A peer may have role = "all"."""
     made = Policy(data, is_local="role" not in data)
-    denied = {name for group in data.get("deny_in", ()) for name in GROUPS[group]}  # type: ignore[attr-defined]
-    assert passing(made.incoming) == set(ID) - {"SETUP_SIGNING"} - denied
+    assert passing(made.incoming) == set(ID) - {"SETUP_SIGNING"}
     assert passing(made.outgoing) == set(ID) - {"SETUP_SIGNING"}
     for gate in (made.incoming, made.outgoing):
         for one in (raw_frame(0x123456, b"x"), heartbeat(version=1), heartbeat(kind=GCS, system=77)):
@@ -96,17 +95,9 @@ def test_foreign_system_is_refused() -> None:
 
 def test_only_what_is_allowed_passes_in_its_direction() -> None:
     """An allow list defines all that passes: names and groups add up. The other direction has its own."""
-    made = compiled({"allow_in": ["position", "STATUSTEXT"], "deny_out": ["ATTITUDE"]})
+    made = compiled({"allow_in": ["position", "STATUSTEXT"], "rate_out": {"ATTITUDE": 0}})
     assert passing(made.incoming) == {*GROUPS["position"], "STATUSTEXT"}
     assert passing(made.outgoing) == set(ID) - {"ATTITUDE", "SETUP_SIGNING"}
-
-
-def test_denial_overrides_everything() -> None:
-    """Deny wins over allow, over a role, and over `all`."""
-    for allow in ({"allow_in": ["all"]}, {"allow_in": ["ATTITUDE"]}, {"allow_in": [30]}, {"role": "vehicle"}):
-        for deny in (["ATTITUDE"], ["telemetry"], [30], ["30"], ["all"]):
-            assert incoming(**allow, deny_in=deny).check(attitude(), 0.0) is Refusal.MESSAGE_NOT_ALLOWED
-    assert incoming(role="vehicle", deny_in=["telemetry"]).check(blank("PARAM_VALUE"), 0.0) is None
 
 
 @pytest.mark.parametrize(
@@ -123,16 +114,6 @@ def test_allowed_command_passes_alone(entry: str) -> None:
         assert gate.check(one, 0.0) is Refusal.MESSAGE_NOT_ALLOWED
 
 
-def test_denied_command_is_refused_in_every_carrier() -> None:
-    """In every command message, cancellation, mission item and stamped command; others pass."""
-    gate = incoming(deny_in=["MAV_CMD_DO_FLIGHTTERMINATION"])
-    carriers = {msgid: row[6] for msgid, row in MESSAGES.items() if row[6] is not None}
-    assert len(carriers) == 7
-    for msgid, at in carriers.items():
-        for number, verdict in ((TERMINATE, Refusal.COMMAND_NOT_ALLOWED), (TAKEOFF, None)):
-            assert gate.check(raw_frame(msgid, bytes(at) + number.to_bytes(2, "little") + b"\1\1"), 0.0) is verdict
-
-
 def test_truncated_command_is_read_as_receivers_read_it() -> None:
     """Truncated bytes of a command count as zeros, as at the receiver."""
     gate = incoming(allow_in=["command:185", "command:0"])
@@ -143,71 +124,54 @@ def test_truncated_command_is_read_as_receivers_read_it() -> None:
         (bytes(28) + b"\xb9\1", Refusal.COMMAND_NOT_ALLOWED),
     ):
         assert gate.check(raw_frame(76, payload), 0.0) is verdict
-    truncated = raw_frame(76, bytes(28) + b"\xb9")
-    assert incoming(deny_in=["command:185"]).check(truncated, 0.0) is Refusal.COMMAND_NOT_ALLOWED
-
-
-def test_denied_command_is_denied_in_its_other_form() -> None:
-    """Messages with the effect of a command are denied with it: SET_MODE is DO_SET_MODE."""
-    assert len(gates.SAME_AS_COMMAND) == 17  # all that are listed: the dialect has them
-    for msgid, number in gates.SAME_AS_COMMAND.items():
-        gate = incoming(deny_in=[f"command:{number}"])
-        assert gate.check(blank(msgid), 0.0) is Refusal.COMMAND_NOT_ALLOWED
-        assert gate.check(attitude(), 0.0) is None
-
-
-@pytest.mark.parametrize(
-    ("denied", "others"),
-    [
-        ("MAV_CMD_COMPONENT_ARM_DISARM", {"MAV_CMD_DO_AUX_FUNCTION"}),
-        ("MAV_CMD_DO_SET_MODE", {"MAV_CMD_DO_AUX_FUNCTION", "MAV_CMD_DO_SET_STANDARD_MODE"}),
-        ("MAV_CMD_DO_CHANGE_ALTITUDE", {"MAV_CMD_GUIDED_CHANGE_ALTITUDE"}),
-        ("MAV_CMD_GUIDED_CHANGE_ALTITUDE", {"MAV_CMD_DO_CHANGE_ALTITUDE"}),
-        ("MAV_CMD_NAV_TAKEOFF", set()),
-    ],
-)
-def test_commands_with_the_same_effect_are_denied_with_a_command(denied: str, others: set[str]) -> None:
-    """A policy that denies arming also denies it by the number of a switch; other commands stay alone."""
-    made = compiled({"role": "operator", "deny_in": [denied]})
-    refused = {name for name in COMMANDS if made.incoming.check(command_long(COMMANDS[name]), 0.0) is not None}
-    assert refused == {denied, *others}
-    text = {row.subject: row.incoming for row in made.describe()}["commands by number"]
-    assert all(name in text for name in refused), "what is denied is shown"
 
 
 @pytest.mark.parametrize("name", ["mission_item", "mission_item_int"])
 @pytest.mark.parametrize("version", [1, 2])
-@pytest.mark.parametrize("refused", [{2}, {3}, {2, 3}, set()])
-def test_mission_item_with_immediate_effect_is_a_command(name: str, version: int, refused: set[int]) -> None:
-    """ArduPilot flies to an item with `current` 2 immediately and climbs for 3: denied with these commands."""
+@pytest.mark.parametrize("allowed", [{2}, {3}, {2, 3}, set()])
+def test_mission_item_with_immediate_effect_is_a_command(name: str, version: int, allowed: set[int]) -> None:
+    """ArduPilot flies to an item with `current` 2 immediately and climbs for 3: that needs these commands."""
     commands = {2: "MAV_CMD_DO_REPOSITION", 3: "MAV_CMD_DO_CHANGE_ALTITUDE"}
-    gate = incoming(deny_in=["MAV_CMD_NAV_TAKEOFF", *(commands[current] for current in refused)])
+    gate = incoming(allow_in=["heartbeat", "mission", *(commands[current] for current in allowed)])
     for current in (0, 1, 2, 3, 4, 255):
         # It ends in zeros, which MAVLink 2 truncates.
         message = getattr(mavlink, f"MAVLink_{name}_message")(1, 1, 7, 3, 16, current, *[0] * 8)
         verdict = gate.check(frame(message, version=version), 0.0)
-        assert verdict is (Refusal.COMMAND_NOT_ALLOWED if current in refused else None), current
+        assert verdict is (Refusal.COMMAND_NOT_ALLOWED if current in {2, 3} - allowed else None), current
 
 
 def test_mission_item_is_read_where_its_sender_wrote() -> None:
-    """A truncated field is 0, and no byte of the checksum is read for it; an unreadable item is refused."""
-    gate = incoming(deny_in=["MAV_CMD_DO_REPOSITION", "MAV_CMD_DO_CHANGE_ALTITUDE"])
+    """A truncated field is 0, and no byte of the checksum is read for it."""
+    gate = incoming(allow_in=["mission"])
     for msgid in (ID["MISSION_ITEM"], ID["MISSION_ITEM_INT"]):
         for length in range(1, 36):
             for fill in (1, 2, 3):
                 assert gate.check(raw_frame(msgid, bytes(length - 1) + bytes([fill])), 0.0) is None, length
         whole = bytes(35) + b"\2"
-        for one in (raw_frame(msgid, whole), raw_frame(msgid, whole + b"\1\1"), foreign(msgid, bytes(36))):
+        for one in (raw_frame(msgid, whole), raw_frame(msgid, whole + b"\1\1")):
             assert gate.check(one, 0.0) is Refusal.COMMAND_NOT_ALLOWED
+        for entry in ("commands", "COMMAND_LONG", 75, "all"):
+            assert incoming(allow_in=["mission", entry]).check(raw_frame(msgid, whole), 0.0) is None
 
 
-def test_commands_that_cannot_be_read_are_refused_where_any_is_denied() -> None:
-    """Another definition of COMMAND_LONG, or five commands in one message, could contain the denied one."""
-    unreadable = [foreign(76, bytes(28) + b"\x16\0\1\1"), raw_frame(332, b"\1")]
-    denial = {"deny_in": ["MAV_CMD_DO_FLIGHTTERMINATION"]}
-    assert [incoming().check(one, 0.0) for one in unreadable] == [None, None]
-    assert [incoming(**denial).check(one, 0.0) for one in unreadable] == [Refusal.COMMAND_NOT_ALLOWED] * 2
-    assert incoming(allow_in=[76], **denial).check(unreadable[0], 0.0) is Refusal.COMMAND_NOT_ALLOWED
+# What a receiver executes when the message arrives (ArduPilot's and PX4's handlers), and the group that says so.
+AT_ONCE = {
+    "commands": "SET_MODE MISSION_SET_CURRENT SET_HOME_POSITION SET_GPS_GLOBAL_ORIGIN COMMAND_LONG COMMAND_INT",
+    "parameters": "PARAM_SET PARAM_EXT_SET PARAM_MAP_RC SET_MAG_OFFSETS",
+    "setpoints": "SET_ATTITUDE_TARGET SET_POSITION_TARGET_LOCAL_NED SET_POSITION_TARGET_GLOBAL_INT",
+    "manual": "MANUAL_CONTROL RC_CHANNELS_OVERRIDE",
+    "streams": "REQUEST_DATA_STREAM",
+    "camera": "DIGICAM_CONFIGURE DIGICAM_CONTROL",
+    "gimbal": "MOUNT_CONFIGURE MOUNT_CONTROL GIMBAL_MANAGER_SET_ATTITUDE GIMBAL_MANAGER_SET_PITCHYAW",
+    "transponder": "UAVIONIX_ADSB_OUT_CONTROL",
+}
+
+
+def test_no_group_for_transfers_or_reports_acts_at_once() -> None:
+    """Such a message is in the group that names its effect, and in no other but that of urgent ones."""
+    for group, names in AT_ONCE.items():
+        for name in names.split():
+            assert {other for other, members in GROUPS.items() if name in members} - {"urgent"} == {group}, name
 
 
 def test_unknown_message_passes_by_all_or_by_number_only() -> None:
@@ -215,7 +179,6 @@ def test_unknown_message_passes_by_all_or_by_number_only() -> None:
     unknown = raw_frame(0xABCDE, b"x")
     for allowed in ("all", 0xABCDE, str(0xABCDE)):
         assert incoming(allow_in=[allowed]).check(unknown, 0.0) is None
-    assert incoming(deny_in=[0xABCDE]).check(unknown, 0.0) is Refusal.MESSAGE_NOT_ALLOWED
     for role in ROLES:
         assert incoming(role=role).check(unknown, 0.0) is (None if role == "all" else Refusal.UNKNOWN_MESSAGE)
 
@@ -228,7 +191,6 @@ def test_name_allows_the_dialects_definition_only() -> None:
             verdicts = {one.header.is_known: gate.check(one, 0.0) for one in order}
             assert verdicts == {True: None, False: Refusal.UNKNOWN_MESSAGE}
     assert incoming(allow_in=[30]).check(foreign(30), 0.0) is None
-    assert incoming(deny_in=["ATTITUDE"]).check(foreign(30), 0.0) is Refusal.MESSAGE_NOT_ALLOWED
 
 
 def grown(one: Frame, version: int) -> Frame:
@@ -243,7 +205,7 @@ def test_extension_fields_change_no_verdict(role: str) -> None:
     frames = [blank(msgid) for msgid, row in MESSAGES.items() if row[3] < 255]
     frames += [command_long(TAKEOFF), command_long(TERMINATE), command_int(TERMINATE), mission_item(TAKEOFF)]
     frames += [heartbeat(), heartbeat(kind=GCS)]
-    gate = compiled({"role": role, "deny_in": ["MAV_CMD_DO_FLIGHTTERMINATION"]}).incoming
+    gate = compiled({"role": role}).incoming
     for one in frames:
         verdicts = [gate.permits(grown(one, version)) for version in (1, 2)[one.header.msgid > 255 :]]
         assert set(verdicts) == {gate.permits(one)}, one.header
@@ -399,18 +361,15 @@ frames = st.sampled_from(
 )
 
 
-@given(allow=st.lists(entries, max_size=4), deny=st.lists(entries, max_size=3), more=entries, one=frames)
+@given(allow=st.lists(entries, max_size=4), more=entries, one=frames)
 @settings(max_examples=400)
-def test_lists_are_monotonic(allow: list[Any], deny: list[Any], more: Any, one: Frame) -> None:
-    """One more allowed entry never refuses a frame, and one more denied entry never passes one."""
-    before = incoming(allow_in=allow, deny_in=deny).check(one, 0.0)
-    wider = incoming(allow_in=[*allow, more], deny_in=deny).check(one, 0.0)
-    narrower = incoming(allow_in=allow, deny_in=[*deny, more]).check(one, 0.0)
+def test_lists_are_monotonic(allow: list[Any], more: Any, one: Frame) -> None:
+    """One more allowed entry never refuses a frame."""
+    gate = incoming(allow_in=allow)
+    before = gate.check(one, 0.0)
+    wider = incoming(allow_in=[*allow, more]).check(one, 0.0)
     if before is None:
         assert wider is None
-    else:
-        assert narrower is not None
-    if "all" in deny or not allow or one.header.msgid == 256:
+    if not allow or one.header.msgid == 256:
         assert before is not None
-    gate = incoming(allow_in=allow, deny_in=deny)
     assert [gate.check(one, 0.0) for _ in range(3)] == [before] * 3

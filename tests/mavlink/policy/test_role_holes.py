@@ -60,7 +60,7 @@ def test_what_may_go_out_may_be_requested() -> None:
     """The rule follows the lists of the file. A role that has all commands has no such limit."""
     more = Policy({**OBSERVER, "allow_out": ["UAVIONIX_ADSB_OUT_CFG"]}).incoming
     assert more.permits(request(ADSB_OUT_CFG))
-    fewer = Policy({**OBSERVER, "deny_out": ["HOME_POSITION"]}).incoming
+    fewer = Policy({**OBSERVER, "rate_out": {"HOME_POSITION": 0}}).incoming
     assert not fewer.permits(request(ID["HOME_POSITION"]))
     operator = Policy({"role": "operator", "system_ids": [200]}).incoming
     assert operator.permits(request(ADSB_OUT_CFG))

@@ -217,7 +217,7 @@ class DaemonStage(Stage):
         if self._silent:
             rules["system_ids"] = [self.names.index(other) + 1]
         if {one, other} & self._silent:
-            rules["deny_out"] = ["ATTITUDE", "HEARTBEAT"]
+            rules["rate_out"] = {"ATTITUDE": 0, "HEARTBEAT": 0}
         return rules
 
     async def close(self) -> None:

@@ -2,11 +2,11 @@
 
 *In* is the direction from the peer or endpoint, *out* the direction to it. ``config/README.md`` has the keys and the
 entries of lists. A peer's policy fails closed: it needs `system_ids`, and a role or both `allow_in` and `allow_out`.
-All keys are optional for a local endpoint, whose wire is trusted. The entries of a list add to those of the role. A
-denied entry is denied even if another entry allows it.
+All keys are optional for a local endpoint, whose wire is trusted. The entries of a list add to those of the role.
 
-An allowed command passes in COMMAND_LONG and COMMAND_INT. A denied command is refused in all messages that carry
-commands, and with it messages and commands with the same effect (`gate.SAME_AS_COMMAND`, `settings.DONE_BY`).
+An allowed command passes in COMMAND_LONG and COMMAND_INT. What a receiver executes at once belongs to its command: a
+mission item with a `current` of 2 or 3 passes only where that command does (`gate.DONE_AT_ONCE`), and the groups for
+transfers contain no message that acts at once.
 
 Each component has a rate of its own: with a common rate, an autopilot and its gimbal would silence each other. An
 incoming frame may name any component, so all components of a system together have SYSTEM_SHARE times the rate.
@@ -15,7 +15,7 @@ of repeated reports does not apply to its messages that are sent once: a missing
 
 A policy cannot inspect the content of files, shells, tunnels and raw buses. A message that the dialect does not know,
 or has in another definition, passes only if ``all`` or its number is allowed. No policy passes SETUP_SIGNING, which
-carries a signing key in clear.
+carries a signing key in clear, nor a request for a file with one (`secrets`).
 
 A message that is longer than the dialect's definition passes by the fields that the dialect has. Its checksum shows
 that these are where they were: what is behind them are extension fields of a newer definition. Extension fields are
@@ -26,16 +26,12 @@ update the daemon first. Frames that are hidden in them are found as in any payl
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from typing import Final, NamedTuple
+from collections.abc import Mapping
+from typing import NamedTuple
 
 from uavlinkd.mavlink import dialect
-from uavlinkd.mavlink.policy.alternatives import open_effects
-from uavlinkd.mavlink.policy.gate import REQUEST_MESSAGE, SAME_AS_COMMAND, Gate, Refusal
+from uavlinkd.mavlink.policy.gate import REQUEST_MESSAGE, Gate, Refusal
 from uavlinkd.mavlink.policy.settings import Direction, Rules, Settings, read_settings
-
-# Messages that can contain a command which a policy cannot inspect.
-OPAQUE: Final = (*dialect.GROUPS["shell"], "FILE_TRANSFER_PROTOCOL")
 
 
 class PolicyRow(NamedTuple):
@@ -68,7 +64,7 @@ class Policy:
         gates, rules = (self.incoming, self.outgoing), settings.rules.values()
         role = settings.role or "none"
         mavlink1 = _passes(settings.mavlink1)
-        unknown = (_passes(side.allows_all and not side.denies_all) for side in rules)
+        unknown = (_passes(side.allows_all) for side in rules)
         groups = dialect.GROUPS.items()
         return [
             PolicyRow("role", role, role),
@@ -87,46 +83,15 @@ def _warnings(settings: Settings, gates: Mapping[Direction, Gate]) -> list[str]:
         return ["no policy: it may send as any system, and any message but SETUP_SIGNING"]
     warnings = []
     if settings.role == dialect.ALL:
-        warnings.append('role = "all": it may send every message and command that no list denies')
+        warnings.append('role = "all": it may send every message and command')
     if settings.systems is None:
         warnings.append('system_ids is "all": it may send as any system, including the ground station')
     for direction, gate in gates.items():
         rules = settings.rules[direction]
-        if rules.denies_all:
-            continue
         if REQUEST_MESSAGE in rules.allowed_commands and gate.opposite.passes_nothing:
             warnings.append(
                 f"allow_{direction} has MAV_CMD_REQUEST_MESSAGE, but the other direction passes no message: every"
                 " request is refused; allow the answers there"
-            )
-        # A denied message with the effect of a command counts as that command.
-        same = {
-            SAME_AS_COMMAND[msgid]: dialect.name_of(msgid)
-            for msgid in sorted(rules.denied)
-            if msgid in SAME_AS_COMMAND
-        }
-        by_message = {
-            dialect.command_name(number): name for number, name in same.items() if number not in rules.denied_commands
-        }
-        for name, denied, still_open in open_effects(rules.denied_commands | set(same), gate.lets_act):
-            asked = ", ".join(by_message.get(command, command) for command in denied)  # as the file names them
-            warnings.append(
-                f"deny_{direction} refuses {asked}, but {name} stays possible by {', '.join(still_open)}:"
-                f" denial is best effort; to block the effect, write no role, and in allow_{direction} only what is"
-                " needed"
-            )
-        if not rules.denied_commands:
-            continue
-        allowed = (rules.allowed | rules.allowed_numbers) - rules.denied
-        through = [
-            name
-            for name in OPAQUE
-            if dialect.IDS[name] in allowed or (rules.allows_all and dialect.IDS[name] not in rules.denied)
-        ]
-        if through:
-            warnings.append(
-                f"deny_{direction} names commands that may still pass inside {', '.join(through)}: a policy cannot"
-                " inspect these messages"
             )
     return warnings
 
@@ -144,10 +109,10 @@ def _group_text(gate: Gate, members: tuple[str, ...]) -> str:
     else:
         text = f"only {', '.join(passing)}"
     conditions = {name: verdict for name, verdict in passing.items() if verdict is not None}
-    limited = [name for name, one in conditions.items() if one.only_commands is not None or one.never_commands]
-    reading = [name for name, one in conditions.items() if one.only_reads_files]
+    limited = [name for name, one in conditions.items() if one.only_commands is not None or one.never_current]
+    partly = [name for name, one in conditions.items() if one.only_opcodes is not None]
     text += f" (by command: {', '.join(limited)})" if limited else ""
-    return text + (f" (only reading: {', '.join(reading)})" if reading else "")
+    return text + (f" (not all requests: {', '.join(partly)})" if partly else "")
 
 
 def _passes(is_allowed: bool) -> str:
@@ -155,17 +120,8 @@ def _passes(is_allowed: bool) -> str:
 
 
 def _commands_text(rules: Rules) -> str:
-    return _lists_text(
-        *(map(dialect.command_name, sorted(n)) for n in (rules.allowed_commands, rules.denied_commands))
-    )
+    return ", ".join(map(dialect.command_name, sorted(rules.allowed_commands))) or "-"
 
 
 def _numbers_text(rules: Rules) -> str:
-    return _lists_text(
-        *(map(str, sorted(n)) for n in (rules.allowed_numbers, rules.denied.difference(dialect.MESSAGES)))
-    )
-
-
-def _lists_text(allowed: Iterable[str], denied: Iterable[str]) -> str:
-    texts = {"allowed": ", ".join(allowed), "denied": ", ".join(denied)}
-    return "; ".join(f"{verdict}: {text}" for verdict, text in texts.items() if text) or "-"
+    return ", ".join(map(str, sorted(rules.allowed_numbers))) or "-"

@@ -15,7 +15,8 @@ from uavlinkd.mavlink.flows import FlowKey, flow_key
 from uavlinkd.mavlink.frames import Frame, payload_bytes
 from uavlinkd.mavlink.headers import Header
 from uavlinkd.mavlink.payloads import HEARTBEAT, claims_to_be_ground_station
-from uavlinkd.mavlink.policy.settings import FILE_TRANSFER, MAX_MSGID, READING_OPCODES, Direction, Settings
+from uavlinkd.mavlink.policy.secrets import OPCODES_WITHOUT_PATH, names_secrets
+from uavlinkd.mavlink.policy.settings import FILE_TRANSFER, MAX_MSGID, Direction, Settings
 
 ANY_OTHER: Final = -1  # stands for every message beyond those that are counted by themselves
 # Limits of one policy in one direction:
@@ -26,7 +27,6 @@ BURST_S: Final = 0.5  # how much of a second's frames may come at once
 SYSTEM_SHARE: Final = 16  # what all components of a system may send of a message, in rates of one
 
 NAMED_COMMANDS: Final = frozenset(COMMANDS.values())
-COMMAND_CARRIERS: Final = frozenset(msgid for msgid, row in MESSAGES.items() if row[6] is not None)
 DIRECT_COMMANDS: Final = frozenset((IDS["COMMAND_LONG"], IDS["COMMAND_INT"]))
 
 # An autopilot answers these with hundreds of frames: components of a system share one rate.
@@ -36,31 +36,7 @@ REQUESTS_OF_LISTS: Final = frozenset((IDS["PARAM_REQUEST_LIST"], IDS["PARAM_EXT_
 # more than answer: PX4 adds parameters to its list if it is asked for UAVIONIX_ADSB_OUT_CFG.
 REQUEST_MESSAGE: Final = COMMANDS["MAV_CMD_REQUEST_MESSAGE"]
 
-# Messages that do what a command does.
-SAME_AS_COMMAND: Final[Mapping[int, int]] = {
-    IDS[message]: COMMANDS[f"MAV_CMD_{command}"]
-    for message, command in (
-        ("SET_MODE", "DO_SET_MODE"),
-        ("MISSION_SET_CURRENT", "DO_SET_MISSION_CURRENT"),
-        ("SET_HOME_POSITION", "DO_SET_HOME"),
-        ("REQUEST_DATA_STREAM", "SET_MESSAGE_INTERVAL"),
-        ("MOUNT_CONFIGURE", "DO_MOUNT_CONFIGURE"),
-        ("MOUNT_CONTROL", "DO_MOUNT_CONTROL"),
-        ("DIGICAM_CONFIGURE", "DO_DIGICAM_CONFIGURE"),
-        ("DIGICAM_CONTROL", "DO_DIGICAM_CONTROL"),
-        ("GIMBAL_MANAGER_SET_PITCHYAW", "DO_GIMBAL_MANAGER_PITCHYAW"),
-        ("GIMBAL_MANAGER_SET_ATTITUDE", "DO_GIMBAL_MANAGER_PITCHYAW"),
-        ("GIMBAL_MANAGER_SET_MANUAL_CONTROL", "DO_GIMBAL_MANAGER_PITCHYAW"),
-        ("STORM32_GIMBAL_MANAGER_CONTROL_PITCHYAW", "STORM32_DO_GIMBAL_MANAGER_CONTROL_PITCHYAW"),
-        ("AUTOPILOT_VERSION_REQUEST", "REQUEST_AUTOPILOT_CAPABILITIES"),
-        ("SET_GPS_GLOBAL_ORIGIN", "DO_SET_GLOBAL_ORIGIN"),
-        ("PARAM_SET", "DO_SET_PARAMETER"),
-        ("SET_MAG_OFFSETS", "PREFLIGHT_SET_SENSOR_OFFSETS"),
-        ("UAVIONIX_ADSB_OUT_CONTROL", "DO_ADSB_OUT_IDENT"),
-    )
-}
-
-# ArduPilot executes such a mission item at once, by the value of `current` and not by its command.
+# ArduPilot executes such a mission item at once, by the value of `current`: it belongs to that command.
 MISSION_ITEMS: Final = frozenset((IDS["MISSION_ITEM"], IDS["MISSION_ITEM_INT"]))
 CURRENT_IN_MISSION_ITEM: Final = 35  # offset in the payload of both
 DONE_AT_ONCE: Final[Mapping[int, int]] = {
@@ -68,11 +44,9 @@ DONE_AT_ONCE: Final[Mapping[int, int]] = {
     3: COMMANDS["MAV_CMD_DO_CHANGE_ALTITUDE"],
 }
 
-# Behind three bytes of target: sequence 2, session 1, opcode 1.
+# Behind three bytes of target: sequence 2, session 1, opcode 1, size 1, requested opcode 1, flags 2, offset 4, data.
 OPCODE_IN_FILE_TRANSFER: Final = 6
-
-# Carries five command numbers at once, which are not looked at: refused where any command is denied.
-CARRIES_MANY_COMMANDS: Final = frozenset({IDS["TRAJECTORY_REPRESENTATION_WAYPOINTS"]})
+DATA_IN_FILE_TRANSFER: Final = 15
 
 
 class Refusal(Reason):
@@ -101,13 +75,13 @@ class Refusal(Reason):
     )
     FILE_WRITE_NOT_ALLOWED = (
         "file_write_not_allowed",
-        "the file transfer writes, where the policy allows only reading",
-        "file writes",
+        "the file transfer writes, or requests anything, where the policy allows only reading or only answers",
+        "file requests not allowed",
     )
     SETUP_SIGNING = (
         "setup_signing",
-        "the message contains a MAVLink signing key in clear, which never crosses a link",
-        "with a signing key (SETUP_SIGNING)",
+        "the message contains a MAVLink signing key in clear, or requests a file with one, which never crosses",
+        "with a signing key, or a request for its file",
     )
     MAVLINK1_NOT_ALLOWED = ("mavlink1_not_allowed", "the policy does not allow MAVLink 1", "MAVLink 1 frames")
     GROUND_STATION_NOT_ALLOWED = (
@@ -138,15 +112,11 @@ class Condition:
 
     # None: any. Else a message may be requested only if it may pass in the other direction.
     only_commands: frozenset[int] | None = None
-    never_commands: frozenset[int] = frozenset()
     never_current: frozenset[int] = frozenset()  # values of a mission item's field
-    only_reads_files: bool = False
+    only_opcodes: frozenset[int] | None = None  # of a file transfer; None: any
+    protects_keys: bool = False  # a file transfer must not name a file of secrets
     refuses_ground_station: bool = False
     per_second: float | None = None
-
-    def takes_command(self, number: int | None) -> bool:
-        """Whether a frame with this command meets it."""
-        return (self.only_commands is None or number in self.only_commands) and number not in self.never_commands
 
 
 class Gate:
@@ -242,17 +212,16 @@ class Gate:
         Then a frame is valid by any CRC_EXTRA. If every frame may pass, the difference does not matter.
         """
         rules = self._rules
-        has_limits = rules.denied or rules.denied_commands or not (self._mavlink1 and self._ground_station)
-        passes_everything = rules.allows_all and not has_limits and self.systems is None
-        passes = rules.allows_all or bool(rules.allowed_numbers)
-        return passes and not rules.denies_all and not passes_everything
+        passes_everything = rules.allows_all and self._mavlink1 and self._ground_station and self.systems is None
+        return (rules.allows_all or bool(rules.allowed_numbers)) and not passes_everything
 
     @property
     def passes_nothing(self) -> bool:
         """Whether the rules allow no message at all, such as ``allow_in = []``."""
         rules = self._rules
-        allows = (rules.allows_all, rules.allowed, rules.allowed_numbers, rules.allowed_commands, rules.reads_files)
-        return rules.denies_all or not any(allows)
+        return not any(
+            (rules.allows_all, rules.allowed, rules.allowed_numbers, rules.allowed_commands, rules.opcodes)
+        )
 
     def may_speak_as(self, system: int) -> bool:
         """Whether frames of this system are let pass at all."""
@@ -281,64 +250,51 @@ class Gate:
         rules = self._rules
         if msgid == SETUP_SIGNING:
             return Refusal.SETUP_SIGNING
-        if rules.denies_all or msgid in rules.denied:
-            return Refusal.MESSAGE_NOT_ALLOWED
+        if self._rates.get(msgid) == 0:
+            return Refusal.RATE_LIMITED
         is_allowed = rules.allows_all or msgid in rules.allowed_numbers or (is_known and msgid in rules.allowed)
-        only_commands = None
-        only_reads_files = False
+        only_commands = only_opcodes = None
         if not is_allowed:
             if not is_known:
                 return Refusal.UNKNOWN_MESSAGE
-            only_reads_files = rules.reads_files and msgid == FILE_TRANSFER
-        if not is_allowed and not only_reads_files:
-            if msgid not in DIRECT_COMMANDS or not rules.allowed_commands:
+            if msgid == FILE_TRANSFER and rules.opcodes:
+                only_opcodes = rules.opcodes
+            elif msgid in DIRECT_COMMANDS and rules.allowed_commands:
+                only_commands = rules.allowed_commands
+            else:
                 return Refusal.MESSAGE_NOT_ALLOWED
-            only_commands = rules.allowed_commands
-        never_commands = never_current = frozenset[int]()
-        if rules.denied_commands:
-            cannot_be_read = msgid in CARRIES_MANY_COMMANDS or (msgid in COMMAND_CARRIERS and not is_known)
-            if cannot_be_read or SAME_AS_COMMAND.get(msgid) in rules.denied_commands:
-                return Refusal.COMMAND_NOT_ALLOWED
-            if msgid in COMMAND_CARRIERS:
-                never_commands = rules.denied_commands
-            if msgid in MISSION_ITEMS:
-                at_once = {value for value, command in DONE_AT_ONCE.items() if command in rules.denied_commands}
-                never_current = frozenset(at_once)
+        never_current = frozenset[int]()
+        if msgid in MISSION_ITEMS:
+            never_current = frozenset(
+                now for now, command in DONE_AT_ONCE.items() if not rules.allows_command(command)
+            )
         condition = Condition(
             only_commands,
-            never_commands,
             never_current,
-            only_reads_files=only_reads_files,
+            only_opcodes,
+            protects_keys=msgid == FILE_TRANSFER,
             refuses_ground_station=msgid == HEARTBEAT and not self._ground_station,
             per_second=self._rates.get(msgid),
         )
         return None if condition == _UNCONDITIONAL else condition
 
-    def lets_act(self, name: str) -> bool:
-        """Whether a frame of this message passes that changes something; with MAV_CMD_ in front, of this command."""
-        if not name.startswith("MAV_CMD_"):
-            verdict = self.decide(IDS[name], is_known=True)
-            return verdict is None or (isinstance(verdict, Condition) and not verdict.only_reads_files)
-        verdicts = (self.decide(msgid, is_known=True) for msgid in DIRECT_COMMANDS)
-        return any(
-            verdict is None or (isinstance(verdict, Condition) and verdict.takes_command(COMMANDS[name]))
-            for verdict in verdicts
-        )
-
     def _breach(self, condition: Condition, frame: Frame) -> Refusal | None:
-        if not condition.takes_command(frame.header.command):
-            return Refusal.COMMAND_NOT_ALLOWED
-        is_request = condition.only_commands is not None and frame.header.command == REQUEST_MESSAGE
-        if is_request and not self._may_be_requested(frame):
-            return Refusal.COMMAND_NOT_ALLOWED
+        if condition.only_commands is not None:
+            command = frame.header.command
+            if command not in condition.only_commands:
+                return Refusal.COMMAND_NOT_ALLOWED
+            if command == REQUEST_MESSAGE and not self._may_be_requested(frame):
+                return Refusal.COMMAND_NOT_ALLOWED
         if condition.never_current:
             current = int.from_bytes(payload_bytes(frame, CURRENT_IN_MISSION_ITEM, 1), "little")
             if current in condition.never_current:
                 return Refusal.COMMAND_NOT_ALLOWED
-        if condition.only_reads_files:
+        if condition.protects_keys:
             opcode = int.from_bytes(payload_bytes(frame, OPCODE_IN_FILE_TRANSFER, 1), "little")
-            if opcode not in READING_OPCODES:
+            if condition.only_opcodes is not None and opcode not in condition.only_opcodes:
                 return Refusal.FILE_WRITE_NOT_ALLOWED
+            if opcode not in OPCODES_WITHOUT_PATH and names_secrets(payload_bytes(frame, DATA_IN_FILE_TRANSFER, 239)):
+                return Refusal.SETUP_SIGNING
         if condition.refuses_ground_station and claims_to_be_ground_station(frame):
             return Refusal.GROUND_STATION_NOT_ALLOWED
         return None

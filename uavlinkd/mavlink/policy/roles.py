@@ -30,7 +30,7 @@ class Role(NamedTuple):
 # Messages of a vehicle to its operator.
 _FROM_VEHICLE: Final = (
     *("heartbeat", "telemetry", "position", "traffic", "identification", "answers", "payload-reports"),
-    *("time", "FILE_TRANSFER_PROTOCOL", "RADIO", "RADIO_STATUS", "CELLULAR_STATUS", "LINK_NODE_STATUS"),
+    *("time", "file-answers", "RADIO", "RADIO_STATUS", "CELLULAR_STATUS", "LINK_NODE_STATUS"),
     *("UAVIONIX_ADSB_OUT_STATUS", "UAVIONIX_ADSB_TRANSCEIVER_HEALTH_REPORT"),
     "MAV_CMD_ACCELCAL_VEHICLE_POS",  # ArduPilot's "now put me on my left side", asked of the person
 )

@@ -10,40 +10,30 @@ from functools import lru_cache
 from typing import Final, Literal, NamedTuple
 
 from uavlinkd.mavlink import dialect
-from uavlinkd.mavlink.dialect import COMMANDS, SAID_ONCE
+from uavlinkd.mavlink.dialect import COMMANDS, IDS, SAID_ONCE
 from uavlinkd.mavlink.policy.roles import ROLES
 
 MAX_MSGID: Final = 0xFFFFFF
 MAX_COMMAND: Final = 0xFFFF
 MAX_SYSTEM: Final = 255
 
-KEYS: Final = (
-    *("role", "system_ids", "allow_in", "deny_in", "allow_out", "deny_out", "rate_in", "rate_out"),
-    *("mavlink1", "ground_station"),
+INSTEAD_OF_DENIAL: Final = (
+    "to stop a message, write it into rate_in or rate_out with a rate of 0; to keep out a command, write no role, and"
+    " in allow_in and allow_out only what is needed: most commands have others with the same effect"
 )
+"""What replaces the former keys ``deny_in`` and ``deny_out``."""
 
-# Commands with the same effect as another: a policy that denies a command denies these too. DO_AUX_FUNCTION has the
-# effect of a switch of the remote control (ArduPilot's RCx_OPTION): modes, arming, a stop.
-DONE_BY: Final[Mapping[int, frozenset[int]]] = {
-    COMMANDS[f"MAV_CMD_{name}"]: frozenset(COMMANDS[f"MAV_CMD_{other}"] for other in others.split())
-    for names, others in (
-        ("COMPONENT_ARM_DISARM DO_FLIGHTTERMINATION DO_PARACHUTE DO_FENCE_ENABLE", "DO_AUX_FUNCTION"),
-        ("NAV_LAND NAV_RETURN_TO_LAUNCH", "DO_AUX_FUNCTION"),
-        ("DO_SET_MODE", "DO_AUX_FUNCTION DO_SET_STANDARD_MODE"),
-        ("DO_SET_STANDARD_MODE", "DO_AUX_FUNCTION DO_SET_MODE"),
-        ("DO_CHANGE_ALTITUDE", "GUIDED_CHANGE_ALTITUDE"),
-        ("GUIDED_CHANGE_ALTITUDE", "DO_CHANGE_ALTITUDE"),
-    )
-    for name in names.split()
-}
+KEYS: Final = ("role", "system_ids", "allow_in", "allow_out", "rate_in", "rate_out", "mavlink1", "ground_station")
 
-FILES_READ: Final = "files-read"
-FILE_TRANSFER: Final = dialect.IDS["FILE_TRANSFER_PROTOCOL"]
+FILE_TRANSFER: Final = IDS["FILE_TRANSFER_PROTOCOL"]
+_COMMANDS: Final = frozenset((IDS["COMMAND_LONG"], IDS["COMMAND_INT"]))
 # MAVLink's MAV_FTP_OPCODE (https://mavlink.io/en/services/ftp.html). The others create, write, truncate, rename or
 # remove; a number outside the definition may have any effect.
 # In this order: TerminateSession, ResetSessions, ListDirectory, OpenFileRO, ReadFile, CalcFileCRC32, BurstReadFile;
 # ACK and NAK, of either kind of request.
 READING_OPCODES: Final = frozenset((1, 2, 3, 4, 5, 14, 15, 128, 129))
+ANSWERING_OPCODES: Final = frozenset((128, 129))
+_OPCODES: Final = {"files-read": READING_OPCODES, "file-answers": ANSWERING_OPCODES}
 
 
 class PolicyProblem(NamedTuple):
@@ -76,10 +66,15 @@ class Rules:
     allowed: frozenset[int]  # by name or group: the message as the dialect defines it
     allowed_numbers: frozenset[int]  # by number: in any definition
     allowed_commands: frozenset[int]
-    reads_files: bool  # whether READING_OPCODES of FILE_TRANSFER_PROTOCOL pass
-    denies_all: bool
-    denied: frozenset[int]  # in any definition
-    denied_commands: frozenset[int]
+    opcodes: frozenset[int]  # of FILE_TRANSFER_PROTOCOL, where only some of its requests or its answers pass
+
+    def allows_command(self, number: int) -> bool:
+        """Whether a command passes as a message of its own."""
+        return (
+            self.allows_all
+            or number in self.allowed_commands
+            or not _COMMANDS.isdisjoint(self.allowed | self.allowed_numbers)
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +101,7 @@ class _Entry(NamedTuple):
     messages: tuple[int, ...] = ()
     number: int | None = None
     command: int | None = None
-    reads_files: bool = False
+    opcodes: frozenset[int] = frozenset()  # the only ones of FILE_TRANSFER_PROTOCOL
 
 
 def read_settings(data: Mapping[str, object], *, is_local: bool) -> Settings:
@@ -120,7 +115,9 @@ def read_settings(data: Mapping[str, object], *, is_local: bool) -> Settings:
         problems.append(PolicyProblem(key, problem, remedy))
 
     for key in data:
-        if key not in KEYS:
+        if key in ("deny_in", "deny_out"):
+            report(key, "was removed", INSTEAD_OF_DENIAL)
+        elif key not in KEYS:
             report(str(key), "no such key", _did_you_mean(str(key), KEYS, f"the keys are {', '.join(KEYS)}"))
     role_name = data.get("role")
     role = ROLES.get(role_name) if isinstance(role_name, str) else None
@@ -134,9 +131,8 @@ def read_settings(data: Mapping[str, object], *, is_local: bool) -> Settings:
     presets: dict[Direction, tuple[str, ...] | None] = {"in": role and role.allow_in, "out": role and role.allow_out}
     for direction, preset in presets.items():
         allow = _entries(data, f"allow_{direction}", report)
-        deny = _entries(data, f"deny_{direction}", report)
         allows_all = is_local and preset is None and f"allow_{direction}" not in data
-        rules[direction] = _rules((*(preset or ()), *allow), deny, allows_all=allows_all)
+        rules[direction] = _rules((*(preset or ()), *allow), allows_all=allows_all)
         rates[direction] = _rates(data, f"rate_{direction}", report)
     if role is not None:
         rates["in"] = {**_rates({"rate_in": role.rate_in}, "rate_in", report), **rates["in"]}
@@ -174,22 +170,15 @@ def _check_is_complete(data: Mapping[str, object], report: Report) -> None:
 
 
 @lru_cache(maxsize=256)  # a fleet's peers mostly have the same lists, and share their rules
-def _rules(allow: tuple[str | int, ...], deny: tuple[str | int, ...], *, allows_all: bool) -> Rules:
+def _rules(allow: tuple[str | int, ...], *, allows_all: bool) -> Rules:
     allowed = [entry for entry in map(_entry, allow) if isinstance(entry, _Entry)]
-    # Reading files allows a part of FILE_TRANSFER_PROTOCOL; a list that denies reading denies the whole message.
-    by_name = (set(entry.messages) - ({FILE_TRANSFER} if entry.reads_files else set()) for entry in allowed)
-    denied = [entry for entry in map(_entry, deny) if isinstance(entry, _Entry)]
-    denied_messages = {msgid for entry in denied for msgid in entry.messages}
-    denied_commands = {entry.command for entry in denied if entry.command is not None}
+    by_name = (set(entry.messages) - ({FILE_TRANSFER} if entry.opcodes else set()) for entry in allowed)
     return Rules(
         allows_all=allows_all or any(entry.is_all for entry in allowed),
         allowed=frozenset[int]().union(*by_name),
         allowed_numbers=frozenset(entry.number for entry in allowed if entry.number is not None),
         allowed_commands=frozenset(entry.command for entry in allowed if entry.command is not None),
-        reads_files=any(entry.reads_files for entry in allowed),
-        denies_all=any(entry.is_all for entry in denied),
-        denied=frozenset(denied_messages | {entry.number for entry in denied if entry.number is not None}),
-        denied_commands=frozenset(denied_commands.union(*(DONE_BY.get(number, ()) for number in denied_commands))),
+        opcodes=frozenset[int]().union(*(entry.opcodes for entry in allowed)),
     )
 
 
@@ -211,7 +200,7 @@ def _entry(item: str | int) -> _Entry | PolicyProblem:
     members = dialect.GROUPS.get(item)
     if members is not None:
         ids = tuple(dialect.IDS[name] for name in members)
-        return _Entry(messages=ids, reads_files=item == FILES_READ)
+        return _Entry(messages=ids, opcodes=_OPCODES.get(item, frozenset()))
     known = (*dialect.GROUPS, *dialect.IDS)
     remedy = "write groups in small letters, messages in capitals, and an unknown message by its number"
     return PolicyProblem("", f"no such group or message: {item!r}", _did_you_mean(item, known, remedy))
@@ -290,11 +279,11 @@ def _rates(data: Mapping[str, object], key: str, report: Report) -> Mapping[int,
             continue
         if entry.command is not None or entry.is_all:
             report(f"{key}.{name}", "a rate is for messages", "name a message or a group")
-        if isinstance(rate, bool) or not isinstance(rate, (int, float)) or not math.isfinite(rate) or rate <= 0:
+        if isinstance(rate, bool) or not isinstance(rate, (int, float)) or not math.isfinite(rate) or rate < 0:
             report(
                 f"{key}.{name}",
                 f"{rate!r} is not a rate",
-                "write frames a second, above 0; to stop a message, deny it",
+                "write frames a second; 0 stops the message",
             )
             continue
         if entry.number is not None or name in dialect.IDS:
