@@ -116,6 +116,17 @@ def test_state_that_cannot_be_written(path: Path, cause: str, monkeypatch: pytes
     assert os.listdir(path.parent) == [path.name]
 
 
+def test_a_link_under_the_name_of_the_new_file_is_not_followed(path: Path) -> None:
+    """Another user of the folder points it at a file that only the daemon may write."""
+    other = path.with_name("other")
+    other.write_text("kept")
+    path.with_name(f".{path.name}.new").symlink_to(other)
+    state_file.write(path, AFTER)
+    assert other.read_text() == "kept"
+    assert start(path) == (AFTER, "")
+    assert not path.is_symlink()
+
+
 class PowerCut(BaseException):
     """No code runs after it."""
 
@@ -136,7 +147,7 @@ class Disk:
         open_file, replace = Path.open, Path.replace
 
         def opened(path: Path, mode: str) -> Any:
-            if mode == "wb":
+            if mode == "xb":
                 self._step()
             return open_file(path, mode)
 

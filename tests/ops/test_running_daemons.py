@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 from pathlib import Path
 from typing import Any
@@ -50,6 +51,33 @@ def daemons(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Daemons:
 def status(name: str, state: str = "up") -> dict[str, Any]:
     """The status of a daemon with one peer."""
     return status_of({"drone1": peer(state, public_key="A=")}, name=name)
+
+
+@pytest.mark.parametrize("command", ["status", "status --json", "peer list", "netcheck", "reload", "ping d"])
+@pytest.mark.parametrize("answer", [{}, {"frames_pass": 1, "peers": 7}, {"relays": [], "problems": 5, "paths": "x"}])
+def test_answer_of_another_form_ends_a_command_with_a_sentence(
+    daemons: Daemons, capsys: pytest.CaptureFixture[str], command: str, answer: dict[str, Any]
+) -> None:
+    """A daemon of another version, or one that an attacker replaced."""
+    daemons.add(answer)
+    main(command.split())
+    assert "Traceback" not in "".join(capsys.readouterr())
+
+
+def test_answer_does_not_act_on_the_terminal(daemons: Daemons, capsys: pytest.CaptureFixture[str]) -> None:
+    """Escape sequences, C1 controls and bidirectional overrides of a captured daemon are written as text."""
+    answer = json.loads(json.dumps(status("gs")).replace("drone1", "d\\u001b]0;x\\u0007\\u009b2J\\u202e"))
+    server = control.ControlServer(daemons.add(None).with_name("real.sock"), lambda request: answer)
+
+    async def shown() -> None:
+        await server.start()
+        await asyncio.to_thread(main, ["status", "--socket", str(daemons.folder / "real.sock")])
+        await server.stop()
+
+    asyncio.run(shown())
+    printed = "".join(capsys.readouterr())
+    assert r"\x1b]0" in printed
+    assert not set(printed) & {"\x1b", "\x07", "\x9b", "\u202e"}
 
 
 def test_several_daemons_are_shown_one_after_another(daemons: Daemons, capsys: pytest.CaptureFixture[str]) -> None:

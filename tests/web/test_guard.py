@@ -72,6 +72,7 @@ async def test_a_form_of_another_site_does_nothing(page: Served, origin: str | N
     "host",
     [
         *("attacker.example", "attacker.example:8790", "127.0.0.1.attacker.example", "localhost.attacker.example"),
+        *("[::1].attacker.example", "[::1", "[localhost]", "127.0.0.1:80.attacker.example", "localhost:x"),
         *("localhost.", "", "2130706433", "0x7f.0.0.1", "127.1", "links.example", "attacker.example#127.0.0.1"),
     ],
 )

@@ -5,8 +5,10 @@ from __future__ import annotations
 import asyncio
 import asyncio.sslproto
 import gc
+import os
 import socket
 import ssl
+import sys
 from asyncio import StreamReader, StreamWriter
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, ExitStack, asynccontextmanager, suppress
@@ -14,6 +16,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.needs import need
 from tests.tls_files import CERTIFICATE, TLS_KEY, write_tls_files
 from tests.waiting import PATIENCE_S, until
 from tests.web.served import PASSWORD, Events, Served, basic, is_answered, page_of, parsed
@@ -42,6 +45,18 @@ async def connected(page: Served, source: str = STRANGER) -> AsyncIterator[Conne
         yield reader, writer
     finally:
         writer.close()
+
+
+@pytest.fixture(autouse=True)
+def addresses_are_sources(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
+    """Addresses of loopback stand for other machines. Really one user has all of them."""
+    if "real_sources" not in request.fixturenames:
+        monkeypatch.setattr(server, "holder_of", lambda sock, sockaddr: sockaddr[0])
+
+
+@pytest.fixture
+def real_sources() -> None:
+    """Users of this machine are told apart as they are in service."""
 
 
 @asynccontextmanager
@@ -218,6 +233,43 @@ async def test_beyond_the_last_place_a_browser_is_refused(page: Served, monkeypa
             await first.next()
         await until_served(page)
         await first.next()
+
+
+_STREAMS = """
+import encodings.idna, os, socket, sys
+os.setgroups([])
+os.setuid(65534)
+host, port, request = sys.argv[1], int(sys.argv[2]), sys.argv[3].encode("latin-1")
+sockets = [socket.create_connection((host, port)) for _ in range(200)]
+for one in sockets:
+    try:
+        one.sendall(request)
+    except OSError:
+        pass
+print("sent", flush=True)
+sys.stdin.read()
+"""
+
+
+async def test_streams_of_one_local_user_leave_places_for_the_owner(page: Served, real_sources: None) -> None:
+    """200 streams of events of `nobody`, who may look too: the owner's page goes on, and another one begins."""
+    need(not os.geteuid(), "root, to run a process as another user")
+    request = page.request("/events").decode("latin-1")
+    arguments = (page.address.host, str(page.address.port), request)
+    async with page.events() as watching:
+        await watching.until(is_answered)
+        process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-c", _STREAMS, *arguments),
+            stdin=asyncio.subprocess.PIPE,
+            stdout=asyncio.subprocess.PIPE,
+        )
+        assert process.stdout is not None
+        assert await process.stdout.readline() == b"sent\n"
+        async with page.events() as another:
+            await another.until(is_answered)
+        await watching.next()
+        process.kill()
+        await process.wait()
 
 
 # Not HTTP, or HTTP of another kind.

@@ -6,7 +6,6 @@ and a checksum of the lines before.
 
 from __future__ import annotations
 
-import os
 from base64 import b64decode, b64encode
 from collections.abc import Mapping
 from contextlib import suppress
@@ -19,7 +18,7 @@ from uavlinkd.authority.trust import BulletinVerdict, Trust, is_same_member
 from uavlinkd.core.certificates import parse_certificate
 from uavlinkd.core.crypto import sha256
 from uavlinkd.core.drops import Drop
-from uavlinkd.system.folders import sync_folder
+from uavlinkd.system.folders import sync_folder, write_new
 
 _TITLE = b"uavlinkd fleet state 1"
 _MOST_BYTES = 2048  # of the file. The longest one has 1,150.
@@ -68,10 +67,7 @@ def write(path: Path, state: FleetState) -> None:
     """
     new = path.with_name(f".{path.name}.new")
     try:
-        with new.open("wb") as file:
-            file.write(_encode(state))
-            file.flush()
-            os.fsync(file.fileno())
+        write_new(new, _encode(state))
         new.replace(path)
     except OSError:
         with suppress(OSError):

@@ -13,7 +13,7 @@ from uavlinkd.config import keys
 from uavlinkd.config.load import load_config
 from uavlinkd.config.model import ConfigError
 from uavlinkd.fleet.manifest import FleetFileError, no_fleet
-from uavlinkd.system.folders import sync_folder
+from uavlinkd.system.folders import sync_folder, write_new
 from uavlinkd.system.terminal import printable
 
 
@@ -33,10 +33,7 @@ class FileChanges:
         new = path.with_name(f".{path.name}.new")
         self._make_folder(path.parent)
         self._steps.append((new, None))
-        with new.open("wb") as file:
-            file.write(text.encode())
-            file.flush()
-            os.fsync(file.fileno())
+        write_new(new, text.encode())
         try:
             if checked is not None:
                 load_config(new, checked)

@@ -11,7 +11,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
 
@@ -119,13 +119,26 @@ def _for_each(sockets: Sequence[Path], request: str, show: Callable[[dict[str, A
     worst = OK
     for answer in _answers(sockets, request):
         if not isinstance(answer, CommandError):
-            worst = max(worst, show(answer))
+            with _of_this_version():
+                worst = max(worst, show(answer))
         elif len(sockets) == 1:
             raise answer
         else:
             print(printable(str(answer)), file=sys.stderr)
             worst = FAILED
     return worst
+
+
+@contextmanager
+def _of_this_version() -> Iterator[None]:
+    """Raises CommandError where an answer lacks something, or has it in another form."""
+    try:
+        yield
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        raise CommandError(
+            f"the daemon's answer has another form than this version of uavlinkd expects ({type(error).__name__}):"
+            " restart the daemon, so that both are of one version"
+        ) from None
 
 
 # The commands.
@@ -163,14 +176,15 @@ def _watch(sockets: Sequence[Path]) -> int:
     with suppress(KeyboardInterrupt), Live(auto_refresh=False, screen=True, vertical_overflow="crop") as live:
         while True:
             answers = list(_answers(sockets, "status"))
-            passes = all(not isinstance(answer, CommandError) and answer["frames_pass"] for answer in answers)
-            screens = [
-                Text(str(answer), style="bold red")
-                if isinstance(answer, CommandError)
-                else render_status(answer, live.console.width)
-                for answer in answers
-            ]
-            live.update(Group(*screens), refresh=True)
+            with _of_this_version():
+                passes = all(not isinstance(answer, CommandError) and answer["frames_pass"] for answer in answers)
+                screens = [
+                    Text(str(answer), style="bold red")
+                    if isinstance(answer, CommandError)
+                    else render_status(answer, live.console.width)
+                    for answer in answers
+                ]
+                live.update(Group(*screens), refresh=True)
             time.sleep(WATCH_INTERVAL_S)
     return OK if passes else FAILED
 
@@ -183,9 +197,12 @@ def _reload(options: argparse.Namespace) -> int:
 
     socket = control_socket(options)
     answer = ask(socket, "reload", on_waiting=report_wait)
-    if answer["problems"]:
-        raise UsageError("\n".join(answer["problems"]))
-    print(printable(f"{answer.get('name', socket)} reloaded"))
+    with _of_this_version():
+        problems = "\n".join(answer["problems"])
+        name = str(answer.get("name", socket))
+    if problems:
+        raise UsageError(problems)
+    print(printable(f"{name} reloaded"))
     return OK
 
 
@@ -196,7 +213,8 @@ def _ping(options: argparse.Namespace) -> int:
     socket = control_socket(options)
     if options.count < 1:
         raise UsageError("--count must be 1 or more")
-    return OK if ping(lambda: ask(socket, f"ping {options.peer}"), options.count) else FAILED
+    with _of_this_version():
+        return OK if ping(lambda: ask(socket, f"ping {options.peer}"), options.count) else FAILED
 
 
 def _netcheck(options: argparse.Namespace) -> int:

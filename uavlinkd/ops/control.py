@@ -15,7 +15,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from uavlinkd.system.terminal import CommandError
+from uavlinkd.system.terminal import CommandError, printable
 
 MAX_REQUEST_BYTES = 8192  # enough for the attacks of a man in the middle with all their parameters
 UNKNOWN = "unknown request"
@@ -27,6 +27,7 @@ REQUEST_TIMEOUT_S = 5.0
 """Limit for sending the request, and for reading the answer. Making the answer has no limit."""
 MAX_CONNECTIONS = 8
 RECEIVE_BYTES = 65536
+MAX_ANSWER_BYTES = 64 << 20  # a status of 4,000 peers has 15 MB
 
 Answer = dict[str, object] | None
 
@@ -138,7 +139,7 @@ def ask(
             sock.settimeout(timeout_s)
             sock.connect(str(path))
             sock.sendall(request.encode() + b"\n")
-            answer = json.loads(_read_answer(sock, on_waiting))
+            answer = _without_controls(json.loads(_read_answer(sock, on_waiting)))
     except PermissionError:
         raise ControlError(
             f"no permission to connect to {path}: only root and the daemon's user have it; use sudo"
@@ -150,13 +151,22 @@ def ask(
         ) from None
     except OSError as error:
         raise ControlError(f"no daemon answers at {path}: {error.strerror or error}") from None
-    except ValueError:
+    except (ValueError, RecursionError):
         raise ControlError(f"the answer of the daemon at {path} is not valid JSON") from None
     if not isinstance(answer, dict) or answer.get("error") == UNKNOWN:
         raise ControlError(f"the daemon at {path} does not know the request {request!r}")
     if "error" in answer:
         raise ControlError(f"the daemon at {path} refuses the request: {answer['error']}")
     return answer
+
+
+def _without_controls(value: Any) -> Any:
+    """An answer in which no text acts on the terminal: a captured daemon may have written it."""
+    if isinstance(value, str):
+        return printable(value, keep="\n")
+    if isinstance(value, dict):
+        return {printable(key, keep="\n"): _without_controls(one) for key, one in value.items()}
+    return [_without_controls(one) for one in value] if isinstance(value, list) else value
 
 
 def _read_answer(sock: socket.socket, on_waiting: Callable[[], None] | None) -> bytes:
@@ -173,3 +183,5 @@ def _read_answer(sock: socket.socket, on_waiting: Callable[[], None] | None) -> 
         if not data:
             return bytes(answer)
         answer += data
+        if len(answer) > MAX_ANSWER_BYTES:
+            raise ValueError

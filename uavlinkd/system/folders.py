@@ -1,4 +1,4 @@
-"""What a power cut must not lose."""
+"""Files that a power cut must not lose, and that no other user may choose."""
 
 from __future__ import annotations
 
@@ -6,6 +6,15 @@ import os
 from pathlib import Path
 
 _CAN_SYNC = hasattr(os, "geteuid")  # Windows cannot open a folder
+
+
+def write_new(path: Path, data: bytes) -> None:
+    """Make a file and sync it. A file or link that has the name is removed, not followed. Raises OSError."""
+    path.unlink(missing_ok=True)
+    with path.open("xb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def sync_folder(folder: Path) -> None:

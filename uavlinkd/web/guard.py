@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import binascii
+import re
 from collections.abc import Callable, Mapping
 from ipaddress import ip_address
 from typing import Final
@@ -19,6 +20,8 @@ WRONG_PER_S: Final = 1 / 10
 WRONG_AT_ONCE: Final = 10
 """Limits on wrong passwords of one source: an address, or a /64 of IPv6. The right one is always accepted: strangers
 behind the same proxy or NAT must not lock its owner out, and 120 random bits are not guessed."""
+_HOST: Final = re.compile(r"(?:\[([0-9a-f:.]+)\]|([^\[\]:]+))(?::[0-9]*)?")
+"""RFC 9110, section 7.2: an IPv6 address in brackets, or a name or IPv4 address; then perhaps a port."""
 _OF_PROXIES: Final = ("forwarded", "via", "x-real-ip")
 HEADERS: Final[Mapping[str, str]] = {
     # Nothing from elsewhere, no inline script or style, no frame around it, and no text that becomes markup.
@@ -90,8 +93,10 @@ def is_addressed(host: str, names: frozenset[str]) -> bool:
 
     Another site's page can make a name of its own resolve to this address (DNS rebinding), but no number.
     """
-    name = host.lower()
-    name = name.partition("]")[0][1:] if name.startswith("[") else name.partition(":")[0]
+    match = _HOST.fullmatch(host.lower())
+    if match is None:
+        return False
+    name = match[1] or match[2]
     if name == "localhost" or name in names:
         return True
     try:

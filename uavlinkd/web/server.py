@@ -2,7 +2,7 @@
 
 Strangers may open any number of connections and send slowly, or nothing. A connection without a request ends after
 :data:`REQUEST_S`. If there is no room for a new one, it replaces one without a request: the oldest of the source that
-has the most of them.
+has the most of them. A source is an address, and on this machine a user: one has half of the places at most.
 """
 
 from __future__ import annotations
@@ -15,6 +15,8 @@ import ssl
 from collections import Counter
 from collections.abc import Hashable
 from contextlib import suppress
+from ipaddress import ip_address
+from pathlib import Path
 from typing import Any, Final
 
 import uvicorn
@@ -27,6 +29,7 @@ from uavlinkd.endpoints.sockets import set_options
 
 MOST_CONNECTIONS: Final = 128
 """A browser has up to six: the page's parts, then one for the events."""
+MOST_OF_SOURCE: Final = MOST_CONNECTIONS // 2
 AT_ONCE: Final = 32
 """Connections that are accepted before browsers have a turn, however fast strangers connect."""
 REQUEST_S: Final = 5.0
@@ -153,10 +156,16 @@ class WebServer:
             await asyncio.gather(*tasks, *self._state.tasks, return_exceptions=True)
 
     def _accept(self, sock: socket.socket, sockaddr: tuple[Any, ...]) -> None:
-        if len(self._open) >= MOST_CONNECTIONS and not self._make_room():
+        source = holder_of(sock, sockaddr)
+        of_source = sum(place.source == source for place in self._open.values())
+        if of_source >= MOST_OF_SOURCE:
+            has_room = self._make_room(source)
+        else:
+            has_room = len(self._open) < MOST_CONNECTIONS or self._make_room()
+        if not has_room:
             sock.close()
             return
-        place = _Place(source_of(sockaddr[0]))
+        place = _Place(source)
         task = asyncio.get_running_loop().create_task(self._serve(sock, place))
         self._open[task] = place
         task.add_done_callback(lambda task: self._forget(task, sock))
@@ -168,9 +177,10 @@ class WebServer:
         if self._tls is not None and self._ended % COLLECTED_EVERY == 0:
             gc.collect()
 
-    def _make_room(self) -> bool:
-        """End a connection without a request. Whether there was one."""
+    def _make_room(self, source: Hashable = None) -> bool:
+        """End a connection without a request, of this source or of any. Whether there was one."""
         free = [(task, place.source) for task, place in self._open.items() if place.is_free]
+        free = [one for one in free if source in (None, one[1])]
         if not free:
             return False
         ((most, _),) = Counter(source for _, source in free).most_common(1)
@@ -194,3 +204,17 @@ class WebServer:
         finally:
             if connection.transport is not None:
                 connection.transport.abort()
+
+
+def holder_of(sock: socket.socket, sockaddr: tuple[Any, ...]) -> Hashable:
+    """Who has the other end of a connection: an address, or a /64 of IPv6; on this machine, the user (proc(5))."""
+    if not ip_address(sockaddr[0].partition("%")[0]).is_loopback and sock.getsockname()[0] != sockaddr[0]:
+        return source_of(sockaddr[0])
+    ends = f":{sockaddr[1]:04X}", f":{sock.getsockname()[1]:04X}"
+    for table in ("tcp", "tcp6"):
+        with suppress(OSError):
+            for line in Path("/proc/net", table).read_text("ascii").splitlines():
+                _, here, there, *fields = line.split()
+                if here.endswith(ends[0]) and there.endswith(ends[1]):
+                    return fields[4]
+    return ""
