@@ -255,3 +255,17 @@ def test_network_that_appears_is_tried_at_once() -> None:
     radios.a.node.set_socket_state(1, radios.now, is_up=True)
     radios.run(0.3)
     assert radios.a.peer.is_up
+
+
+def test_new_connection_carries_an_initiation_at_once() -> None:
+    """Its other end may have restarted, and know no session: nobody waits for a silence."""
+    radios = Radios().run(5.0)
+    assert radios.a.peer.is_up
+    tries = len(initiations(radios))
+    radios.a.node.set_socket_state(0, radios.now, is_up=True)
+    radios.run(0.3)
+    assert len(initiations(radios)) == tries  # a network of datagrams
+    radios.a.node.facts.add_stream(0)
+    radios.a.node.set_socket_state(0, radios.now, is_up=True)
+    radios.run(0.3)
+    assert len(initiations(radios)) > tries

@@ -13,9 +13,9 @@ from websockets.uri import parse_uri
 
 from tests.endpoints.web_streams import Loopback
 from tests.waiting import until
-from uavlinkd.endpoints import web_connect
+from uavlinkd.endpoints import sockets, web_connect
 from uavlinkd.endpoints.tls_channel import client_tls
-from uavlinkd.endpoints.web_connect import WebConnectError, open_socket
+from uavlinkd.endpoints.web_connect import Connector, WebConnectError
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.resolver import Resolved
 from uavlinkd.system.tasks import Threads
@@ -83,7 +83,7 @@ async def proxy(monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[HttpProxy]:
 
 async def open_to(loopback: Loopback) -> socket.socket:
     uri = parse_uri(f"wss://127.0.0.1:{loopback.port}/uavlink")
-    return await open_socket("127.0.0.1", loopback.port, uri)
+    return await Connector("127.0.0.1", loopback.port, uri).open()
 
 
 async def carries_a_datagram(loopback: Loopback) -> None:
@@ -191,7 +191,7 @@ async def test_no_address_answers(secure: Loopback, monkeypatch: pytest.MonkeyPa
     with socket.socket() as closed:
         closed.bind(("127.0.0.1", 0))
         with pytest.raises(ConnectionRefusedError):
-            await open_socket("127.0.0.1", closed.getsockname()[1], parse_uri("wss://127.0.0.1/"))
+            await Connector("127.0.0.1", closed.getsockname()[1], parse_uri("wss://127.0.0.1/")).open()
 
     async def resolved(address: Address, threads: Threads | None) -> Resolved:
         return []
@@ -199,3 +199,40 @@ async def test_no_address_answers(secure: Loopback, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(web_connect, "resolve", resolved)
     with pytest.raises(WebConnectError, match="not_resolved"):
         await open_to(secure)
+
+
+async def test_address_that_was_silent_is_tried_again(secure: Loopback, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beside the attempts that wait: the kernel repeats a SYN that an outage lost too late."""
+    begun: list[float] = []
+
+    async def connect_tcp(family: socket.AddressFamily, place: tuple[str, int]) -> socket.socket:
+        begun.append(asyncio.get_running_loop().time())
+        if len(begun) < 4:
+            await asyncio.get_running_loop().create_future()
+        return await sockets.connect_tcp(family, place)
+
+    monkeypatch.setattr(web_connect, "connect_tcp", connect_tcp)
+    monkeypatch.setattr(web_connect, "STAGGER_S", 0.01)
+    connector = Connector("127.0.0.1", secure.port, parse_uri(f"wss://127.0.0.1:{secure.port}/uavlink"))
+    (await connector.open(0.02)).close()
+    assert len(begun) == 4
+    assert begun[3] - begun[0] >= 0.06
+
+
+async def test_name_server_that_is_silent(secure: Loopback, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As during an outage: the last addresses of the name are used, and one query waits for its answer."""
+    queries: list[asyncio.Future[Resolved]] = []
+
+    async def resolved(address: Address, threads: Threads | None) -> Resolved:
+        queries.append(asyncio.get_running_loop().create_future())
+        if len(queries) == 1:
+            return [(socket.AF_INET, secure.listener.getsockname())]
+        return await queries[-1]
+
+    monkeypatch.setattr(web_connect, "resolve", resolved)
+    monkeypatch.setattr(web_connect, "NAME_S", 0.01)
+    connector = Connector("relay.example", secure.port, parse_uri("wss://relay.example/uavlink"))
+    for _ in range(3):
+        (await connector.open()).close()
+    assert len(queries) == 2
+    queries[-1].set_result([])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -36,7 +37,7 @@ class Stream:
         self._handler = handler
         self.made.append(self)
 
-    def start(self) -> None:
+    def start(self, _: float) -> None:
         self._handler.on_open()
         if self.ends:
             self.lose(self.ends)
@@ -54,11 +55,11 @@ class Stream:
 def streams(monkeypatch: pytest.MonkeyPatch) -> list[Stream]:
     """All that are made, in place of real ones."""
 
-    async def open_socket(*_: object) -> None:
+    async def opened(*_: object) -> None:
         await asyncio.sleep(0)
 
     monkeypatch.setattr(Stream, "made", [], raising=False)
-    monkeypatch.setattr(web_connect, "open_socket", open_socket)
+    monkeypatch.setattr(web_connect.Connector, "open", opened)
     monkeypatch.setattr(web_stream, "WebStream", Stream)
     return Stream.made
 
@@ -70,60 +71,84 @@ def relay(port: int = 443) -> tuple[WebRelay, Recorder]:
     return WebRelay(written, NUMBER, SocketStateLog(), stall, cast(Any, log)), log
 
 
-async def test_connection_that_carries_nothing_ends(streams: list[Stream], monkeypatch: pytest.MonkeyPatch) -> None:
-    """A proxy keeps it open, and drops all. The member makes another one."""
-    monkeypatch.setattr(module, "SILENT_S", 0.05)
-    monkeypatch.setattr(module, "LOOK_S", 0.01)
+async def test_connection_that_carries_nothing_is_replaced(
+    streams: list[Stream], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A proxy keeps it open, and drops all. It stays until there is another one."""
+    monkeypatch.setattr(module, "PATIENCE_S", (0.05, 0.1))
     monkeypatch.setattr(module, "RETRY_S", (0.01, 0.05))
     web, _ = relay()
     web.start(PEER, lambda *_: None, lambda: None)
-    await until(lambda: len(streams) > 2)
+    await until(lambda: len(streams) > 3)
     web.stop()
-    assert {stream.lost for stream in streams[:2]} == {"silent"}
+    assert [stream.lost for stream in streams[:2]] == ["silent", "silent"]
 
 
-@pytest.mark.parametrize("is_lost", [False, True])
-async def test_connection_that_works_stays(
-    streams: list[Stream], monkeypatch: pytest.MonkeyPatch, *, is_lost: bool
-) -> None:
+async def test_connection_that_works_stays(streams: list[Stream], monkeypatch: pytest.MonkeyPatch) -> None:
     """For as long as the relay answers along it. A relay that is lost is not asked along any path."""
-    monkeypatch.setattr(module, "SILENT_S", 0.05)
+    monkeypatch.setattr(module, "PATIENCE_S", (0.05, 0.1))
     monkeypatch.setattr(module, "LOOK_S", 0.01)
+    monkeypatch.setattr(module, "RETRY_S", (0.1, 0.1))
     web, _ = relay()
     state = SimpleNamespace(works=True, path=web.path)
-    peer = SimpleNamespace(is_up=True, paths=SimpleNamespace(states=[state]))
+    peer = SimpleNamespace(is_up=False, paths=SimpleNamespace(states=[state]))
     web.start(cast(Any, peer), lambda *_: None, lambda: None)
+    await until(lambda: len(streams) == 1)
+    peer.is_up = True
     await asyncio.sleep(0.2)
     assert [stream.lost for stream in streams] == [""]
-    if is_lost:
-        peer.is_up = False
-    else:
-        state.works = False
+    peer.is_up = False
     await until(lambda: streams[0].lost == "silent")
     web.stop()
 
 
-@pytest.mark.parametrize("is_used", [False, True])
-async def test_connections_that_end_at_once_are_fewer_and_fewer(
-    streams: list[Stream], monkeypatch: pytest.MonkeyPatch, *, is_used: bool
-) -> None:
-    """Before the member used them, or after. A proxy that resets each does not keep the member busy."""
-    waits: list[float] = []
-    sleep = asyncio.sleep
+async def attempts_in(seconds: float, web: WebRelay, monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """When the attempts of one relay's member begin, in virtual time."""
+    clock = [monotonic()]
+    began, beginnings = clock[0], list[float]()
+    connect = web_connect.Connector.open
 
-    async def record(seconds: float) -> None:
-        if seconds >= module.RETRY_S[0]:
-            waits.append(seconds)
-        await sleep(0)
+    async def pause(_: WebRelay, seconds: float) -> None:
+        clock[0] += seconds
+        await asyncio.sleep(0)
 
-    monkeypatch.setattr(asyncio, "sleep", record)
-    monkeypatch.setattr(Stream, "ends", "" if is_used else "ECONNRESET")
-    web, _ = relay()
-    web.start(PEER, lambda *_: None, lambda: streams[-1].lose("ECONNRESET"))
-    while len(waits) < 7:
-        await sleep(0)
+    async def counted(connector: web_connect.Connector, again_s: float) -> Any:
+        beginnings.append(clock[0] - began)
+        return await connect(connector, again_s)
+
+    monkeypatch.setattr(module, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(WebRelay, "_pause", pause)
+    monkeypatch.setattr(web_connect.Connector, "open", counted)
+    web.start(PEER, lambda *_: None, lambda: None)
+    await until(lambda: clock[0] >= began + seconds)
     web.stop()
-    assert waits[:7] == [1, 2, 4, 4, 4, 4, 4]
+    return beginnings
+
+
+async def test_attempts_while_nothing_answers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At most 0.5 s apart, each time a little less, and after ten minutes 4 s."""
+
+    async def refused(*_: object) -> None:
+        raise ConnectionRefusedError(111, "refused")
+
+    monkeypatch.setattr(web_connect.Connector, "open", refused)
+    began = await attempts_in(module.AWAY_S + 100, relay()[0], monkeypatch)
+    soon, late = (
+        [after - at for at, after in pairwise(began) if is_late == (at > module.AWAY_S)] for is_late in (False, True)
+    )
+    assert 0.4 <= min(soon) < max(soon) <= 0.5 + 1e-6
+    assert 3.2 <= min(late) < max(late) <= 4.0 + 1e-6
+
+
+async def test_connections_that_bring_nothing_are_fewer_and_fewer(
+    streams: list[Stream], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A proxy that resets each does not keep the member and the relay busy."""
+    monkeypatch.setattr(Stream, "ends", "ECONNRESET")
+    monkeypatch.setattr(module, "SPREAD", 0.0)
+    began = await attempts_in(20, relay()[0], monkeypatch)
+    waits = [round(after - at, 3) for at, after in pairwise(began)]
+    assert waits[:9] == [0.5, 0.5, 0.5, 0.5, 1, 2, 4, 4, 4]
 
 
 def udp(*, works: bool = True, is_silent: bool = False) -> Any:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass
 from time import monotonic
 from typing import Final, NamedTuple
@@ -24,6 +24,8 @@ VEHICLE, STATION = 1, 2
 UDP, TLS = "udp", "tls"
 NO_UDP: Final = "ip saddr V meta l4proto udp drop", "ip daddr V meta l4proto udp drop"
 AWAY_S: Final = 15.0
+OUTAGE_S: Final = 3.0
+ABSENT_S: Final = 1.4
 SETTLE_S: Final = 5.0
 LATE_S: Final = 3.0
 """Frames that arrive later than this after the last one was sent count as lost."""
@@ -61,6 +63,8 @@ class Outcome:
     lost: int
     commands_lost: int
     gap_s: float
+    away_s: float
+    """How long the network or the relay was away."""
 
 
 class Scene:
@@ -69,6 +73,7 @@ class Scene:
     def __init__(self, laboratory: Laboratory, stage: Stage, line: Line, rates: tuple[Rates, Rates]) -> None:
         public = laboratory.public()
         places = laboratory.place("open", delay_s=line.delay_s, loss=line.loss), laboratory.place("open")
+        self.host = places[0].host
         self._internet = laboratory.internet
         self._addresses = [place.address for place in places]
         if line.kbit_s:
@@ -90,6 +95,7 @@ class Scene:
             end.config["relay"][0]["addresses"] = [relay.address, url]
             into = end.add_endpoint("client")
             self.talkers.append(Talker(udp_socket_in(place.host.path), into, system, rate))
+        self.away_s = 0.0
         self._stage = stage
 
     def filter(self, *rules: str) -> None:
@@ -114,6 +120,13 @@ class Scene:
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
+
+    @contextmanager
+    def away(self) -> Iterator[None]:
+        """The network or the relay is away."""
+        began = monotonic()
+        yield
+        self.away_s = monotonic() - began
 
     async def until_by(self, kind: str) -> None:
         """Wait until the vehicle sends by UDP or by TLS."""
@@ -165,18 +178,42 @@ async def connection_is_reset(scene: Scene) -> None:
     await scene.until_by(TLS)
 
 
-async def relay_restarts(scene: Scene) -> None:
-    """UDP is dropped at the vehicle. The relay is killed, and starts again."""
+async def network_drops(scene: Scene) -> None:
+    """UDP is dropped at the vehicle, and for 3 s everything: neither end's kernel reports it."""
+    with scene.away():
+        scene.filter("ip saddr V drop", "ip daddr V drop")
+        await asyncio.sleep(OUTAGE_S)
+        scene.filter(*NO_UDP)
+    await scene.until_by(TLS)
+
+
+async def interface_is_down(scene: Scene) -> None:
+    """UDP is dropped at the vehicle. For 3 s its kernel has no interface and no route."""
+    route = scene.host.run("ip", "route", "show", "default")
+    with scene.away():
+        scene.host.ip("link set wan down")
+        await asyncio.sleep(OUTAGE_S)
+        scene.host.ip("link set wan up", f"route add {route.strip()}")
+    await scene.until_by(TLS)
+
+
+async def relay_is_absent(scene: Scene) -> None:
+    """UDP is dropped at the vehicle. The relay is killed, and starts 1.4 s later."""
     relay, *_ = scene.daemons
-    await relay.kill()
-    await relay.start()
+    with scene.away():
+        await relay.kill()
+        await asyncio.sleep(ABSENT_S)
+        await relay.start()
+        await until(lambda: len(relay.events("daemon_started")) == 2)
     await scene.until_by(TLS)
 
 
 FAULTS: Final = {
     "UDP goes and returns": (udp_goes_and_returns, ()),
     "the connection is reset": (connection_is_reset, NO_UDP),
-    "the relay is killed and starts": (relay_restarts, NO_UDP),
+    "the network drops all for 3 s": (network_drops, NO_UDP),
+    "the interface is down for 3 s": (interface_is_down, NO_UDP),
+    "the relay is absent for 1.4 s": (relay_is_absent, NO_UDP),
 }
 """Each with the rules before it."""
 
@@ -203,6 +240,7 @@ async def fail(name: str, line: Line) -> Outcome:
         sum(one.lost for one in every),
         sum(one.lost for one in commands),
         max(one.gap_s for one in every),
+        scene.away_s,
     )
 
 

@@ -194,11 +194,15 @@ class Node:
     def set_socket_state(self, socket: int, now: float, *, is_up: bool) -> None:
         """The network behind a socket disappeared; or it appeared or changed, and its paths have to prove themselves.
 
+        A new connection may lead to a relay that has restarted and knows no session: this node initiates at once.
+
         The events come with the next :meth:`handle_timeout`, which is due at once.
         """
         for peer in self.peers.values():
             if peer.paths.set_socket_state(socket, now, is_up=is_up) and is_up:
                 peer.initiator.hurry(socket, now)
+                if socket in self.facts.streams:
+                    peer.offered_at = now
             self._revise_paths(peer, now)
 
     def remove_path(self, path: Path, now: float) -> None:

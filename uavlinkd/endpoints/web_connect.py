@@ -1,11 +1,15 @@
-"""Connects to a relay's WebSocket over TCP, through an HTTP proxy if the environment names one."""
+"""Connects to a relay's WebSocket over TCP, through an HTTP proxy if the environment names one.
+
+The kernel repeats a lost SYN after 1, 3 and 7 s only, and TCP's waits double in every outage. So a fresh attempt
+begins beside the others every :data:`AGAIN_S`. The first one that connects wins.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import socket
 from contextlib import suppress
-from typing import Final
+from typing import Any, Final
 
 from websockets.exceptions import InvalidProxy
 from websockets.http11 import Response
@@ -15,11 +19,13 @@ from websockets.uri import WebSocketURI
 
 from uavlinkd.endpoints.sockets import connect_tcp
 from uavlinkd.system.addresses import Address
-from uavlinkd.system.resolver import Resolved, resolve
+from uavlinkd.system.resolver import Query, Resolved, resolve
 from uavlinkd.system.tasks import Threads
 
-CONNECT_S: Final = 5.0  # for the name, all addresses and the proxy
-STAGGER_S: Final = 0.3  # after this time without an answer, the next address is tried too, as in RFC 8305
+CONNECT_S: Final = 5.0  # for the name, all addresses and the proxy: at most 20 attempts at the same time
+AGAIN_S: Final = 0.5  # between two attempts to one address
+STAGGER_S: Final = 0.25  # between attempts to different addresses, as in RFC 8305
+NAME_S: Final = 0.5  # without an answer for so long, the last addresses of the name are used
 MAX_ADDRESSES: Final = 8
 RESPONSE_BYTES: Final = 8192  # a proxy that sends more before it has connected is refused
 
@@ -28,23 +34,38 @@ class WebConnectError(OSError):
     """There is no connection. The message is a short stable name, such as ``proxy_407`` or ``not_resolved``."""
 
 
-async def open_socket(host: str, port: int, uri: WebSocketURI, threads: Threads | None = None) -> socket.socket:
-    """A socket that is connected to ``host``, or to a proxy that has connected to the host of ``uri``.
+class Connector:
+    """Connects to ``host``, or to a proxy that connects to the host of ``uri``. ``threads``: of the resolver."""
 
-    ``threads``: of the resolver.
-    Raises OSError: the kernel's error, TimeoutError, or WebConnectError.
-    """
-    async with asyncio.timeout(CONNECT_S):
-        proxy = _proxy_for(uri)
-        if proxy is None:
-            return await _connect(Address(host, port), threads)
-        sock = await _connect(Address(proxy.host, proxy.port), threads)
-        try:
-            await _tunnel(sock, proxy, uri)
-        except BaseException:
-            sock.close()
-            raise
-        return sock
+    def __init__(self, host: str, port: int, uri: WebSocketURI, threads: Threads | None = None) -> None:
+        self._address = Address(host, port)
+        self._uri = uri
+        self._threads = threads
+        self._known: Resolved = []
+        self._query: Query | None = None
+
+    async def open(self, again_s: float = AGAIN_S) -> socket.socket:
+        """A connected socket. ``again_s``: between attempts to one address.
+
+        Raises OSError: the kernel's error, TimeoutError, or WebConnectError.
+        """
+        async with asyncio.timeout(CONNECT_S):
+            proxy = _proxy_for(self._uri)
+            resolved = await self._resolve(self._address if proxy is None else Address(proxy.host, proxy.port))
+            return await _connect(resolved[:MAX_ADDRESSES], again_s, proxy, self._uri)
+
+    async def _resolve(self, address: Address) -> Resolved:
+        """The addresses of a name; those of before while no name server answers."""
+        if self._query is None:
+            self._query = asyncio.ensure_future(resolve(address, self._threads))
+            self._query.add_done_callback(self._on_resolved)
+        await asyncio.wait((self._query,), timeout=NAME_S if self._known else None)
+        return self._known
+
+    def _on_resolved(self, query: Query) -> None:
+        self._query = None
+        if not query.cancelled():
+            self._known = query.result() or self._known
 
 
 def proxy_of(uri: WebSocketURI) -> str:
@@ -65,27 +86,23 @@ def _proxy_for(uri: WebSocketURI) -> Proxy | None:
     return proxy
 
 
-async def _connect(address: Address, threads: Threads | None) -> socket.socket:
-    """Connect to the address of a name that answers first."""
-    resolved = await resolve(address, threads)
-    attempts: set[asyncio.Task[socket.socket]] = set()
+async def _connect(resolved: Resolved, again_s: float, proxy: Proxy | None, uri: WebSocketURI) -> socket.socket:
+    """Connect to the address that answers first. An address that fails is not tried again."""
+    attempts: dict[asyncio.Task[socket.socket], int] = {}  # with the number of the address
     error: OSError = WebConnectError("not_resolved")
-    waiting: Resolved = resolved[:MAX_ADDRESSES]
+    left = list(range(len(resolved)))
+    stagger_s = max(STAGGER_S, again_s / max(1, len(resolved)))
     try:
-        while waiting or attempts:
-            if waiting:
-                attempts.add(asyncio.ensure_future(connect_tcp(*waiting.pop(0))))
-            timeout_s = STAGGER_S if waiting else None
-            done, _ = await asyncio.wait(attempts, timeout=timeout_s, return_when=asyncio.FIRST_COMPLETED)
+        while left:
+            left.append(number := left.pop(0))
+            attempts[asyncio.ensure_future(_reach(resolved[number], proxy, uri))] = number
+            done, _ = await asyncio.wait(attempts, timeout=stagger_s, return_when=asyncio.FIRST_COMPLETED)
             for attempt in done:
+                failed = attempts.pop(attempt)
                 try:
-                    sock = attempt.result()
+                    return attempt.result()
                 except OSError as failure:
-                    attempts.discard(attempt)
-                    error = failure
-                else:
-                    attempts.discard(attempt)
-                    return sock
+                    error, left = failure, [other for other in left if other != failed]
         raise error
     finally:
         for attempt in attempts:
@@ -97,6 +114,18 @@ def _close(attempt: asyncio.Task[socket.socket]) -> None:
     """An attempt that another one overtook."""
     if not attempt.cancelled() and attempt.exception() is None:
         attempt.result().close()
+
+
+async def _reach(target: tuple[socket.AddressFamily, Any], proxy: Proxy | None, uri: WebSocketURI) -> socket.socket:
+    """One attempt."""
+    sock = await connect_tcp(*target)
+    if proxy is not None:
+        try:
+            await _tunnel(sock, proxy, uri)
+        except BaseException:
+            sock.close()
+            raise
+    return sock
 
 
 async def _tunnel(sock: socket.socket, proxy: Proxy, uri: WebSocketURI) -> None:

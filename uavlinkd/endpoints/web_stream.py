@@ -127,8 +127,9 @@ class WebStream:
         """The socket address of the other end; None if it reset the connection at once."""
         return self._channel.peername
 
-    def start(self) -> None:
-        self._opening = self._loop.call_later(OPEN_S, self.lose, "slow_handshake")
+    def start(self, within_s: float = OPEN_S) -> None:
+        """Open it within this time."""
+        self._opening = self._loop.call_later(within_s, self.lose, "slow_handshake")
         self._channel.start()
 
     def lose(self, reason: str) -> None:

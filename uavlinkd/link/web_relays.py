@@ -8,7 +8,11 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import socket
 from collections.abc import Callable, Iterable
+from contextlib import suppress
+from math import inf
+from random import SystemRandom
 from typing import TYPE_CHECKING, Final
 
 from structlog.typing import FilteringBoundLogger
@@ -27,6 +31,7 @@ from uavlinkd.system.stall import StallWatch
 from uavlinkd.system.tasks import keep_running
 
 if TYPE_CHECKING:
+    from uavlinkd.endpoints.web_connect import Connector
     from uavlinkd.endpoints.web_stream import WebStream
 
 WEB_NETWORK: Final = "TLS"
@@ -39,17 +44,24 @@ UDP_BACK_S: Final = 10.0
 """So a network that passes UDP now and then does not cost a connection each time."""
 LEAVE_S: Final = 2.5
 """Before it is closed, a connection only receives for so long: peers notice that, and use UDP."""
-SILENT_S: Final = 15.0
-"""A connection along which the relay does not answer for so long is made again: a proxy may keep it open."""
 LOOK_S: Final = 0.25
-RETRY_S: Final = 1.0, 4.0
-"""After a failure, the first wait; each further one is twice as long, up to the second value. A connection that
-brought nothing is a failure too."""
+RETRY_S: Final = 0.5, 4.0
+"""Between the beginnings of two attempts, at most: the first value while nothing answers. A server that answers, and
+brings no relay, gets :data:`TRIES` of these, and then each wait is twice as long, up to the second value."""
+TRIES: Final = 4
+SPREAD: Final = 0.2
+"""Each wait is shorter by up to this share, so that the members of a relay that restarts do not come at once."""
+AWAY_S: Final = 600.0
+"""After so long without the relay, each wait is the longest one."""
+PATIENCE_S: Final = 2.0, 5.0
+"""A connection may take the first value to open, and once more until the relay answers along it. A relay with many
+members that restarted may need longer: after each connection that brought nothing twice as long, up to the second."""
 UDP_WORKS: Final = "udp_works"
 PROBE_S: Final = 3.0
 """The command that asks for a probe waits for 5 s."""
 WAIT_S: Final = 0.01
 """Frames look so often whether a connection takes them again."""
+_RNG: Final = SystemRandom()
 
 
 class WebGate(Bucket):
@@ -84,27 +96,28 @@ class WebBudget(NetworkBudget):
         """Nothing is charged."""
 
 
-class _Attempt:
-    """The handler of one connection. ``owner``: None for a probe."""
+class _Connection:
+    """The handler of one connection, and its stream. ``owner``: once that uses it."""
 
-    def __init__(self, owner: WebRelay | None) -> None:
+    stream: WebStream
+
+    def __init__(self) -> None:
         self.opened = asyncio.get_running_loop().create_future()
         """Its result is why there is no connection; empty if there is one."""
-        self._owner = owner
+        self.owner: WebRelay | None = None
 
     def on_open(self) -> None:
-        if not self.opened.done():
-            self.opened.set_result("")
+        self.opened.set_result("")
 
     def on_datagrams(self, datagrams: list[bytes], now: float, epoch: int) -> None:
-        if self._owner is not None:
-            self._owner.receive(datagrams, now, epoch)
+        if self.owner is not None:
+            self.owner.receive(datagrams, now, epoch)
 
     def on_lost(self, reason: str) -> None:
         if not self.opened.done():
             self.opened.set_result(reason)
-        elif self._owner is not None:
-            self._owner.lost(reason)
+        elif self.owner is not None:
+            self.owner.lost(reason)
 
 
 class WebRelay:
@@ -123,7 +136,6 @@ class WebRelay:
         self.path = Path(number, (str(written), 0))
         self.budget = WebBudget(self._room)
         self._error = ""
-        self._is_used = False  # whether anything came along the connection
         self._node = node
         self._stall = stall
         self._log = log
@@ -134,9 +146,13 @@ class WebRelay:
         self._ended = asyncio.Event()
         self._peer: Peer | None = None
         self._task: asyncio.Task[None] | None = None
-        self._has_udp = False
+        self._connector: Connector | None = None
         self._is_leaving = False  # the connection only receives
         self._udp_silent_at = 0.0  # it is silent from then on, if it does not work before
+        self._began_at = -inf  # the last attempt
+        self._spread = 1.0
+        self._unanswered = 0  # connections since the relay answered along one
+        self._answer_by = self._answered_at = monotonic()
         node.facts.add_stream(number)
 
     @property
@@ -146,9 +162,8 @@ class WebRelay:
 
     def start(self, peer: Peer, receive: Receive, on_change: Callable[[], None], *, has_udp: bool = False) -> None:
         """Connect whenever this relay does not answer by UDP. ``has_udp``: it has an address for that."""
-        self._has_udp = has_udp
         self._peer, self._receive, self._on_change = peer, receive, on_change
-        self._udp_silent_at = monotonic() + UDP_FIRST_S
+        self._udp_silent_at = monotonic() + UDP_FIRST_S if has_udp else -inf
         if self._task is None:
             self._task = keep_running(self._keep(), f"the connection to {self.written}")
 
@@ -188,77 +203,103 @@ class WebRelay:
         try:
             proxy = proxy_of(parse_uri(self.path.host))
             async with asyncio.timeout(PROBE_S):
-                (await self._connect(None)).lose("probed")
+                sock = await self._connect(RETRY_S[0])
+                (await self._upgrade(sock, PROBE_S)).stream.lose("probed")
         except OSError as failure:  # TimeoutError too
             error = _name(failure)
         return {"error": error, "proxy": proxy}
 
-    async def _connect(self, owner: WebRelay | None) -> WebStream:
+    async def _connect(self, again_s: float) -> socket.socket:
         # Imported only if configured: a daemon on UDP starts faster and stays smaller.
         from websockets.uri import parse_uri  # noqa: PLC0415
 
+        from uavlinkd.endpoints.web_connect import Connector  # noqa: PLC0415
+
+        if self._connector is None:
+            address = self.written.address
+            self._connector = Connector(address.host, address.port, parse_uri(self.path.host))
+        return await self._connector.open(again_s)
+
+    async def _upgrade(self, sock: socket.socket, within_s: float) -> _Connection:
+        """TLS and HTTP."""
+        from websockets.uri import parse_uri  # noqa: PLC0415
+
         from uavlinkd.endpoints.tls_channel import client_tls  # noqa: PLC0415
-        from uavlinkd.endpoints.web_connect import open_socket  # noqa: PLC0415
         from uavlinkd.endpoints.web_stream import WebStream, client_protocol  # noqa: PLC0415
 
-        uri, (host, port) = parse_uri(self.path.host), (self.written.address.host, self.written.address.port)
-        attempt, tls = _Attempt(owner), client_tls(host)
-        sock = await open_socket(host, port, uri)
-        stream = WebStream(sock, client_protocol(uri), tls, attempt, self._stall, self.path.host)
+        connection, tls = _Connection(), client_tls(self.written.address.host)
+        protocol = client_protocol(parse_uri(self.path.host))
+        stream = connection.stream = WebStream(sock, protocol, tls, connection, self._stall, self.path.host)
         try:
-            stream.start()
-            if reason := await attempt.opened or stream.lost:
+            stream.start(within_s)
+            if reason := await connection.opened or stream.lost:
                 raise ConnectionError(reason)
         except BaseException:
             stream.lose("closed")
             raise
-        return stream
+        return connection
 
     async def _keep(self) -> None:
-        wait_s = RETRY_S[0]
+        """Make connections. One that became silent stays beside the attempts: it may recover before they succeed."""
         while True:
-            await self._until_udp_is_silent()
-            self._ended.clear()
+            await self._until_wanted()
+            self._began_at, self._spread = monotonic(), _RNG.uniform(1.0 - SPREAD, 1.0)
             try:
-                stream = await self._connect(self)
+                sock = await self._connect(self._wait_s)
+                patience_s = min(PATIENCE_S[0] * 2.0**self._unanswered, PATIENCE_S[1])
+                self._unanswered = min(self._unanswered + 1, 32)
+                connection = await self._upgrade(sock, patience_s)
             except OSError as error:
                 before, self._error = self._error, _name(error)
                 if self._error != before and (omitted := self._take_line()) is not None:
                     url = self.path.host
                     self._log.warning("relay_not_connected", address=url, reason=self._error, **omitted)
             else:
-                opened_at = monotonic()
-                self._open(stream)
-                await self._until_not_needed()
-                if monotonic() - opened_at > RETRY_S[0]:
-                    wait_s = 0.0
-                elif self._is_used:
-                    wait_s = RETRY_S[0]
-            await asyncio.sleep(wait_s)
-            wait_s = min(max(RETRY_S[0], 2 * wait_s), RETRY_S[1])
+                if self._works:
+                    connection.stream.lose("not_needed")
+                else:
+                    self._answer_by = monotonic() + patience_s
+                    self._open(connection)
 
-    async def _until_udp_is_silent(self) -> None:
-        """A relay without an address for UDP needs no wait."""
-        while self._has_udp and (self._udp_works or monotonic() < self._udp_silent_at):
-            if self._udp_works:
-                self._udp_silent_at = monotonic() + UDP_SILENT_S
-            await asyncio.sleep(LOOK_S)
+    @property
+    def _wait_s(self) -> float:
+        """Between the beginnings of the last attempt and the next one."""
+        wait_s = min(RETRY_S[0] * 2.0 ** max(0, self._unanswered - TRIES), RETRY_S[1])
+        return self._spread * (RETRY_S[1] if self._began_at > self._answered_at + AWAY_S else wait_s)
 
-    async def _until_not_needed(self) -> None:
-        back = asyncio.ensure_future(_until_held(lambda: self._udp_works, UDP_BACK_S))
-        silent = asyncio.ensure_future(_until_held(lambda: not self._works, SILENT_S))
-        ended = asyncio.ensure_future(self._ended.wait())
-        try:
-            await asyncio.wait((back, silent, ended), return_when=asyncio.FIRST_COMPLETED)
-            if self._stream is not None and back.done():
-                self._is_leaving = True
-                self._node.set_socket_state(self.number, monotonic(), is_up=False)
-                await asyncio.wait((ended,), timeout=LEAVE_S)
+    async def _until_wanted(self) -> None:
+        """Until an attempt is due: the relay answers neither by UDP nor along the connection."""
+        udp_since = inf
+        while True:
+            now = monotonic()
+            udp_since = min(udp_since, now) if self._udp_works else inf
+            if udp_since <= now:
+                self._udp_silent_at = now + UDP_SILENT_S
+            if self._works:
+                self._unanswered, self._answered_at, self._answer_by = 0, now, now + LOOK_S
+            due_at = max(self._began_at + self._wait_s, self._udp_silent_at)
             if self._stream is not None:
-                self._stream.lose(UDP_WORKS if back.done() else "silent")
-        finally:
-            for task in (back, silent, ended):
-                task.cancel()
+                due_at = max(due_at, self._answer_by)
+                if now >= udp_since + UDP_BACK_S:
+                    await self._leave(self._stream)
+                    continue
+            if now >= due_at:
+                return
+            await self._pause(min(due_at - now, LOOK_S))
+
+    async def _leave(self, stream: WebStream) -> None:
+        """UDP works again."""
+        self._is_leaving = True
+        self._node.set_socket_state(self.number, monotonic(), is_up=False)
+        await self._pause(LEAVE_S)
+        stream.lose(UDP_WORKS)
+
+    async def _pause(self, seconds: float) -> None:
+        """Wait so long, or until the connection ends."""
+        self._ended.clear()
+        with suppress(TimeoutError):
+            async with asyncio.timeout(seconds):
+                await self._ended.wait()
 
     @property
     def _works(self) -> bool:
@@ -272,8 +313,11 @@ class WebRelay:
         states = self._peer.paths.states
         return self._peer.is_up and any(state.path.is_udp and state.works and not state.is_silent for state in states)
 
-    def _open(self, stream: WebStream) -> None:
-        self._stream, self._is_leaving, self._error, self._is_used = stream, False, "", False
+    def _open(self, connection: _Connection) -> None:
+        if self._stream is not None:
+            self._stream.lose("silent")
+        connection.owner = self
+        self._stream, self._is_leaving, self._error = connection.stream, False, ""
         self._node.set_socket_state(self.number, monotonic(), is_up=True)
         if (omitted := self._take_line()) is not None:
             self._log.info("relay_connected", address=self.path.host, **omitted)
@@ -289,13 +333,11 @@ class WebRelay:
 
     def receive(self, datagrams: list[bytes], now: float, epoch: int) -> None:
         """Messages came in one read."""
-        self._is_used, address = True, self.path.address
+        address = self.path.address
         self._receive(self.number, [(datagram, address) for datagram in datagrams], now, epoch, 0.0)
 
     def lost(self, reason: str) -> None:
         """It ended."""
-        if self._stream is None:  # before it was used
-            return
         self._stream = None
         self._ended.set()
         self._node.set_socket_state(self.number, monotonic(), is_up=False)
@@ -369,15 +411,6 @@ class WebRelays:
 
     def _of(self, addresses: Iterable[PeerAddress]) -> list[WebRelay]:
         return [self._relays[written] for written in addresses if written in self._relays]
-
-
-async def _until_held(is_so: Callable[[], bool], seconds: float) -> None:
-    """Until something was so for this long, at each look."""
-    since = monotonic()
-    while monotonic() < since + seconds:
-        await asyncio.sleep(LOOK_S)
-        if not is_so():
-            since = monotonic()
 
 
 def _name(error: OSError) -> str:

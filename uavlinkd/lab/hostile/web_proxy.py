@@ -23,7 +23,7 @@ from uavlinkd.core.relay_records import RELAYED
 from uavlinkd.endpoints.sockets import udp_socket
 from uavlinkd.endpoints.tcp import tcp_listener
 from uavlinkd.endpoints.tls_channel import TlsFactory, client_tls, server_context, server_tls
-from uavlinkd.endpoints.web_connect import open_socket
+from uavlinkd.endpoints.web_connect import Connector
 from uavlinkd.endpoints.web_stream import WebStream, client_protocol, server_protocol
 from uavlinkd.lab.mitm.attack import Action, Attack, AttackContext, Operation, Timed
 from uavlinkd.lab.mitm.attacks import ATTACKS
@@ -127,7 +127,7 @@ class WebProxy:
         while True:
             sock, _ = await asyncio.get_running_loop().sock_accept(self._listener)
             try:
-                relay = await open_socket(HOST, self._relay_port, uri)
+                relay = await Connector(HOST, self._relay_port, uri).open()
             except OSError:  # it does not listen
                 sock.close()
                 continue
