@@ -258,7 +258,7 @@ def test_network_that_appears_is_tried_at_once() -> None:
 
 
 def test_new_connection_carries_an_initiation_at_once() -> None:
-    """Its other end may have restarted, and know no session: nobody waits for a silence."""
+    """Its other end may have restarted, and know no session: the initiation does not wait for a silence."""
     radios = Radios().run(5.0)
     assert radios.a.peer.is_up
     tries = len(initiations(radios))
