@@ -9,11 +9,11 @@ from contextlib import ExitStack, closing
 import pytest
 
 from tests.daemon.udp import open_socket
-from tests.endpoints.clients import Recorder, address_of, frame, heartbeat, recorder, write
+from tests.endpoints.clients import Recorder, address_of, frame, heartbeat, large_frame, recorder, write
 from uavlinkd.endpoints.ports import CLIENT_SILENT_S, CLIENTS_PER_ENDPOINT, LocalPort
 from uavlinkd.endpoints.reader import Datagrams, Reader
 from uavlinkd.endpoints.sockets import udp_socket
-from uavlinkd.endpoints.udp import CLIENT_IDLE_S, LOCAL_DATAGRAM_BYTES, UdpServer
+from uavlinkd.endpoints.udp import CLIENT_IDLE_S, LOCAL_DATAGRAM_BYTES, MOST_STREAMS, UdpServer
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.mavlink.frames import MAX_GAP_S
 from uavlinkd.system.addresses import Address
@@ -89,36 +89,85 @@ async def test_garbage_does_not_make_its_sender_a_client(server: UdpServer, clie
     """Only a genuine frame does."""
     client().send(datagram)
     read(server)
+    server.do_housekeeping(2.0)
     assert (list(server.ports), recorder(server).by_client, recorder(server).open) == ([], [], [])
     assert server.counters.garbage_bytes == len(datagram) == server.bytes_received
 
 
 @pytest.mark.parametrize("start", [b"\xfd\xff\x00", b"\xfe\xff", frame(7)[:1] + b"\xf0" + frame(7)[2:], b"\xfd"])
-@pytest.mark.parametrize("cuts", [False, True])
 async def test_a_broken_beginning_doubles_nothing_and_holds_nothing_back(
-    server: UdpServer, client: Make, start: bytes, cuts: bool
+    server: UdpServer, client: Make, start: bytes
 ) -> None:
-    """Frames behind a false start are delivered once; if a bridge sent them, within 1.5 s."""
-    bridge = client()
+    """Frames behind a false start are delivered once, within 1.5 s."""
+    one = client()
     sent = [heartbeat(), frame(1), frame(2), frame(3)]
-    bridge.send(sent[0])
+    one.send(sent[0])
     read(server, 1.0)
-    if cuts:
-        for datagram in (frame(8)[:20], frame(9)[:20], frame(9)[20:]):
-            bridge.send(datagram)
-            read(server, 1.0)
-        recorder(server).by_client[1:] = []
-    assert bool(server._splitters) == cuts
-    bridge.send(start + sent[1] + sent[2])
+    one.send(start + sent[1] + sent[2])
     read(server, 1.1)
     server.do_housekeeping(1.1 + MAX_GAP_S + 1.0)
     assert recorder(server).received == sent[:3]
-    bridge.send(sent[3])
+    one.send(sent[3])
     read(server, 3.0)
     assert recorder(server).received == sent
-    assert bool(server._splitters) == cuts
-    carried = server.counters.garbage_bytes + sum(map(len, sent))
-    assert carried + (len(frame(9)) if cuts else 0) == server.bytes_received
+    assert server.counters.garbage_bytes == len(start)
+
+
+BRIDGE = ("127.0.0.1", 1)
+
+
+def cut(frames: Sequence[bytes], size: int) -> list[bytes]:
+    """Datagrams of this size, as of a bridge from a serial line."""
+    stream = b"".join(frames)
+    return [stream[at : at + size] for at in range(0, len(stream), size)]
+
+
+@pytest.mark.parametrize("size", [1, 6, 8, 20, 64, 300])
+async def test_frames_that_a_bridge_cuts_anywhere_are_assembled_from_the_first_byte(
+    server: UdpServer, size: int
+) -> None:
+    """Frames of 21 bytes and others: none is lost."""
+    sent = [heartbeat(), *map(frame, range(20)), large_frame(1), *[heartbeat()] * 20]
+    for number, datagram in enumerate(cut(sent, size)):
+        server.take([(datagram, BRIDGE)], number / 1000, 0)
+    assert recorder(server).received == sent
+    assert server.counters.garbage_bytes == 0
+
+
+@pytest.mark.parametrize("size", [8, 20, 64])
+async def test_a_lost_datagram_costs_only_the_frames_in_it(server: UdpServer, size: int) -> None:
+    """Every other frame is delivered once, at the latest after the next silence."""
+    sent = [frame(number) for number in range(10)]
+    datagrams = cut(sent, size)
+    for lost in range(len(datagrams)):
+        recorder(server).by_client.clear()
+        for number, datagram in enumerate(datagrams):
+            if number != lost:
+                server.take([(datagram, BRIDGE)], 10.0 * lost, 0)
+        server.do_housekeeping(10.0 * lost + 2 * MAX_GAP_S)
+        touched = range(lost * size // len(sent[0]), -(-min((lost + 1) * size, 10 * len(sent[0])) // len(sent[0])))
+        assert recorder(server).received == [raw for number, raw in enumerate(sent) if number not in touched]
+
+
+async def test_whole_frame_behind_an_unfinished_one_is_not_lost(server: UdpServer) -> None:
+    """The rest of the first frame does not arrive, or arrives too late."""
+    for now, datagram in ((1.0, large_frame(1)[:20]), (1.1, heartbeat()), (5.0, frame(1)[:9]), (8.0, frame(1)[9:])):
+        server.take([(datagram, BRIDGE)], now, 0)
+    assert recorder(server).received == [heartbeat()]
+
+
+async def test_unfinished_frames_of_strangers_are_bounded_and_displace_no_client(server: UdpServer) -> None:
+    """A client's frame is finished after a flood; of the strangers, only the latest ones can finish theirs."""
+    half, rest = heartbeat()[:10], heartbeat()[10:]
+    strangers = [("192.0.2.1", port) for port in range(1, 1 + 2 * MOST_STREAMS)]
+    server.take([(heartbeat() + half, BRIDGE)], 1.0, 0)
+    server.take([(half, stranger) for stranger in strangers], 1.0, 0)
+    server.take([(rest, BRIDGE), (rest, strangers[0]), (rest, strangers[-1])], 1.1, 0)
+    assert recorder(server).by_client == [
+        ("127.0.0.1:1", [heartbeat()]),
+        ("127.0.0.1:1", [heartbeat()]),
+        (f"192.0.2.1:{strangers[-1][1]}", [heartbeat()]),
+    ]
 
 
 async def test_frames_share_datagrams_up_to_a_size(server: UdpServer, client: Make) -> None:
@@ -214,13 +263,13 @@ async def test_frame_that_a_bridge_began_before_a_pause_is_stale(server: UdpServ
     """The rest of it comes after the pause; the next frame is new."""
     one = client()
     reader = reader_of(server)
-    cut = frame(2)
-    for datagram in (frame(1), frame(1) + cut[:10]):
+    broken = frame(2)
+    for datagram in (frame(1), frame(1) + broken[:10]):
         one.send(datagram)
         reader.read(monotonic())
     recorder(server).stall.turn(monotonic() + 2 * STALL_S)
-    for datagram in (cut[10:], frame(3)):
+    for datagram in (broken[10:], frame(3)):
         one.send(datagram)
         reader.read(monotonic())
-    assert [frames for _, frames in recorder(server).by_client] == [[frame(1)], [frame(1)], [cut], [frame(3)]]
+    assert [frames for _, frames in recorder(server).by_client] == [[frame(1)], [frame(1)], [broken], [frame(3)]]
     assert recorder(server).epochs == [0, 0, STALE, 1]

@@ -87,7 +87,6 @@ class Connection(LocalPort):
         self._fd = channel.fileno()
         self._stall = endpoint.handler.stall
         self._backlog = Backlog(self._stall, self._fd, channel.capacity, opened_in)
-        self._epoch = opened_in  # of the last read
         self._is_open = True
         self.ended_well = False  # whether the client ended it, and may still read the kernel's bytes
         self._has_read = False
@@ -127,15 +126,13 @@ class Connection(LocalPort):
                 self.lose("http")
                 return
         self.endpoint.bytes_received += len(data)
-        self._age(epoch)
         # Stale bytes are split too: otherwise the stream would go on in the middle of a frame.
-        is_fresh = self._splitter.is_fresh
-        frames = self._splitter.feed(data, now)
+        frames = self._splitter.feed(data, now, epoch)
         if ended is not None:
             frames += self._splitter.end()
         if frames:
             self.received_at = now
-            self.endpoint.handler.on_frames(self, frames, now, epoch if is_fresh else STALE)
+            self.endpoint.handler.on_frames(self, frames, now, epoch if self._splitter.is_fresh else STALE)
         if ended is not None:
             self.lose(ended)
 
@@ -157,19 +154,12 @@ class Connection(LocalPort):
 
     def check(self, now: float) -> None:
         """Drop stale frames. Close the connection if the kernel has accepted no byte for long."""
-        self._age(self._stall.epoch)
-        epoch = self._epoch if self._splitter.is_fresh else STALE
-        if frames := self._splitter.give_up(now):
+        if frames := self._splitter.give_up(now, self._stall.epoch):
+            epoch = self._stall.epoch if self._splitter.is_fresh else STALE
             self.endpoint.handler.on_frames(self, frames, now, epoch)
         self.outgoing.queue.drop_stale(now)
         if self._blocked_since is not None and now - self._blocked_since >= STALLED_S:
             self.lose("stalled")
-
-    def _age(self, epoch: int) -> None:
-        """Mark the part of a frame that arrived before a pause: the whole frame is not new."""
-        if epoch != self._epoch:
-            self._epoch = epoch
-            self._splitter.age()
 
     def lose(self, reason: str) -> None:
         """Stop, count the reason, and report the port as closed in the loop's next turn, never in :meth:`send`."""

@@ -1,5 +1,8 @@
 """Local MAVLink endpoints on UDP: ``udpin`` listens, ``udpout`` sends to one address.
 
+The bytes of a sender are one stream, as on a serial line: a bridge may cut them into datagrams anywhere. A sender
+with an unfinished frame has a :class:`StreamSplitter`, which holds less than a frame, for :data:`MAX_HOLD_S` at most.
+
 Frames that arrived together are delivered together, so that they can share an envelope.
 """
 
@@ -25,7 +28,7 @@ from uavlinkd.endpoints.ports import (
 )
 from uavlinkd.endpoints.reader import Datagrams, Reader
 from uavlinkd.endpoints.sockets import BindError, ErrorReports, send_again, udp_socket
-from uavlinkd.mavlink.frames import MAX_GAP_S, MIN_FRAME_BYTES, Frame, SplitCounters, StreamSplitter, split_datagram
+from uavlinkd.mavlink.frames import Frame, StreamSplitter, parse_frames
 from uavlinkd.mavlink.policy.delivery import Source
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic
@@ -35,6 +38,9 @@ from uavlinkd.system.tasks import keep_running
 
 CLIENT_IDLE_S = 60.0  # `udpin` forgets a client that is silent for this long; even a listener sends heartbeats
 REMOTE_SILENT_S = 5.0  # the name of a `udpout` endpoint is looked up again when its address is silent for this long
+MAX_HOLD_S = 2.0  # A frame in pieces may take this long: a frame of 280 bytes from a radio of 1,400 bit/s does.
+MOST_STREAMS = 64
+"""Most senders without a client's place whose unfinished frames are held. A new one displaces the oldest of these."""
 LOCAL_DATAGRAM_BYTES = 296
 """Frames for one client share a datagram up to this size: MAVROS reads no more of a datagram and loses the rest
 (libmavconn, MsgBuffer::MAX_SIZE)."""
@@ -83,10 +89,10 @@ class UdpEndpoint(Endpoint):
     def __init__(self, name: str, sock: socket.socket, handler: PortHandler) -> None:
         super().__init__(name, handler)
         self._use(sock)
-        self._epoch = handler.stall.epoch  # of the last read
         self._ports: dict[SocketAddress, UdpPort] = {}
         self._silent: set[LocalPort] = set()
-        self._splitters: dict[SocketAddress, StreamSplitter] = {}  # of clients that cut frames apart
+        self._streams: dict[SocketAddress, StreamSplitter] = {}
+        """Of the senders with an unfinished frame, the latest last."""
 
     @property
     def ports(self) -> Sequence[UdpPort]:
@@ -108,53 +114,41 @@ class UdpEndpoint(Endpoint):
         """Deliver the frames of each client, in their order."""
         received: dict[SocketAddress, list[Frame]] = {}
         stale: set[SocketAddress] = set()
-        counters = self.counters
-        if epoch != self._epoch:
-            self._age(epoch)
         for datagram, address in datagrams:
+            if address not in self._ports and not self._is_welcome(address):
+                continue
             self.bytes_received += len(datagram)
-            if self._splitters and address in self._splitters:
-                splitter = self._splitters[address]
-                if not splitter.is_fresh:
+            frames = received.setdefault(address, [])
+            stream = self._streams.pop(address, None)
+            if stream is None:
+                end, fault = parse_frames(datagram, 0, frames, self.counters, is_expected=True)
+                if fault is not None:
+                    datagram = datagram[end:]  # noqa: PLW2901
+                    stream = StreamSplitter(self.counters, max_hold_s=MAX_HOLD_S, gives_up=True)
+            if stream is not None:
+                frames += stream.feed(datagram, now, epoch)
+                if not stream.is_fresh:
                     stale.add(address)
-                frames = splitter.feed(datagram, now)
-            else:
-                garbage = counters.garbage_bytes
-                frames = split_datagram(datagram, counters)
-                if counters.garbage_bytes != garbage and address in self._ports:
-                    self._follow_cuts(address, datagram, len(frames), now)
-            if frames:
-                if address in received:
-                    received[address] += frames
-                else:
-                    received[address] = frames
+                if stream.pending_bytes:
+                    self._hold(stream, address)
         for address, frames in received.items():
-            port = self._ports.get(address) or self._admit(address, now)
-            if port is not None:
-                port.received_at = now
-                if port in self._silent:
-                    self._silent.remove(port)
-                    self.handler.on_port_active(port)
-                self.handler.on_frames(port, frames, now, STALE if address in stale else epoch, waited_s)
+            self._deliver(address, frames, now, STALE if address in stale else epoch, waited_s)
 
-    def _follow_cuts(self, address: SocketAddress, datagram: bytes, complete: int, now: float) -> None:
-        """Read a known client's datagrams as a stream from now on, if this one ends within a frame.
+    def _deliver(self, address: SocketAddress, frames: list[Frame], now: float, epoch: int, waited_s: float) -> None:
+        port = (self._ports.get(address) or self._admit(address, now)) if frames else None
+        if port is not None:
+            port.received_at = now
+            if port in self._silent:
+                self._silent.remove(port)
+                self.handler.on_port_active(port)
+            self.handler.on_frames(port, frames, now, epoch, waited_s)
 
-        A bridge from a serial line may cut its bytes anywhere. ``complete`` is the number of frames in the datagram.
-        If the splitter finds fewer, the others are behind the start that it holds, and that is not a frame's start.
-        A few bytes are more likely a stray start byte; a bridge soon cuts elsewhere.
-        """
-        splitter = StreamSplitter(SplitCounters(), max_hold_s=MAX_GAP_S, gives_up=True)
-        if len(splitter.feed(datagram, now)) == complete and splitter.pending_bytes >= MIN_FRAME_BYTES:
-            self.counters.garbage_bytes -= splitter.pending_bytes
-            splitter.counters = self.counters
-            self._splitters[address] = splitter
-
-    def _age(self, epoch: int) -> None:
-        """Mark the parts of frames that arrived before a pause: the whole frames are not new."""
-        self._epoch = epoch
-        for splitter in self._splitters.values():
-            splitter.age()
+    def _hold(self, stream: StreamSplitter, address: SocketAddress) -> None:
+        """Keep an unfinished frame. Senders that are not clients cannot displace those of clients."""
+        self._streams[address] = stream
+        if len(self._streams) > MOST_STREAMS + len(self._ports):
+            oldest = next(one for one in self._streams if one not in self._ports)
+            self.counters.garbage_bytes += self._streams.pop(oldest).pending_bytes
 
     def send(self, datagram: bytes, address: SocketAddress, frames: int) -> None:
         """Send a datagram with so many frames, and count it."""
@@ -166,6 +160,8 @@ class UdpEndpoint(Endpoint):
             last = send_again(self._sock, datagram, address, error, self._take_errors)
             if last is not None:
                 self.failures[failure_name(last)] += frames
+                if last.errno != errno.ECONNREFUSED:  # which is about an earlier datagram, perhaps to another client
+                    self._on_failed(address, last.errno)
                 return
         self.bytes_sent += len(datagram)
         self.frames_sent += frames
@@ -173,12 +169,12 @@ class UdpEndpoint(Endpoint):
     def do_housekeeping(self, now: float) -> None:
         """Give up incomplete frames whose rest does not arrive, and have the kernel report errors again."""
         self._reports.renew()
-        if self.handler.stall.epoch != self._epoch:
-            self._age(self.handler.stall.epoch)
-        for address, splitter in self._splitters.items():
-            epoch = self._epoch if splitter.is_fresh else STALE
-            if frames := splitter.give_up(now):
-                self.handler.on_frames(self._ports[address], frames, now, epoch)
+        epoch = self.handler.stall.epoch
+        for address, stream in list(self._streams.items()):
+            frames = stream.give_up(now, epoch)
+            if not stream.pending_bytes:
+                del self._streams[address]
+            self._deliver(address, frames, now, epoch if stream.is_fresh else STALE, 0.0)
 
     def close(self) -> None:
         super().close()
@@ -188,6 +184,10 @@ class UdpEndpoint(Endpoint):
     def _close_socket(self) -> None:
         self._reader.stop()
         self._sock.close()
+
+    def _is_welcome(self, address: SocketAddress) -> bool:
+        """Whether an address that is not a client's may become one. Datagrams from others are not looked at."""
+        return True
 
     @abstractmethod
     def _admit(self, address: SocketAddress, now: float) -> UdpPort | None:
@@ -202,7 +202,6 @@ class UdpEndpoint(Endpoint):
     def _forget(self, port: UdpPort) -> None:
         del self._ports[port.address]
         self._silent.discard(port)
-        self._splitters.pop(port.address, None)
         self.handler.on_port_closed(port)
 
     def _on_read_error(self, error: OSError) -> None:
@@ -214,8 +213,7 @@ class UdpEndpoint(Endpoint):
         reports = self._reports.take()
         for address, number in reports:
             self.failures[errno.errorcode.get(number, "OSError")] += 1
-            if number == errno.ECONNREFUSED and (port := self._port_at(address)) is not None:
-                self._on_refused(port)
+            self._on_failed(address, number)
         self._reader.renew()
         return bool(reports)
 
@@ -223,8 +221,8 @@ class UdpEndpoint(Endpoint):
         """The client at an address, whichever own address it asked."""
         return next((port for port in self._ports.values() if remote_of(port.address) == remote), None)
 
-    def _on_refused(self, port: UdpPort) -> None:
-        """No process listens at a client's address."""
+    def _on_failed(self, address: SocketAddress, number: int | None) -> None:
+        """A datagram to a client did not arrive, because of the kernel's error with this number."""
 
 
 class UdpServer(UdpEndpoint):
@@ -264,9 +262,10 @@ class UdpServer(UdpEndpoint):
             self._forget(silent)
         return self._open(address, now)
 
-    def _on_refused(self, port: UdpPort) -> None:
-        # Not within this call: it may be forwarding a frame of that client.
-        asyncio.get_running_loop().call_soon(self._forget_refusing, port)
+    def _on_failed(self, address: SocketAddress, number: int | None) -> None:
+        if number == errno.ECONNREFUSED and (port := self._port_at(address)) is not None:
+            # Not within this call: it may be forwarding a frame of that client.
+            asyncio.get_running_loop().call_soon(self._forget_refusing, port)
 
     def _forget_refusing(self, port: UdpPort) -> None:
         if self._ports.get(port.address) is port:

@@ -95,15 +95,9 @@ class SplitCounters:
 
 
 def split_datagram(datagram: bytes, counters: SplitCounters) -> list[Frame]:
-    """The frames in a datagram of a local client, for any bytes. A frame never continues in the next datagram.
-
-    A datagram of false starts costs a bounded time: MAX_FALSE_STARTS checksums for each valid frame in it.
-    """
-    frames: list[Frame] = []
-    position, fault = parse_frames(datagram, 0, frames, counters, is_expected=True)
-    if fault is not None:
-        find_frames(datagram[position:], frames, counters, in_garbage=False, is_final=True, gives_up=True)
-    return frames
+    """The frames in bytes behind which nothing follows."""
+    splitter = StreamSplitter(counters, gives_up=True)
+    return [*splitter.feed(datagram, 0.0), *splitter.end()]
 
 
 def split_payload(payload: bytes, counters: SplitCounters) -> list[Frame]:
@@ -277,35 +271,30 @@ class StreamSplitter:
         self._rest = b""
         self._in_garbage = False
         self._fed_at = 0.0
-        self._fresh_bytes = 0
-
-    @property
-    def is_fresh(self) -> bool:
-        """Whether all held bytes arrived after the last :meth:`age`."""
-        return len(self._rest) <= self._fresh_bytes
-
-    def age(self) -> None:
-        """Mark the held bytes as old, and so a frame that begins in them."""
-        self._fresh_bytes = 0
+        self._epoch = self._old_bytes = 0
+        self.is_fresh = True
+        """Whether the frames of the last call began in its epoch (:mod:`uavlinkd.system.stall`)."""
 
     @property
     def pending_bytes(self) -> int:
         """Bytes held because they may be the start of a frame. Below MAX_FRAME_BYTES."""
         return len(self._rest)
 
-    def feed(self, chunk: bytes, now: float) -> list[Frame]:
+    def feed(self, chunk: bytes, now: float, epoch: int = 0) -> list[Frame]:
         """The frames that this chunk completes, for any bytes. ``now`` is monotonic seconds."""
-        frames = self.give_up(now)
+        frames = self.give_up(now, epoch)
         held = len(self._rest)
         self._fed_at = now
-        self._fresh_bytes += len(chunk)
         if self._find(self._rest + chunk if held else chunk, frames, is_final=False) or not held:
             self._held_since = now
         return frames
 
-    def give_up(self, now: float) -> list[Frame]:
+    def give_up(self, now: float, epoch: int = 0) -> list[Frame]:
         """The frames in the held bytes, if these begin with a broken frame: they need not wait for the next chunk."""
         frames: list[Frame] = []
+        if epoch != self._epoch:
+            self._epoch, self._old_bytes = epoch, len(self._rest)
+        self.is_fresh = not self._old_bytes
         is_over = now - self._fed_at > self._max_gap_s or now - self._held_since > self._max_hold_s
         if self._rest and is_over:
             self._find(self._rest, frames, is_final=True)
@@ -328,6 +317,7 @@ class StreamSplitter:
             gives_up=is_final or self._gives_up,
         )
         self._rest = data[consumed:]
+        self._old_bytes = max(0, self._old_bytes - consumed)
         return consumed
 
 
