@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import select
 import termios
@@ -124,6 +125,21 @@ async def test_device_is_opened_exclusively(autopilot: Autopilot, endpoint: Seri
         assert list(second.ports) == []
         endpoint.close()
         await opened(second)
+
+
+def test_terminal_is_locked_also_through_another_device_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each of two containers has a file of its own for one terminal, so a lock of the file does not count."""
+    monkeypatch.setattr(serial, "_PSEUDO_TERMINALS", "none here")
+    terminal, slave = os.openpty()
+    try:
+        device = cast(BaseSerial, SimpleNamespace(fileno=lambda: slave))
+        serial.lock(device, "/dev/ttyUSB0")
+        with pytest.raises(OSError, match="another process") as refused:
+            serial.lock(device, "/dev/another")
+        assert refused.value.errno == errno.EBUSY
+    finally:
+        os.close(terminal)
+        os.close(slave)
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import socket
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Final
@@ -145,7 +146,9 @@ def _devices(file: Sections) -> Found:
     for section in (*file.endpoints, *file.networks):
         key = "url" if section.kind == "endpoint" else "serial"
         line = section.get(key)
-        if isinstance(line, SerialUrl) and (other := users.setdefault(line.device, section)) is not section:
+        if not isinstance(line, SerialUrl):
+            continue
+        if (other := users.setdefault(os.path.realpath(line.device), section)) is not section:
             yield section.at(key), f"is the device of {other.at()} too, and only one can open it: write another"
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import os
+import sys
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from math import inf
@@ -17,6 +19,10 @@ from uavlinkd.system.clock import monotonic
 from uavlinkd.system.stall import StallWatch
 from uavlinkd.system.tasks import Threads, keep_running
 
+if sys.platform == "linux":
+    import fcntl
+    import termios
+
 RETRY_S = 0.5  # wait between two attempts to open a device that is missing or not permitted
 IN_FLIGHT_S = 0.02  # the kernel gets no more than the line carries in this time, or one frame: it cannot be overtaken
 REFILL = 0.75  # it gets more when it holds no more than this part of that, so that frames share a wake-up
@@ -27,6 +33,7 @@ TERMINAL_BYTES = 4096 + 640 * 1024  # most that the kernel receives (N_TTY_BUF_S
 _BITS_PER_BYTE = 10  # with start and stop bit
 _WITHOUT_RATE = ("ttyACM", "ttyGS", "rfcomm", "cu.usbmodem", "tty.usbmodem")
 _PSEUDO_TERMINALS = "/dev/pts/"
+_TIOCGEXCL = 0x80045440  # not in the module termios: asm-generic/ioctls.h
 
 
 def has_line_rate(device: str) -> bool:
@@ -36,6 +43,22 @@ def has_line_rate(device: str) -> bool:
     """
     path = os.path.realpath(device)
     return not path.startswith(_PSEUDO_TERMINALS) and not os.path.basename(path).startswith(_WITHOUT_RATE)
+
+
+def lock(device: BaseSerial, path: str) -> None:
+    """Keep other processes from the terminal. Raises OSError (EBUSY) if one of them did.
+
+    The library locks the device file. A container has another file for the same terminal. A pseudo-terminal would
+    stay locked after the process is killed.
+    """
+    if sys.platform != "linux" or os.path.realpath(path).startswith(_PSEUDO_TERMINALS):
+        return
+    is_locked = False
+    with suppress(OSError):  # a few processors have another number
+        is_locked = any(fcntl.ioctl(device.fileno(), _TIOCGEXCL, bytes(4)))
+    if is_locked:  # and this process is root's, or the kernel had refused
+        raise OSError(errno.EBUSY, "another process has the device")
+    fcntl.ioctl(device.fileno(), termios.TIOCEXCL)
 
 
 def discard(device: BaseSerial) -> None:
@@ -80,7 +103,9 @@ class Opener:
         device = serial_for_url(self._url.device, self._url.baud, exclusive=True)
         try:
             device.open()
+            lock(device, self._url.device)
         except OSError:
+            device.close()
             raise
         except Exception as error:  # of the library and of termios, such as for an unsupported baud rate
             raise OSError(*error.args) from error
