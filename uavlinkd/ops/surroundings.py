@@ -6,6 +6,7 @@ and sends nothing. It asks the kernel for routes by ``ip route get`` of iproute2
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -50,7 +51,7 @@ class Reach(NamedTuple):
 
 class Surroundings(NamedTuple):
     """``reaches`` has all networks. ``lacks`` are sentences for a person: the daemon may run in spite of them, now or
-    later. ``errors`` too, about addresses that no network reaches.
+    later. ``errors`` too, about addresses that no network reaches, or that are not those of one machine.
     """
 
     reaches: list[Reach]
@@ -62,7 +63,8 @@ def look_around(config: Config) -> Surroundings:
     answers = _look_up_names(config)
     networks = look_at_networks(config, answers)
     others = _serial(config), _addresses(config), _names(config, answers), _control_socket(config)
-    return networks._replace(lacks=[*chain(*others), *networks.lacks])
+    errors = [*_broadcasts(config, answers), *networks.errors]
+    return networks._replace(lacks=[*chain(*others), *networks.lacks], errors=errors)
 
 
 def _addresses(config: Config) -> Iterator[str]:
@@ -124,6 +126,15 @@ def _names(config: Config, answers: Answers) -> Iterator[str]:
                 f"{section}: {address.host} has no address here now: see `getent hosts {address.host}`, or"
                 f' write an IP address, such as "10.13.0.2:{address.port}"'
             )
+
+
+def _broadcasts(config: Config, answers: Answers) -> Iterator[str]:
+    """Broadcast addresses, of which the kernel knows those of the interfaces that are up. It refuses to connect."""
+    for section, address in _named(config):
+        for host in answers.get(address.host, [address.host]):
+            with socket.socket(family_of(host), socket.SOCK_DGRAM) as probe, suppress(OSError):
+                if probe.connect_ex((host, address.port)) == errno.EACCES:
+                    yield f"{section}: {address} is a broadcast address: write the address of one machine"
 
 
 def _serial(config: Config) -> Iterator[str]:

@@ -75,7 +75,8 @@ ERROR_MEANINGS: Final[Mapping[str, str]] = {
     "ENXIO": "the device has gone: plug it in again",
     "ENODEV": "the device has gone: plug it in again",
     "EIO": "the device does not work: it was unplugged, or is broken",
-    "EACCES": "this user has no permission: for a serial device, add the user to its group, often dialout",
+    "EACCES": "this user has no permission: for a serial device, add the user to its group, often dialout; for UDP,"
+    " write the address of one machine: this is a broadcast address",
     "EBUSY": "another process has the device: end it (`fuser -v DEVICE` names it), often ModemManager",
     "ENOTTY": "it is not a serial device: name one, such as /dev/ttyUSB0",
     "ENOSPC": "no space is left on the disk: delete files, or set min_free_bytes lower",
