@@ -10,7 +10,7 @@ import pytest
 
 from tests.daemon.frames import frame
 from tests.daemon.harness import Stage
-from tests.daemon.process import DaemonProcess
+from tests.daemon.process import DaemonProcess, Status
 from tests.needs import need
 from uavlinkd.lab.sim.loopback_ports import free_port, has_ipv6
 
@@ -49,6 +49,25 @@ async def test_endpoints_over_ipv6(stage: Stage) -> None:
     autopilot.send(frame(1), into)
     await ground.until(lambda: ground.received == frame(1))
     assert list((await a.status())["endpoints"]["autopilot"]["clients"]) == [str(autopilot)]
+
+
+@pytest.mark.long
+async def test_broadcast_address_is_named_as_the_cause(stage: Stage) -> None:
+    """Its network may come up after ``check``."""
+    a, b = stage.pair()
+    into = a.add_endpoint("autopilot")
+    b.add_endpoint("ground", f"udpout:127.255.255.255:{free_port()}")
+    await stage.start(a, b)
+    autopilot = await stage.client()
+
+    def send(status: Status) -> bool:
+        autopilot.send(frame(1), into)
+        return "client_unreachable" in {finding["cause"] for finding in status["findings"]}
+
+    status = await b.until(send, timeout_s=10.0)
+    (found,) = [finding for finding in status["findings"] if finding["name"] == "ground"]
+    assert "cannot be reached (EACCES)" in found["text"]
+    assert "this is a broadcast address" in found["remedy"]
 
 
 async def test_a_link_between_link_local_addresses(stage: Stage) -> None:

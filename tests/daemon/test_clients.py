@@ -12,8 +12,9 @@ import pytest
 
 from tests import waiting
 from tests.daemon.fleet import drone_and_ground, held_back
+from tests.daemon.frames import heartbeat
 from tests.daemon.harness import Stage
-from tests.daemon.process import DaemonProcess
+from tests.daemon.process import DaemonProcess, Status
 from tests.lab.sim import scenarios
 from tests.lab.sim.scenarios import Seen
 from uavlinkd.lab.mitm.modem import ModemSettings
@@ -91,6 +92,25 @@ async def fly_with_mavproxy(stage: Stage, air: tuple[str, str], ground_url: str,
     drone_url, flight_url = (f"{kind}:127.0.0.1:{port}" for port in [free_port()] for kind in air)
     async with flying(stage, drone_url, flight_url, ground_url) as (flight, drone, ground):
         await check(flight, drone, ground, lambda: scenarios.fly_with_mavproxy(url, stage.folder, flight))
+
+
+@pytest.mark.long
+async def test_client_that_answers_from_another_port_is_named_and_counts_as_silent(stage: Stage) -> None:
+    """Within 10 s, although valid frames arrive all the time. Its frames are not carried."""
+    _, b, into, ground = await stage.one_way()
+    autopilot, answering = await stage.client(), await stage.client()
+
+    def exchange(status: Status) -> bool:
+        autopilot.send(heartbeat(), into)
+        if ground.sources:
+            answering.send(heartbeat(255), ground.sources[-1])
+        causes = {finding["cause"] for finding in status["findings"] if finding["name"] == "ground"}
+        return causes >= {"other_port", "client_silent"}
+
+    status = await b.until(exchange, timeout_s=10.0)
+    assert any(f"datagrams from {answering} are dropped" in finding["text"] for finding in status["findings"])
+    assert status["endpoints"]["ground"]["frames_received"] == 0
+    assert autopilot.datagrams == []
 
 
 async def test_mavsdk_flies_through_udp(stage: Stage) -> None:

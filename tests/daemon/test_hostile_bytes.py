@@ -110,7 +110,7 @@ async def test_a_stranger_gets_no_answer(stage: Stage) -> None:
 async def test_strangers_cannot_speak_through_a_udpout_endpoint(stage: Stage) -> None:
     """What does not come from the address of a ``udpout`` endpoint is not carried, and counted."""
     a, b = stage.pair()
-    autopilot, stranger = await stage.client(), await stage.client()
+    autopilot, other, stranger = await stage.client(), await stage.client(), await stage.client("127.0.0.2")
     a.add_endpoint("autopilot", f"udpout:{autopilot}")
     into = b.add_endpoint("ground")
     await stage.start(a, b)
@@ -118,8 +118,9 @@ async def test_strangers_cannot_speak_through_a_udpout_endpoint(stage: Stage) ->
     ground.send(heartbeat(255), into)
     await autopilot.until_received(heartbeat(255))
     here = ("127.0.0.1", autopilot.sources[-1][1])
-    stranger.send(frame(1), here)
+    for sender in (other, stranger):
+        sender.send(frame(1), here)
     autopilot.send(frame(2), here)
     await ground.until(lambda: ground.received == frame(2))
-    assert (await a.status())["endpoints"]["autopilot"]["failures"]["stranger"] == 1
-    assert stranger.datagrams == []
+    assert (await a.status())["endpoints"]["autopilot"]["failures"] == {"other_port": 1, "stranger": 1}
+    assert other.datagrams == stranger.datagrams == []

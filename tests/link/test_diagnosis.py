@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import replace
 from itertools import chain
@@ -34,6 +35,7 @@ from uavlinkd.link.own_problems import PROBLEMS, own_codes
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.traffic_problems import SECURITY_S, has_no_client, is_contested
 from uavlinkd.mavlink.frames import SplitCounters, split_payload
+from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.mavlink.routing import Router
 from uavlinkd.ops.findings import Finding, Severity, Subject
@@ -509,6 +511,20 @@ def test_frames_cannot_pass_without_any_client(daemon: Daemon, url: str, cause: 
     assert "client_silent" in {one.cause for one in found}
     assert not has_no_client(found, 2)
     assert not has_no_client([], 0)
+
+
+@pytest.mark.parametrize("url", ["udpin:0.0.0.0:14550", "udpout:192.0.2.1:14550"])
+def test_send_error_that_lasts_is_named_while_the_client_sends(daemon: Daemon, url: str) -> None:
+    """Whichever error it is: nothing else shows that one direction is blocked."""
+    endpoint: Any = SimpleNamespace(name="ground", ports=[SimpleNamespace(name="192.0.2.1:1")], frames_sent=0)
+    endpoint.counters, endpoint.failures = SplitCounters(), Counter[str]()
+    daemon.local.append(endpoint)
+    daemon.parts.config.endpoints.append(SimpleNamespace(name="ground", url=parse_url(url), policy={}))
+    for now in range(8):
+        endpoint.counters.frames += 1
+        endpoint.failures["EMSGSIZE"] += 1
+        daemon.history.sample([], [(endpoint, Policy({}, is_local=True))], float(now))
+        assert ("send_fails" in daemon.findings(float(now))) == (now >= 5)
 
 
 # What a peer says about itself.

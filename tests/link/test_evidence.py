@@ -181,6 +181,15 @@ class Traffic:
         return self.history.blocked(self.now)
 
 
+def test_growth_lasts_only_without_a_pause() -> None:
+    """From 5 s on. A single error, now and then, does not last."""
+    growth = RecentGrowth[str]()
+    for now, count, lasts in ((0, 1, False), (4, 2, False), (5, 3, True), (10, 4, True), (16, 5, False)):
+        growth.update({"EPERM": count}, float(now))
+        assert growth.lasting(float(now)) == ["EPERM"] * lasts
+    assert growth.lasting(30.0) == []
+
+
 def test_peer_whose_frames_are_all_refused_is_blocked() -> None:
     """From the first one until one passes, or until none came for ten seconds. An earlier passed frame hides none."""
     traffic = Traffic()

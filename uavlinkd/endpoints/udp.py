@@ -27,7 +27,7 @@ from uavlinkd.endpoints.ports import (
     failure_name,
 )
 from uavlinkd.endpoints.reader import Datagrams, Reader
-from uavlinkd.endpoints.sockets import BindError, ErrorReports, send_again, udp_socket
+from uavlinkd.endpoints.sockets import BindError, ErrorReports, family_of, send_again, udp_socket
 from uavlinkd.mavlink.frames import Frame, StreamSplitter, parse_frames
 from uavlinkd.mavlink.policy.delivery import Source
 from uavlinkd.system.addresses import Address
@@ -37,7 +37,10 @@ from uavlinkd.system.stall import STALE
 from uavlinkd.system.tasks import keep_running
 
 CLIENT_IDLE_S = 60.0  # `udpin` forgets a client that is silent for this long; even a listener sends heartbeats
-REMOTE_SILENT_S = 5.0  # the name of a `udpout` endpoint is looked up again when its address is silent for this long
+REMOTE_SILENT_S = 5.0  # a `udpout` whose client is silent for this long looks its name up, and tries another address
+ATTEMPT_S = 0.5  # it tries each address for this long at least, until the client answers
+AVOIDED_S = 30.0  # an address that failed is not used again for this long, if there is another one
+MAX_ADDRESSES = 8  # most addresses of a name that are used
 MAX_HOLD_S = 2.0  # A frame in pieces may take this long: a frame of 280 bytes from a radio of 1,400 bit/s does.
 MOST_STREAMS = 64
 """Most senders without a client's place whose unfinished frames are held. A new one displaces the oldest of these."""
@@ -273,14 +276,23 @@ class UdpServer(UdpEndpoint):
 
 
 class UdpClient(UdpEndpoint):
-    """``udpout``: one client, at the configured address. Datagrams from other addresses are counted and dropped.
+    """``udpout``: one client, at the configured address. If no process listens there, the kernel's ``ECONNREFUSED``
+    is counted.
 
-    If no process listens there, the kernel's ``ECONNREFUSED`` is counted.
+    The addresses of a name are used in turn until the client answers, without those that failed recently. A client
+    that sends from one of them is served there from then on. All other datagrams are dropped, because any host of the
+    network could send them: ``other_port`` counts those from the client's host, ``stranger`` the rest.
     """
 
     def __init__(self, name: str, remote: Address, handler: PortHandler) -> None:
         super().__init__(name, udp_socket(_ANY.get(remote.family, _ANY[socket.AF_INET])), handler)
+        self.other_port = ""
+        """The latest address with another port of the client's host that sent a datagram."""
         self._remote = remote
+        self._addresses: Sequence[SocketAddress] = ()
+        """The first one is used."""
+        self._used_since = -inf
+        self._failed_at: dict[SocketAddress, float] = {}
 
     def start(self) -> None:
         """Read whenever datagrams are there, and resolve the name again when its address is silent."""
@@ -289,16 +301,47 @@ class UdpClient(UdpEndpoint):
         following = keep_resolving(self._remote, self._interval_s, self._on_resolved, log)
         self._task = keep_running(following, f"the search for {self._remote}")
 
+    def do_housekeeping(self, now: float) -> None:
+        """Use the next address of the name if this one is silent."""
+        super().do_housekeeping(now)
+        patience_s = REMOTE_SILENT_S if self._received_at >= self._used_since else ATTEMPT_S
+        if now - max(self._received_at, self._used_since) >= patience_s:
+            turns = [*self._addresses[1:], *self._addresses[:1]]
+            self._use_first(sorted(turns, key=lambda one: now - self._failed_at.get(one, -inf) < AVOIDED_S), now)
+
+    @property
+    def _received_at(self) -> float:
+        return max((port.received_at or -inf for port in self.ports), default=-inf)
+
     def _interval_s(self) -> float:
         """The interval between look-ups: none while the client answers."""
-        received_at = max((port.received_at or -inf for port in self.ports), default=-inf)
-        is_silent = self._remote.ip is None and monotonic() - received_at >= REMOTE_SILENT_S
+        is_silent = self._remote.ip is None and monotonic() - self._received_at >= REMOTE_SILENT_S
         return LONGEST_WAIT_S if is_silent or not self.ports else inf
 
     def _on_resolved(self, resolved: Resolved) -> bool:
-        family, address = resolved[0]
-        if address in self._ports:
+        addresses = [address for _, address in resolved[:MAX_ADDRESSES]]
+        self._failed_at = {one: at for one, at in self._failed_at.items() if one in addresses}
+        return self._use_first(sorted(addresses, key=lambda one: one not in self._ports), monotonic())
+
+    def _use_first(self, addresses: Sequence[SocketAddress], now: float) -> bool:
+        """Serve the client at the first address whose family this machine has. Returns whether there is one."""
+        for at, address in enumerate(addresses):
+            if not self._has_socket(family_of(address[0])):
+                continue
+            self._addresses = addresses[at:]
+            if address not in self._ports:
+                self._used_since = now
+                if self._ports:
+                    _, port = self._ports.popitem()
+                    port.address, port.name = address, str(Address.of(address))
+                    self._ports[address] = port
+                else:
+                    self._open(address, None)
             return True
+        return False
+
+    def _has_socket(self, family: socket.AddressFamily) -> bool:
+        """Change to a socket of this family. Returns False if this machine has no such sockets."""
         if family != self._sock.family:
             try:
                 sock = udp_socket(_ANY[family])
@@ -310,11 +353,23 @@ class UdpClient(UdpEndpoint):
             self._use(sock)
             self._reader.gather_s = gather_s
             self._reader.start()
-        for port in self.ports:
-            self._forget(port)
-        self._open(address, None)
         return True
 
+    def _is_welcome(self, address: SocketAddress) -> bool:
+        if address in self._addresses:
+            return True
+        if any(address[0] == used[0] for used in self._ports):
+            self.failures["other_port"] += 1
+            self.other_port = str(Address.of(address))
+        else:
+            self.failures["stranger"] += 1
+        return False
+
     def _admit(self, address: SocketAddress, now: float) -> UdpPort | None:
-        self.failures["stranger"] += 1
-        return None
+        if address in self._addresses:  # it may have been removed meanwhile
+            self._use_first([address, *(one for one in self._addresses if one != address)], now)
+        return self._ports.get(address)
+
+    def _on_failed(self, address: SocketAddress, number: int | None) -> None:
+        if address in self._addresses:
+            self._failed_at[address] = monotonic()

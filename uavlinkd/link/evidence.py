@@ -189,6 +189,8 @@ def _addresses_of(peer: Peer) -> list[Place]:
 
 REMEMBERED_S: Final = 600.0
 """The growth of a counter is remembered for this time after it stopped."""
+LASTING_S: Final = 5.0
+"""A counter that grows for this time, with shorter pauses, counts something that lasts."""
 OWN_FRAMES_S: Final = 10.0
 """A foreign system counts as mixed with a peer's own if own frames passed within this time."""
 
@@ -209,7 +211,8 @@ class RecentGrowth(Generic[K]):
     def __init__(self) -> None:
         self._before: dict[K, int] = {}
         self._sum = 0
-        self._recent: dict[K, tuple[int, float]] = {}  # how much each grew without a long pause, and when last
+        self._recent: dict[K, tuple[int, float, float]] = {}
+        """How much each grew without a long pause, when last, and since when without a short one."""
 
     def update(self, counters: Mapping[K, int], now: float) -> dict[K, int]:
         """Read the counters. Returns what grew since the last call. A smaller counter began again at zero."""
@@ -225,12 +228,17 @@ class RecentGrowth(Generic[K]):
         self._before = dict(counters)
         self._recent = {key: recent for key, recent in self._recent.items() if now - recent[1] <= REMEMBERED_S}
         for key, count in grown.items():
-            self._recent[key] = self._recent.get(key, (0, now))[0] + count, now
+            before, grew_at, since = self._recent.get(key, (0, now, now))
+            self._recent[key] = before + count, now, since if now - grew_at <= LASTING_S else now
         return grown
 
     def within(self, seconds: float, now: float) -> dict[K, int]:
         """The counters that grew within the last ``seconds``, and by how much they grew without a long pause."""
-        return {key: count for key, (count, grew_at) in self._recent.items() if now - grew_at <= seconds}
+        return {key: count for key, (count, grew_at, _) in self._recent.items() if now - grew_at <= seconds}
+
+    def lasting(self, now: float) -> list[K]:
+        """The counters that have grown for :data:`LASTING_S` without a pause of this length."""
+        return [key for key in self.within(LASTING_S, now) if now - self._recent[key][2] >= LASTING_S]
 
 
 class GateHistory:

@@ -6,6 +6,7 @@ All of it is authentic, or happens on this machine. Without a peer's key, an att
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from typing import Final
@@ -13,6 +14,7 @@ from typing import Final
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.refusals import Claim
 from uavlinkd.core.sessions import Twin
+from uavlinkd.endpoints.udp import UdpClient
 from uavlinkd.endpoints.url import EndpointKind
 from uavlinkd.link.evidence import EVIDENCE_S, GateHistory
 from uavlinkd.link.facts import EndpointFacts, Found, PartFacts, PeerFacts, fault, listed, security, warning
@@ -49,7 +51,8 @@ _FLIGHT_COMMANDS: Final = frozenset(
 _EVERYDAY_COMMANDS: Final = frozenset({"MAV_CMD_REQUEST_MESSAGE", "MAV_CMD_SET_MESSAGE_INTERVAL"})
 """Commands that a vehicle's own components send too."""
 _CLAIMS_SHOWN: Final = 3
-_NOT_LISTENING: Final = ("ECONNREFUSED", "connect_timeout", "EHOSTUNREACH", "ENETUNREACH")
+_NOT_LISTENING: Final = "ECONNREFUSED"
+_KERNEL_ERRORS: Final = frozenset(errno.errorcode.values())
 
 
 def peer_problems(peer: PeerFacts) -> Iterator[Found]:
@@ -302,12 +305,23 @@ def _refused_kind(claim: Claim, now: float) -> str:
 
 
 def endpoint_problems(endpoint: EndpointFacts) -> Iterator[Found]:
-    """What its policy refuses, and why its client is silent."""
+    """What its policy refuses, why its client is silent, and why frames do not reach it."""
     yield from _hidden_frames(endpoint)
     yield from _refused(endpoint)
     yield from _commands(endpoint)
-    if endpoint.now - endpoint.history.silent_since >= SILENT_S:
+    failures, url = endpoint.history.failures, endpoint.config.url
+    is_silent = endpoint.now - endpoint.history.silent_since >= SILENT_S
+    if is_silent:
         yield _silent(endpoint)
+    errors = [name for name in failures.lasting(endpoint.now) if name in _KERNEL_ERRORS - {_NOT_LISTENING}]
+    if errors and (url.kind is EndpointKind.UDPIN or (url.kind is EndpointKind.UDPOUT and not is_silent)):
+        yield warning("send_fails", f"datagrams to clients of {url} are lost ({errors[0]})", meaning_of(errors[0]))
+    if isinstance(endpoint.endpoint, UdpClient) and "other_port" in failures.within(SILENT_S, endpoint.now):
+        yield warning(
+            "other_port",
+            f"datagrams from {endpoint.endpoint.other_port} are dropped: the client is {url}, at another port",
+            "let the client send from that port; or write udpin:HOST:PORT here, and let the client send there",
+        )
 
 
 def has_no_client(findings: Iterable[Finding], endpoints: int) -> bool:
@@ -319,14 +333,16 @@ def _silent(endpoint: EndpointFacts) -> Found:
     silent_s = endpoint.now - endpoint.history.silent_since
     url, ports = endpoint.config.url, endpoint.endpoint.ports
     failures = endpoint.history.failures.within(SILENT_S, endpoint.now)
-    not_listening = next((error for error in _NOT_LISTENING if error in failures), "")
-    if endpoint.history.garbage.within(SILENT_S, endpoint.now):
+    error = next((name for name in failures if name in _KERNEL_ERRORS or name == "connect_timeout"), "")
+    # A client of `udpin` has sent MAVLink: the bytes are another sender's.
+    is_known = url.kind is EndpointKind.UDPIN and bool(ports)
+    if not is_known and endpoint.history.garbage.within(SILENT_S, endpoint.now):
         return warning(
             "garbage",
             f"bytes arrive at {url}, and none of them is MAVLink",
             "correct the baud rate, set the port of the autopilot to MAVLink, and let only this daemon read it",
         )
-    if ports and not (url.kind is EndpointKind.UDPOUT and not_listening):
+    if ports and not (url.kind is EndpointKind.UDPOUT and error):
         return warning(
             "client_silent",
             f"the client {listed(port.name for port in ports)} has sent no MAVLink for {silent_s:.0f} s",
@@ -341,7 +357,9 @@ def _silent(endpoint: EndpointFacts) -> Found:
         return warning("no_client", text, "let the autopilot or ground station send there")
     if "not_resolved" in failures or (url.kind is EndpointKind.UDPOUT and not ports):
         text, remedy = f"the host of {url} has no address now", "write an IP address, or see `getent hosts NAME`"
-    else:
-        text = f"no process listens at {url}{f' ({not_listening})' if not_listening else ''}"
+    elif error in ("", _NOT_LISTENING, "connect_timeout"):
+        text = f"no process listens at {url}{f' ({error})' if error else ''}"
         remedy = "start the client there, or correct the port"
+    else:
+        text, remedy = f"{url} cannot be reached ({error})", meaning_of(error)
     return warning("client_unreachable", text, remedy)

@@ -35,6 +35,7 @@ ENDPOINT_FAILURES: Final[Mapping[str, str]] = {
     "not_resolved": "attempts without an address",
     "family_unavailable": "addresses of an unavailable family",
     "stranger": "datagrams of another address",
+    "other_port": "datagrams of another port of the client's host",
 }
 """Errors of an endpoint that the daemon names itself; the others are names of the kernel."""
 _NOT_USABLE: Final = {"unanswered": "no answer", "loss": "loss", "network": "no network"}
