@@ -232,6 +232,8 @@ def _keygen(options: argparse.Namespace) -> int:
 
     private = generate_private_key()
     if options.out is None:
+        if sys.stdout.isatty():
+            print("private key, which nobody else may see:", file=sys.stderr)
         print(private)
         print(f"public key: {public_key_text(private)}", file=sys.stderr)
         return OK

@@ -225,8 +225,10 @@ def test_signed_request_is_in_the_manifest_before_its_line_is_printed(folder: Pa
     with refused(folder, "already"):
         operations.sign(folder, request, Identity(ids=(7, 7)), unasked)
     operations.revoke(folder, "v7", unasked)
-    with refused(folder, "is that of v7, which is revoked"):
+    with refused(folder, "v7 was revoked, as serial 7: .* --replace v7"):
         operations.sign(folder, request, Identity(), unasked)
+    with refused(folder, "is that of v7, which is revoked"):
+        operations.sign(folder, request, Identity(), unasked, replaces=True)
 
 
 def test_revoked_member_frees_its_name(folder: Path) -> None:
@@ -329,7 +331,7 @@ ACTIONS: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.mark.parametrize("has_links", [True, False])
-@pytest.mark.parametrize("step", ["write", "_keep"])
+@pytest.mark.parametrize("step", ["write", "keep"])
 @pytest.mark.parametrize("action", ACTIONS.values(), ids=ACTIONS)
 def test_failed_write_changes_nothing(
     folder: Path, monkeypatch: pytest.MonkeyPatch, action: Callable[[Path], object], step: str, has_links: bool

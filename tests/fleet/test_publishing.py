@@ -18,6 +18,7 @@ from uavlinkd.cli import main
 from uavlinkd.core.certificates import parse_bulletin
 from uavlinkd.fleet import operations
 from uavlinkd.fleet.manifest import read_manifest
+from uavlinkd.ops import commands
 from uavlinkd.ops.control import MAX_REQUEST_BYTES, Answer, ControlServer
 from uavlinkd.system.addresses import Address
 
@@ -96,10 +97,25 @@ def test_removal_without_a_daemon_says_what_is_left_to_do(tmp_path: Path, capsys
     assert (
         main(["fleet", "remove", "drone1", "--out", str(tmp_path / "fleet"), "--socket", str(tmp_path / "no")]) == 1
     )
-    error = capsys.readouterr().err
-    assert "drone1 is revoked in" in error
-    assert f"Then run `uavlinkd fleet publish --socket {tmp_path / 'no'}`" in error
+    said = capsys.readouterr()
+    assert "drone1 is revoked, by bulletin 2." in said.out
+    assert "the 1 other members have not heard of it" in said.err
+    assert f"when you run `uavlinkd fleet publish --socket {tmp_path / 'no'}`" in said.err
     assert read_manifest(tmp_path / "fleet").bulletin.revoked == (2,)
+
+
+def test_removal_without_a_service_revokes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No daemon runs on the laptop: the bulletin is signed all the same. A wrong name is named."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(commands, "RUNTIME_FOLDER", tmp_path / "none")
+    create(tmp_path / "fleet", drones=2, relays=RELAYS)
+    assert main(["fleet", "remove", "nosuch"]) == 2
+    assert 'this fleet has no "nosuch": its members are relay, drone1, drone2' in capsys.readouterr().err
+    assert main(["fleet", "remove", "drone2"]) == 1
+    assert "drone2 is revoked, by bulletin 2." in capsys.readouterr().out
+    assert read_manifest(tmp_path / "fleet").former("drone2") is not None
 
 
 async def test_new_certificates_come_before_the_bulletin_that_ends_the_old_ones(

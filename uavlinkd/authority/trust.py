@@ -24,6 +24,7 @@ from uavlinkd.core.certificates import (
 from uavlinkd.core.crypto import AuthorityKey
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.peer import Peer
+from uavlinkd.system.base64_text import to_base64
 
 
 class HeldCertificate(NamedTuple):
@@ -76,6 +77,17 @@ class Trust:
     @property
     def digest(self) -> bytes:
         return digest_of(self.bulletin_bytes)
+
+    def known(self) -> dict[str, object]:
+        """The bulletin and the certificates with their keys, in base64, as `fleet restore` reads them."""
+        own = {} if self.own is None else {self.own_key: self.own}
+        return {
+            "fleet": {"authority": to_base64(self._authority.public), "bulletin": to_base64(self.bulletin_bytes)},
+            "contact": [
+                {"public_key": to_base64(key), "certificate": to_base64(held.data)}
+                for key, held in (own | self.held).items()
+            ],
+        }
 
     def replace_own(self, data: bytes) -> bool:
         """Use a newer certificate for the own key. Returns whether it is one."""

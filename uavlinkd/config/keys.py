@@ -92,30 +92,36 @@ def is_canonical_public_key(public: bytes) -> bool:
 
 
 def write_secret_file(path: Path, text: str) -> None:
-    """Write a key to a new file that only its owner may read, and sync it to the disk.
+    """Write a key in ASCII, as :func:`write_private_file` does."""
+    write_private_file(path, text.strip().encode("ascii") + b"\n")
+
+
+def write_private_file(path: Path, data: bytes) -> None:
+    """Write a new file that only its owner may read, and sync it to the disk. It appears whole, or not at all.
 
     Raises KeyFileError if the file exists (a key is never overwritten), or cannot be written.
     """
-    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | _CLOEXEC
+    if os.path.lexists(path):
+        raise KeyFileError(f"{path}: exists, and keys are never overwritten: move it away")
+    new = path.with_name(f".{path.name}.new")
     try:
-        descriptor = os.open(path, flags, 0o600)
-    except FileExistsError:
-        raise KeyFileError(f"{path}: exists, and keys are never overwritten: move it away") from None
+        new.unlink(missing_ok=True)  # of a command that was killed
+        descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _CLOEXEC, 0o600)
     except OSError as error:
         raise KeyFileError(f"{path}: cannot be made: {error.strerror}") from None
     try:
-        with os.fdopen(descriptor, "w", encoding="ascii") as file:
+        with os.fdopen(descriptor, "wb") as file:
             # A umask could remove the owner's rights too.
             if _HAS_OWNERS:
                 os.fchmod(file.fileno(), 0o600)
-            file.write(text.strip() + "\n")
+            file.write(data)
             file.flush()
             os.fsync(file.fileno())
+        new.rename(path)
         sync_folder(path.parent)
     except BaseException as error:
-        # Delete half a key: otherwise the next attempt would refuse to overwrite it.
         with suppress(OSError):
-            path.unlink()
+            new.unlink()
         if isinstance(error, OSError):
             raise KeyFileError(f"{path}: cannot be written: {error.strerror}") from None
         raise

@@ -6,6 +6,7 @@ Lines for pipes go to standard output, all else about them to standard error.
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import fields
@@ -24,11 +25,13 @@ from uavlinkd.fleet.authority_key import (
     read_paper,
 )
 from uavlinkd.fleet.files import config_file
-from uavlinkd.fleet.manifest import Fleet, FleetSettings, Member, parse_addresses, read_manifest
+from uavlinkd.fleet.manifest import FILE_NAME, Fleet, FleetSettings, Member, parse_addresses, read_manifest
 from uavlinkd.fleet.operations import Result
+from uavlinkd.fleet.recovery import read_source
 from uavlinkd.fleet.signing import Identity
 from uavlinkd.mavlink.dialect import SYSTEM_ID
-from uavlinkd.ops.commands import control_socket
+from uavlinkd.ops.commands import control_socket, control_sockets
+from uavlinkd.ops.control import ask as ask_daemon
 from uavlinkd.system.base64_text import to_base64
 from uavlinkd.system.terminal import CommandError, printable
 
@@ -45,8 +48,10 @@ def _init(options: argparse.Namespace) -> None:
     places = parse_addresses("--relay", options.relay), parse_addresses("--station-address", options.station_address)
     result, private = operations.init(options.out, settings, counts, places, _new_passphrase(options))
     _print_result(options, result)
-    _say(f"\n{options.out / AUTHORITY_FILE} signs members: back it up. Its paper copy, for a safe:")
+    _say(f"\n{options.out / AUTHORITY_FILE} signs members. Its paper copy, for a safe:")
     _say(paper_copy(private) if sys.stdout.isatty() else "(`uavlinkd fleet paper` prints it on a terminal)")
+    _say("Keep on another machine, made anew after each change: `uavlinkd fleet backup FILE`. Without it, the paper")
+    _say("copy and any member restore the fleet: `uavlinkd fleet restore --member FILE`.")
     _say(f"Carry {options.out / SUCCESSOR_FILE} away: it is for a later version. After a theft, create a new fleet.")
 
 
@@ -104,28 +109,53 @@ def _change(options: argparse.Namespace) -> None:
     elif options.action == "rotate":
         result = operations.add(options.out, options.name, Identity(), ask, replaces=True)
     else:
-        socket = control_socket(options) if options.action == "remove" else None
         resign = options.action == "revoke" and options.resign
         result = operations.revoke(options.out, options.name, ask, resign=resign)
+        _say(f"{options.name} is revoked, by bulletin {result.fleet.bulletin.number}.")
+    if options.action == "remove":
         try:
-            if socket is not None:
-                _say_published(operations.publish(options.out, socket, ask))
+            _publish_here(options, ask)
         except CommandError as error:
-            reason = f"{options.name} is revoked in {options.out}, but no daemon has the bulletin: {error}"
             given = "".join(f" --{key} {value}" for key in ("config", "socket") if (value := getattr(options, key)))
-            raise CommandError(f"{reason}\nThen run `uavlinkd fleet publish{given}`") from None
+            raise CommandError(
+                f"the {len(result.fleet.current)} other members have not heard of it: {error}\n"
+                f"They will when you run `uavlinkd fleet publish{given}` beside a member's daemon that is up"
+            ) from None
     _print_result(options, result)
     if options.action in ("revoke", "rotate"):
         _say("Now publish the bulletin with `uavlinkd fleet publish`: until then members accept the old certificate.")
 
 
 def _publish(options: argparse.Namespace) -> None:
-    ask = passphrase_from(options.passphrase_file)
-    _say_published(operations.publish(options.out, control_socket(options), ask, merges=options.merge))
+    _publish_here(options, passphrase_from(options.passphrase_file), merges=options.merge)
 
 
-def _say_published(fleet: Fleet) -> None:
-    _say(f"The daemon has bulletin {fleet.bulletin.number}, and passes it on.")
+def _publish_here(options: argparse.Namespace, ask: Passphrase, *, merges: bool = False) -> None:
+    """Hand the bulletin to each daemon here that is a member. Raises CommandError if none has it then."""
+    fleet, errors = None, list[CommandError]()
+    for socket in control_sockets(options):
+        try:
+            fleet = operations.publish(options.out, socket, ask, merges=merges)
+        except CommandError as error:
+            errors.append(error)
+    if fleet is None:
+        raise errors[0]
+    for each in errors:
+        _note(str(each))
+    _say(
+        f"The daemon has bulletin {fleet.bulletin.number}, and passes it on: members that are up have it within"
+        " seconds, others when they meet one that has it. `uavlinkd status` shows which."
+    )
+
+
+def _members(options: argparse.Namespace) -> None:
+    print(json.dumps(ask_daemon(control_socket(options), "fleet")))
+
+
+def _backup(options: argparse.Namespace) -> None:
+    operations.backup(options.out, options.file)
+    _say(f"{options.file} has the manifest and the authority's keys. Keep it on another machine.")
+    _say(f"`tar -xf {options.file}` makes {options.out.name} from it.")
 
 
 def _paper(options: argparse.Namespace) -> None:
@@ -133,10 +163,27 @@ def _paper(options: argparse.Namespace) -> None:
 
 
 def _restore(options: argparse.Namespace) -> None:
+    has_manifest = (options.out / FILE_NAME).exists()
+    if has_manifest and options.member:
+        raise FleetError(f"{options.out / FILE_NAME} exists, so --member has nothing to add: leave it out")
+    if not has_manifest and not options.member:
+        raise FleetError(
+            f"{options.out} has no {FILE_NAME}: extract a backup, or name what members know, each file with --member:"
+            " a copy of one's configuration (ssh v7 cat v7.toml > v7.toml), and what its daemon knows of the others"
+            " (ssh v7 uavlinkd fleet members --config v7.toml > members.json)"
+        )
+    sources = list(map(read_source, options.member))
     _prompt("type both lines of the paper copy, then press Ctrl-D")
     text = sys.stdin.read(LONGEST_LINE)
-    operations.restore(options.out, read_paper(text), _new_passphrase(options))
+    fleet = operations.restore(options.out, read_paper(text), _new_passphrase(options), sources)
     _say(f"{options.out / AUTHORITY_FILE} is the fleet's authority.")
+    if not has_manifest:
+        _print_table(fleet, fleet.members)
+        _say("Members that are missing here go on flying. To revoke one, restore with a member that knows it.")
+        if not fleet.reachable:
+            _say(
+                "No member has an address here: before you sign others, add a relay, or restore with a configuration."
+            )
 
 
 def _enroll(options: argparse.Namespace) -> None:
@@ -205,7 +252,8 @@ def _to_carry(options: argparse.Namespace, result: Result) -> list[str]:
 def _list(options: argparse.Namespace) -> None:
     fleet = read_manifest(options.out)
     _say(f"fleet {fingerprint_of(fleet.authority.public)}, bulletin {fleet.bulletin.number}")
-    _print_table(fleet, fleet.members)
+    last = {member.name: member for member in (*fleet.members, *fleet.current)}  # former keys are not members
+    _print_table(fleet, last.values())
 
 
 def _print_table(fleet: Fleet, members: Iterable[Member]) -> None:
@@ -245,5 +293,7 @@ ACTIONS: dict[str, Callable[[argparse.Namespace], None]] = {
     "list": _list,
     "paper": _paper,
     "restore": _restore,
+    "backup": _backup,
+    "members": _members,
     "enroll": _enroll,
 }

@@ -25,6 +25,9 @@ _LIMIT = 4096
 _CHECK_BYTES = 3  # of a paper copy, which so has 56 characters without padding
 _GROUP = 4
 
+LEAST_PASSPHRASE = 12
+"""Characters of a new passphrase: who has a copy of the file can try millions a second."""
+
 Passphrase = Callable[[str], Secret]  # returns the passphrase, given what it is for
 
 
@@ -40,6 +43,10 @@ def passphrase_from(file: Path | None, *, is_new: bool = False) -> Passphrase:
             place = f"{file} is empty" if file is not None else "the passphrase is empty"
             advice = "choose four words or more, at random; without one, each copy of the file signs"
             raise FleetError(f"{place}: {advice if is_new else f'it must be that of {what}'}")
+        if is_new and len(typed) < LEAST_PASSPHRASE:
+            raise FleetError(
+                f"the passphrase has fewer than {LEAST_PASSPHRASE} characters: choose four words or more, at random"
+            )
         if is_new and file is None and _typed("once more: ") != typed:
             raise FleetError("the two passphrases differ: run the command again")
         return Secret(typed)

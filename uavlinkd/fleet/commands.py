@@ -75,15 +75,19 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     revoke.add_argument("--resign", action="store_true", help="sign all others again, which empties the bulletin")
     publish = add("publish", "hand the bulletin to a running daemon, which passes it on")
     publish.add_argument("--merge", action="store_true", help="the fleet has a newer bulletin: sign the union")
-    for action in (publish, remove):
+    members = add("members", "print what a running daemon knows of its fleet, for `restore`", signs=False)
+    for action in (publish, remove, members):
         daemon = action.add_mutually_exclusive_group()
         daemon.add_argument("--config", metavar="FILE", type=Path, help="the daemon's configuration")
         daemon.add_argument("--socket", metavar="PATH", type=Path, help="the daemon's control socket")
     add("list", "list the members, also revoked ones", signs=False)
     add("paper", "print the paper copy of authority.pem, with which each reader can sign")
-    add("restore", "write authority.pem from its paper copy on standard input").add_argument(
-        "--no-passphrase", action="store_true", help="as of init"
-    )
+    restore = add("restore", "write authority.pem from its paper copy on standard input")
+    restore.add_argument("--no-passphrase", action="store_true", help="as of init")
+    text = "without the folder: a member's configuration, or what `fleet members` printed there (may be repeated)"
+    restore.add_argument("--member", action="append", default=[], metavar="FILE", type=Path, help=text)
+    backup = add("backup", "copy the manifest and the authority's keys into a tar file", signs=False)
+    backup.add_argument("file", metavar="FILE", type=Path)
 
 
 def _add_list(parser: argparse.ArgumentParser, name: str, metavar: str, text: str) -> None:

@@ -25,7 +25,7 @@ from uavlinkd.core.crypto import x25519_public_key
 from uavlinkd.core.drops import Drop
 from uavlinkd.fleet.files import config_file, edited, key_file, listen_on, write_config
 from uavlinkd.fleet.manifest import FleetSettings
-from uavlinkd.fleet.transaction import changing
+from uavlinkd.fleet.transaction import aside_of, changing, recover
 from uavlinkd.mavlink.dialect import SYSTEM_ID
 from uavlinkd.system.base64_text import from_base64
 
@@ -87,6 +87,11 @@ def finish(line: str, config: Path | None, folder: Path | None, url: str | None,
     path, contacts = _verified(reply, certificate.name, [place.key(_other(own)), former])
     name = own if path == former else _other(own)  # it may be in another folder
     listen = listen or ([] if "listen" in table else listen_on(reply))
+    replaced = place.key(_other(own))
+    if (aside := aside_of(replaced)).exists():  # a command was killed when the configuration had the new key
+        replaced.unlink(missing_ok=True)
+        aside.unlink()
+    recover((place.config, former))
     with changing() as changes:
         if table:
             if url is not None and url not in _urls(table):
@@ -100,10 +105,12 @@ def finish(line: str, config: Path | None, folder: Path | None, url: str | None,
             if url is not None:
                 settings = replace(settings, drone_url=url, ground_station_url=url)
             text = write_config(reply, settings, name, listen)
-        changes.write(place.config, text, place.environ())
         has_former = path != former and former.exists()
         if has_former:
-            changes.delete(former)
+            changes.keep(former)
+        changes.write(place.config, text, place.environ())
+        if has_former:
+            former.unlink(missing_ok=True)
     fingerprint = fingerprint_of(reply.authority)
     ids = f"the id of the ground control station, to system id {ids_of(certificate)}"
     return [

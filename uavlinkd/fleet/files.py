@@ -106,6 +106,17 @@ def write_config(reply: Reply, settings: FleetSettings, private_key_file: str, l
     return with_fleet("\n".join(lines) + "\n", reply)
 
 
+def is_outdated(path: Path, reply: Reply) -> bool:
+    """Whether a configuration has another certificate than the present one, or other contacts."""
+    try:
+        table = _parsed(path.read_text(encoding="utf-8-sig"))
+        present = [contact["certificate"] for contact in table.get("contact", ())]
+    except (ValueError, TypeError, LookupError, FleetError):  # a person's: it is not changed without need
+        return False
+    wanted = [to_base64(contact.certificate) for contact in reply.contacts]
+    return (table.get("fleet", {}).get("certificate"), present) != (to_base64(reply.certificate), wanted)
+
+
 def edited(path: Path, reply: Reply, top: Table | None = None, former_ids: tuple[int, int] | None = None) -> str:
     """A member's configuration as :func:`with_fleet` changes it."""
     try:

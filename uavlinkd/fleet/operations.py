@@ -1,21 +1,28 @@
-"""The operations on a fleet's folder: init, sign, add, rotate, revoke, publish and restore.
+"""The operations on a fleet's folder: init, sign, add, rotate, revoke, publish, restore and backup.
 
 A fleet's folder contains the manifest, the authority's key, and a folder for each member whose key was made here. The
 commands do not need that again: it may have been moved to its vehicle. An operation that raises FleetError changed
 nothing.
+
+A certificate is in the manifest before it is in any other file: a serial is never used twice, and each member that
+was signed is known, wherever the command was killed.
 """
 
 from __future__ import annotations
 
 import errno
+import io
 import os
 import secrets
+import shutil
+import tarfile
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from uavlinkd.authority.enrolment import FleetError, Request
 from uavlinkd.authority.trust import BulletinVerdict
@@ -34,8 +41,9 @@ from uavlinkd.fleet.manifest import (
     read_manifest,
     write_manifest,
 )
+from uavlinkd.fleet.recovery import recovered
 from uavlinkd.fleet.signing import Identity
-from uavlinkd.fleet.transaction import FileChanges, changing, lock
+from uavlinkd.fleet.transaction import FileChanges, changing, is_unlocked, lock, recover
 from uavlinkd.ops.control import ask as ask_daemon
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.base64_text import to_base64
@@ -87,6 +95,7 @@ def init(
             private_keys[full] = keys.generate_private_key()
             fleet = signing.certify(fleet, signer, _public(private_keys[full]), full, Identity(role, None, addresses))
     try:
+        _remove_half_made(folder)
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise _exists(folder)
         passphrase = None if ask is None else ask(AUTHORITY_FILE)
@@ -94,11 +103,12 @@ def init(
         prefix = f".{folder.name}-"
         with tempfile.TemporaryDirectory(prefix=prefix, dir=folder.parent, ignore_cleanup_errors=True) as name:
             building = Path(name)
-            with changing() as changes:
+            with lock(building), changing() as changes:
                 for file, key in ((AUTHORITY_FILE, private), (SUCCESSOR_FILE, successor)):
                     changes.write_secret(building / file, signing_key_pem(key, passphrase, os.urandom))
                 for member in fleet.members:
-                    _write_member(changes, building, fleet, member, private_keys[member.name])
+                    _write_key(changes, building, member, private_keys[member.name])
+                    _write_config(changes, building, fleet, member)
                 changes.write(building / FILE_NAME, write_manifest(fleet))
             building.chmod(0o755)
             building.rename(folder)
@@ -147,14 +157,19 @@ def sign(
     with _changing(folder) as (before, changes):
         known = next((member for member in before.current if member.public_key == request.public_key), None)
         if known is not None and known.name == request.name and identity.is_of(known):
-            return Result(before), files.reply_for(before, known).line()
-        signer = _signer(folder, before, ask)
-        fleet = signing.certify(before, signer, request.public_key, request.name, identity, replaces=replaces)
+            fleet = before
+        else:
+            signer = _signer(folder, before, ask)
+            # A key that was made here is no stranger's that asks for a revoked name.
+            replaces = replaces or (private is not None and before.former(request.name) is not None)
+            fleet = signing.certify(before, signer, request.public_key, request.name, identity, replaces=replaces)
         member = fleet.member(request.name)
-        if private is not None:
-            _write_member(changes, folder, fleet, member, private)
         changed = () if private is None else (member.name,)
-        result = _save(changes, folder, fleet, before, but=member.name, changed=changed)
+        if private is not None:
+            _write_key(changes, folder, member, private)
+        result = _save(changes, folder, before, fleet, member.name, changed)
+        if private is not None:
+            _write_config(changes, folder, fleet, member)
     return result, files.reply_for(fleet, member).line()
 
 
@@ -165,30 +180,60 @@ def line_of(folder: Path, name: str) -> str:
 
 
 def add(folder: Path, name: str, identity: Identity, ask: Passphrase, *, replaces: bool = False) -> Result:
-    """Make a key and a folder for a new member. ``replaces``: a new key for a member, whose old one is revoked."""
+    """Make a key and a folder for a new member. ``replaces``: a new key for a member, whose old one is revoked.
+
+    A key without a configuration is of a command that was killed: it is used.
+    """
+    key = folder / name / files.key_file(name)
     if replaces:
         read_manifest(folder).member(name)
-    private = keys.generate_private_key()
+        private = keys.generate_private_key()
+    elif key.exists() and not key.with_name(files.config_file(name)).exists():
+        private = keys.encode_key(keys.read_secret_file(key).reveal())
+    else:
+        private = keys.generate_private_key()
     return sign(folder, Request(name, _public(private)), identity, ask, replaces=replaces, private=private)[0]
 
 
 def revoke(folder: Path, name: str, ask: Passphrase, *, resign: bool = False) -> Result:
     """Sign a bulletin that refuses a member. Its own folder is kept. Once more changes nothing."""
     with _changing(folder) as (before, changes):
-        if before.former(name) is not None:
-            return Result(before)
-        member = before.member(name)
-        fleet = signing.revoke(before, _signer(folder, before, ask), [member], resign=resign)
-        return _save(changes, folder, fleet, before if resign else None)
+        fleet = before
+        if before.former(name) is None:
+            member = before.member(name)
+            fleet = signing.revoke(before, _signer(folder, before, ask), [member], resign=resign)
+        return _save(changes, folder, before, fleet)
 
 
-def restore(folder: Path, private: Secret, ask: Passphrase | None) -> None:
-    """Write the authority's key from its paper copy, with a new passphrase, unless the file exists."""
-    with _changing(folder) as (fleet, changes):
+def restore(folder: Path, private: Secret, ask: Passphrase | None, sources: Sequence[dict[str, Any]] = ()) -> Fleet:
+    """Write the authority's key from its paper copy, with a new passphrase, unless the file exists.
+
+    ``sources``: what members have of the fleet, if the folder is lost too.
+    """
+    if sources:
+        folder.mkdir(mode=0o755, parents=True, exist_ok=True)
+    with lock(folder), changing() as changes:
+        _recover(folder)
+        fleet = recovered(sources) if sources else read_manifest(folder)
         if SigningKey(private).public != fleet.authority.public:
             raise FleetError("this paper copy is of another authority than this fleet's")
         passphrase = None if ask is None else ask(AUTHORITY_FILE)
+        if sources:
+            changes.write(folder / FILE_NAME, write_manifest(fleet))
         changes.write_secret(folder / AUTHORITY_FILE, signing_key_pem(private, passphrase, os.urandom))
+    return fleet
+
+
+def backup(folder: Path, file: Path) -> None:
+    """Write the manifest and the authority's keys, encrypted as they are, into a new tar file for its owner alone."""
+    with lock(folder), changing():
+        read_manifest(folder)
+        data = io.BytesIO()
+        with tarfile.open(fileobj=data, mode="w") as archive:
+            for name in (FILE_NAME, AUTHORITY_FILE, SUCCESSOR_FILE):
+                if (folder / name).exists():
+                    archive.add(folder / name, f"{folder.name}/{name}")
+    keys.write_private_file(file, data.getvalue())
 
 
 def publish(folder: Path, socket: Path, ask: Passphrase, *, merges: bool = False) -> Fleet:
@@ -208,7 +253,7 @@ def publish(folder: Path, socket: Path, ask: Passphrase, *, merges: bool = False
     if bulletin.number > own or (bulletin.number == own and theirs != to_base64(fleet.published)):
         with _changing(folder) as (before, changes):
             fleet = signing.merge(before, _signer(folder, before, ask), bulletin)
-            _save(changes, folder, fleet)
+            _save(changes, folder, before, fleet)
     # The certificates come first: a member that meets the bulletin with its old one would be refused.
     certificates = [
         f"{to_base64(member.public_key)}:{to_base64(member.signed)}"
@@ -228,9 +273,25 @@ def publish(folder: Path, socket: Path, ask: Passphrase, *, merges: bool = False
 def _changing(folder: Path) -> Iterator[tuple[Fleet, FileChanges]]:
     """Lock a fleet's folder, read its manifest, and change its files."""
     with lock(folder):
+        with changing():
+            _recover(folder)
         fleet = read_manifest(folder)
         with changing() as changes:
             yield fleet, changes
+
+
+def _recover(folder: Path) -> None:
+    """Clean up after a command that was killed."""
+    beside = [path for end in ("new", "old") for path in (*folder.glob(f".*.{end}"), *folder.glob(f"*/.*.{end}"))]
+    recover({path.with_name(path.name[1:-4]) for path in beside})
+
+
+def _remove_half_made(folder: Path) -> None:
+    """Remove what a killed `init` of this folder left. One that still works holds its lock."""
+    for half_made in folder.parent.glob(f".{folder.name}-*"):
+        with suppress(OSError):
+            if is_unlocked(half_made):
+                shutil.rmtree(half_made)
 
 
 def _signer(folder: Path, fleet: Fleet, ask: Passphrase) -> SigningKey:
@@ -244,39 +305,36 @@ def _public(private: str) -> bytes:
     return keys.decode_key(keys.public_key_text(private))
 
 
-def _write_member(changes: FileChanges, folder: Path, fleet: Fleet, member: Member, private: str) -> None:
-    """Write the key and the configuration of a member. A configuration that is there keeps its edits."""
-    path = folder / member.name / files.config_file(member.name)
-    key = path.with_name(files.key_file(member.name))
+def _write_key(changes: FileChanges, folder: Path, member: Member, private: str) -> None:
+    key = folder / member.name / files.key_file(member.name)
+    changes.delete(key)
+    changes.write_secret(key, private)
+
+
+def _write_config(changes: FileChanges, folder: Path, fleet: Fleet, member: Member) -> None:
+    """Write the configuration of a member. One that is there keeps its edits."""
+    path, key = folder / member.name / files.config_file(member.name), files.key_file(member.name)
     reply = files.reply_for(fleet, member)
     if path.exists():
-        changes.delete(key)
-        text = files.edited(path, reply, {"private_key_file": key.name})
+        text = files.edited(path, reply, {"private_key_file": key})
     else:
-        text = files.write_config(reply, fleet.settings, key.name, files.listen_on(reply))
-    changes.write_secret(key, private)
+        text = files.write_config(reply, fleet.settings, key, files.listen_on(reply))
     changes.write(path, text, {})
 
 
 def _save(
-    changes: FileChanges,
-    folder: Path,
-    fleet: Fleet,
-    before: Fleet | None = None,
-    *,
-    but: str = "",
-    changed: tuple[str, ...] = (),
+    changes: FileChanges, folder: Path, before: Fleet, fleet: Fleet, but: str = "", changed: tuple[str, ...] = ()
 ) -> Result:
-    """Write the manifest, and if contacts differ from those ``before``, the configurations that are here."""
-    is_new = before is not None and before.reachable != fleet.reachable
+    """Write the manifest, then the configurations that are here and have another certificate or other contacts."""
+    if fleet is not before:
+        changes.write(folder / FILE_NAME, write_manifest(fleet))
+    has_new_contacts = before.reachable != fleet.reachable
     elsewhere: tuple[str, ...] = ()
-    for member in (member for member in fleet.current if is_new and member.name != but):
-        path = folder / member.name / files.config_file(member.name)
-        if path.exists():
-            changes.write(path, files.edited(path, files.reply_for(fleet, member)))
-        if path.parent.exists():
+    for member in (member for member in fleet.current if member.name != but):
+        path, reply = folder / member.name / files.config_file(member.name), files.reply_for(fleet, member)
+        if path.exists() and (has_new_contacts or files.is_outdated(path, reply)):
+            changes.write(path, files.edited(path, reply))
             changed += (member.name,)
-        else:
+        elif has_new_contacts and not path.parent.exists():
             elsewhere += (member.name,)
-    changes.write(folder / FILE_NAME, write_manifest(fleet))
     return Result(fleet, changed, elsewhere)

@@ -63,7 +63,13 @@ def certify(
         raise FleetError(
             f'this fleet has a "{name}" already: choose another name, or replace its key (--replace {name})'
         )
-    model = former or (fleet.former(name) if replaces else None)
+    gone = fleet.former(name)
+    if gone is not None and not replaces:
+        raise FleetError(
+            f"{name} was revoked, as serial {gone.certificate.serial}: if it is to come back with a new key,"
+            f" --replace {name}; else choose another name"
+        )
+    model = former or gone
     if model is not None:
         role, ids = (
             role or model.role,

@@ -1,10 +1,14 @@
-"""Changes of a fleet's files: one command at a time, and if a step fails, all files are as before."""
+"""Changes of a fleet's files: one command at a time, and if a step fails, all files are as before.
+
+A command that is killed leaves some files changed and some not: each with its old content or the new one, and perhaps
+its old or new content beside it. The next command cleans up (:func:`recover`) and can be the same one once more.
+"""
 
 from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -40,7 +44,7 @@ class FileChanges:
         except ConfigError as error:
             problems = "\n".join(f"{problem.key}: {problem.message}" for problem in error.problems)
             raise FleetError(f"the new {path.name} is not valid, so nothing was changed:\n{problems}") from None
-        self._keep(path)
+        self.keep(path)
         new.rename(path)
         sync_folder(path.parent)
 
@@ -50,7 +54,7 @@ class FileChanges:
         self._steps.append((path, None))
 
     def delete(self, path: Path) -> None:
-        self._keep(path)
+        self.keep(path)
         path.unlink(missing_ok=True)
 
     def _make_folder(self, folder: Path) -> None:
@@ -58,11 +62,11 @@ class FileChanges:
             folder.mkdir(mode=0o700)
             self._steps.append((folder, None))
 
-    def _keep(self, path: Path) -> None:
+    def keep(self, path: Path) -> None:
         """Keep the content of a file, if there is one, under another name. Its own may be gone."""
         aside = None
         if path.exists():
-            aside = path.with_name(f".{path.name}.old")
+            aside = aside_of(path)
             aside.unlink(missing_ok=True)
             try:
                 aside.hardlink_to(path)
@@ -92,6 +96,22 @@ class FileChanges:
                     path.unlink(missing_ok=True)
 
 
+def aside_of(path: Path) -> Path:
+    """Where the old content of a file is while a command changes it."""
+    return path.with_name(f".{path.name}.old")
+
+
+def recover(paths: Iterable[Path]) -> None:
+    """Delete the other contents of files that a killed command left beside them. A file that is gone returns."""
+    for path in paths:
+        path.with_name(f".{path.name}.new").unlink(missing_ok=True)
+        aside = aside_of(path)
+        if path.exists():
+            aside.unlink(missing_ok=True)
+        elif aside.exists():
+            aside.rename(path)
+
+
 @contextmanager
 def changing() -> Iterator[FileChanges]:
     """Change files, or leave every file as before. Raises FleetFileError if a file cannot be read or written."""
@@ -104,6 +124,20 @@ def changing() -> Iterator[FileChanges]:
             raise FleetFileError(f"{error.filename}: {error.strerror}") from None
         raise
     changes.finish()
+
+
+def is_unlocked(folder: Path) -> bool:
+    """Whether no command holds the lock of a folder."""
+    import fcntl  # noqa: PLC0415  Windows has no such module
+
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    finally:
+        os.close(descriptor)
+    return True
 
 
 @contextmanager

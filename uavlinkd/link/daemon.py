@@ -169,6 +169,8 @@ class Daemon:
                 return {**netcheck(parts, monotonic()), "web": web}
             case ("bulletin", "", "") if parts.fleet is not None:
                 return {"bulletin": to_base64(parts.fleet.trust.bulletin_bytes)}
+            case ("fleet", "", "") if parts.fleet is not None:
+                return parts.fleet.trust.known()
             case ("publish", " ", signed) if parts.fleet is not None:
                 return parts.fleet.publish(signed, monotonic())
             case ("ping", " ", name):

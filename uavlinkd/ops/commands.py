@@ -68,7 +68,7 @@ def for_daemon(
 # The daemons that a command is for.
 
 
-def _control_sockets(options: argparse.Namespace) -> list[Path]:
+def control_sockets(options: argparse.Namespace) -> list[Path]:
     """The control socket of the daemon that the options name, or those of the service and its instances, by name.
 
     Raises CommandError if no service runs, or the configuration names no socket or cannot be read.
@@ -93,7 +93,7 @@ def _control_sockets(options: argparse.Namespace) -> list[Path]:
 
 def control_socket(options: argparse.Namespace) -> Path:
     """The control socket of the only daemon. Raises CommandError as above, or if several daemons run."""
-    socket, *others = _control_sockets(options)
+    socket, *others = control_sockets(options)
     if others:
         listed = "\n".join(f"  --socket {path}" for path in (socket, *others))
         raise UsageError(f"several daemons run here: name one of them\n{listed}")
@@ -149,7 +149,7 @@ def _status(options: argparse.Namespace) -> int:
 
     from uavlinkd.ops.status_screen import render_status
 
-    sockets = _control_sockets(options)
+    sockets = control_sockets(options)
     if options.watch:
         return _watch(sockets)
     console = Console()
@@ -225,7 +225,7 @@ def _netcheck(options: argparse.Namespace) -> int:
             print(folded(printable(line)))
         return OK if any(relay["state"] == "up" for relay in answer["relays"].values()) else FAILED
 
-    return _for_each(_control_sockets(options), "netcheck", show)
+    return _for_each(control_sockets(options), "netcheck", show)
 
 
 def _report(options: argparse.Namespace) -> int:
@@ -235,7 +235,7 @@ def _report(options: argparse.Namespace) -> int:
     if options.config is None and options.socket is None:
         configs = sorted(SERVICE_FILES.glob("*.toml"))
     try:
-        sockets = _control_sockets(options)
+        sockets = control_sockets(options)
     except CommandError as error:
         print(printable(str(error), keep="\n"), file=sys.stderr)  # a daemon that does not start is reported on too
         sockets = []
@@ -248,7 +248,7 @@ def _peer_list(options: argparse.Namespace) -> int:
 
     from uavlinkd.ops.status_screen import render_peers
 
-    console, sockets = Console(), _control_sockets(options)
+    console, sockets = Console(), control_sockets(options)
 
     def show(status: dict[str, Any]) -> int:
         if len(sockets) > 1:

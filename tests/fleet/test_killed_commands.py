@@ -1,0 +1,156 @@
+"""Each command is killed at each change of a file, and run again: no serial is used twice, and nothing is lost."""
+
+from __future__ import annotations
+
+import io
+import os
+import shutil
+import sys
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.fleet.vehicles import create
+from uavlinkd.cli import main
+from uavlinkd.core.certificates import parse_certificate
+from uavlinkd.fleet.authority_key import load_key, paper_copy
+from uavlinkd.fleet.manifest import read_manifest
+from uavlinkd.system.addresses import Address
+from uavlinkd.system.base64_text import from_base64
+
+pytestmark = pytest.mark.long
+KILLED = 137
+CHANGES = frozenset({"os.rename", "os.remove", "os.link", "os.mkdir", "os.rmdir", "os.chmod", "os.truncate"})
+"""Audit events of changes (PEP 578), beside an `open` for writing."""
+
+
+class Stage:
+    """A folder with a fleet, and commands that run there in processes of their own."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        folder.mkdir()
+
+    def run(self, command: str, line: str = "", kill_at: int | None = None) -> tuple[int, str]:
+        """The exit status and the standard output. ``kill_at``: before the change of this number."""
+        reading, writing = os.pipe()
+        if not (child := os.fork()):
+            self._run(command, line, kill_at, writing)
+        os.close(writing)
+        with open(reading) as pipe:
+            output = pipe.read()
+        return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), output
+
+    def _run(self, command: str, line: str, kill_at: int | None, output: int) -> None:
+        status = 1
+        try:
+            os.chdir(self.folder)
+            os.dup2(output, 1)
+            sys.stdin, sys.stdout = io.StringIO(line), os.fdopen(1, "w")
+            changes = 0
+
+            def count(event: str, arguments: tuple[Any, ...]) -> None:
+                nonlocal changes
+                writes = (
+                    event == "open" and isinstance(arguments[2], int) and arguments[2] & (os.O_WRONLY | os.O_RDWR)
+                )
+                if (event in CHANGES or writes) and "/dev/" not in str(arguments[0]):
+                    if changes == kill_at:
+                        os._exit(KILLED)
+                    changes += 1
+
+            if kill_at is not None:
+                sys.addaudithook(count)
+            status = main(command.split())
+            sys.stdout.flush()
+        finally:
+            os._exit(status)
+
+
+def serials_in_files(folder: Path) -> set[int]:
+    """The serials of all certificates that some member's configuration has as its own."""
+    tables = [tomllib.loads(path.read_text()) for path in folder.rglob("*.toml") if path.name != "fleet.toml"]
+    return {
+        parse_certificate(from_base64(table["fleet"]["certificate"])).serial for table in tables if "fleet" in table
+    }
+
+
+def check(folder: Path) -> None:
+    """Every certificate is known by one name, no two have one serial, and nothing is left beside the files."""
+    fleet = read_manifest(folder / "fleet")
+    serials = [member.certificate.serial for member in fleet.members]
+    assert len(set(serials)) == len(serials)
+    assert max(serials) < fleet.next_serial
+    assert serials_in_files(folder) <= set(serials)
+    names = [member.name for member in fleet.current]
+    assert len(set(names)) == len(names)
+    assert not [path for path in folder.rglob(".*") if path.name.endswith((".new", ".old")) or path.is_dir()]
+
+
+PAPER = "paper"
+ENROLLED = ["enroll v7", "fleet sign", "enroll --finish"]
+COMMANDS: list[tuple[str, list[str], str]] = [
+    # The command; those before it, each of which reads the line of the one before; and what it reads.
+    ("fleet add v9 --id 9", [], ""),
+    ("fleet add r2 --role relay --address relay2.example.org:5790", [], ""),
+    ("fleet rotate drone1", [], ""),
+    ("fleet revoke drone1", [], ""),
+    ("fleet revoke drone1 --resign", [], ""),
+    ("fleet sign --id 7", ["enroll v7"], "line"),
+    ("enroll v7", [], ""),
+    ("enroll --finish", ["enroll v7", "fleet sign --id 7"], "line"),
+    (
+        "enroll --finish",
+        ["enroll v7", "fleet sign", "enroll --finish", "enroll v7", "fleet sign --replace v7"],
+        "line",
+    ),
+    ("fleet restore --no-passphrase", [], PAPER),
+    ("fleet init --out fleet2 --no-passphrase --relay r.example.org:5790 --drones 1", [], ""),
+    ("fleet backup copy.tar", [], ""),
+]
+
+
+@pytest.mark.parametrize(("command", "before", "reads"), COMMANDS, ids=[command for command, _, _ in COMMANDS])
+def test_killed_at_each_change_and_run_again(tmp_path: Path, command: str, before: list[str], reads: str) -> None:
+    """After the second run all is as after one that was not killed, but for keys and serials."""
+    made = Stage(tmp_path / "made")
+    create(made.folder / "fleet", drones=2, relays=(Address("relay.example.org", 5790),))
+    line = ""
+    for each in before:
+        status, line = made.run(each, line)
+        assert status == 0
+    if reads == PAPER:
+        line = paper_copy(load_key(made.folder / "fleet" / "authority.pem", _unasked))
+        (made.folder / "fleet" / "authority.pem").unlink()
+    whole = copy_of(made, tmp_path / "whole")
+    assert whole.run(command, line)[0] == 0
+    check(whole.folder)
+    killed = 0
+    while True:
+        stage = copy_of(made, tmp_path / f"{killed}")
+        status, _ = stage.run(command, line, kill_at=killed)
+        if status != KILLED:
+            break
+        killed += 1
+        status, output = stage.run(command, line)
+        is_done = status == 2 and command.startswith("fleet add")  # only old contents were left to delete
+        assert status == 0 or is_done, (killed, output)
+        check(stage.folder)
+        assert names(stage.folder) == names(whole.folder)
+    assert killed >= 2
+
+
+def names(folder: Path) -> set[str]:
+    return {str(path.relative_to(folder)) for path in folder.rglob("*")}
+
+
+def copy_of(made: Stage, folder: Path) -> Stage:
+    stage = Stage(folder)
+    shutil.copytree(made.folder, folder, dirs_exist_ok=True)
+    return stage
+
+
+def _unasked(what: str) -> Any:
+    raise AssertionError(what)

@@ -1,0 +1,87 @@
+"""A fleet from its paper copy and what members know: their configurations, and what `fleet members` prints there.
+
+The authority's signatures make each certificate and bulletin trustworthy, wherever they come from. A member that no
+source knows is not in the new manifest, and goes on flying. Its serial must not be used twice, so the next one is
+:data:`SERIALS_LEFT_OUT` higher than all that are known.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, Final
+
+from uavlinkd.authority.enrolment import FleetError
+from uavlinkd.config.load import read_toml
+from uavlinkd.core.certificates import LAST_SERIAL, MemberRole, is_certified, parse_certificate, verified_bulletin
+from uavlinkd.core.crypto import AuthorityKey
+from uavlinkd.core.drops import Drop
+from uavlinkd.fleet.manifest import Fleet, FleetSettings, Member, check_settings, parse_addresses
+from uavlinkd.system.base64_text import from_base64
+
+SERIALS_LEFT_OUT: Final = 1000
+"""A fleet has at most 255 members at once, so fewer certificates than this are valid and unknown."""
+
+
+def read_source(path: Path) -> dict[str, Any]:
+    """What a file has of a fleet: a member's configuration, or the line of `fleet members`. Raises FleetError."""
+    try:
+        table: Any = json.loads(path.read_text("utf-8"))
+    except OSError as error:
+        raise FleetError(f"{path} cannot be read: {error.strerror}") from None
+    except (ValueError, RecursionError):
+        table = read_toml(path)
+    if type(table) is not dict or type(table.get("fleet")) is not dict:
+        raise FleetError(f"{path} is neither a member's configuration nor the line of `uavlinkd fleet members`")
+    return dict(table)
+
+
+def recovered(sources: Iterable[dict[str, Any]]) -> Fleet:
+    """The fleet of which these are parts. Raises FleetError if they are forged, or of different fleets."""
+    try:
+        return _recovered(list(sources))
+    except (LookupError, TypeError, ValueError, AttributeError, Drop):
+        raise FleetError("what a member has of the fleet is damaged, or not signed by one authority") from None
+
+
+def _recovered(sources: list[dict[str, Any]]) -> Fleet:
+    (text,) = {source["fleet"]["authority"] for source in sources}
+    authority = AuthorityKey(from_base64(text))
+    members, serials = dict[int, Member](), list[int]()
+    successor, published, bulletin = bytes(32), b"", None
+    settings = FleetSettings()
+    for source in sources:
+        facts = source["fleet"]
+        successor = from_base64(facts["successor"]) if "successor" in facts else successor
+        data = from_base64(facts["bulletin"])
+        if (each := verified_bulletin(data, authority)) is None:
+            raise ValueError("not signed")
+        if bulletin is None or each.number > bulletin.number:
+            bulletin, published = each, data
+        if "certificate" in facts:  # its key is in another file
+            serials.append(parse_certificate(from_base64(facts["certificate"])).serial)
+        if "link" in source:
+            suites = source["link"].get("suites") or [settings.suite]
+            settings = FleetSettings(suite=suites[0], swarm="vehicle" in facts.get("call", ()))
+        for contact in source.get("contact", ()):
+            member = _member(contact, authority)
+            if member.addresses or member.certificate.serial not in members:
+                members[member.certificate.serial] = member
+    assert bulletin is not None
+    check_settings(settings)
+    serials += [*members, bulletin.least, *bulletin.revoked]
+    next_serial = min(max(serials) + SERIALS_LEFT_OUT, LAST_SERIAL)
+    known = tuple(members[serial] for serial in sorted(members))
+    return Fleet(authority, successor, bulletin, published, next_serial, settings, known)
+
+
+def _member(contact: dict[str, Any], authority: AuthorityKey) -> Member:
+    key, signed = from_base64(contact["public_key"]), from_base64(contact["certificate"])
+    if not is_certified(signed, key, authority):
+        raise ValueError("not signed")
+    certificate = parse_certificate(signed)
+    written = [text for text in contact.get("addresses", ()) if isinstance(text, str)]
+    addresses = parse_addresses("addresses", written)
+    relays = contact.get("relays") is True or (certificate.role is MemberRole.RELAY and addresses != ())
+    return Member(key, certificate, signed, addresses, relays)
