@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
@@ -36,6 +37,7 @@ from tests.core.harness import (
 )
 from uavlinkd.core import constants as c
 from uavlinkd.core import establish, wire
+from uavlinkd.core import node as module
 from uavlinkd.core import noise as noise_protocol
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.crypto import Entropy, KeyPair
@@ -43,9 +45,11 @@ from uavlinkd.core.drops import DropReason
 from uavlinkd.core.node import PEERS_AT_ONCE
 from uavlinkd.core.outputs import Dropped, Output, SessionEstablished
 from uavlinkd.core.path import Path
+from uavlinkd.core.peer import Peer
 from uavlinkd.core.probe import Probe
 from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.core.suites import SUITES, SUITES_BY_NAME, Suite
+from uavlinkd.core.timeouts import handle_timeout
 
 QUIET = quiet()
 LATER = 4.0
@@ -575,6 +579,34 @@ def test_address_of_two_peers_outlives_the_first() -> None:
     assert len(datagrams(pair.b.receive(stray(), 1.0), wire.INITIATION)) == 1
     pair.b.node.set_paths(charlie, [], 2.0)
     assert datagrams(pair.b.receive(stray(), 9.0)) == []
+
+
+def test_fault_in_the_timers_of_one_peer_costs_no_other_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ten are due together. The failing one has its timers back within a second, whatever the fault interrupted."""
+    node = Pair().a.node
+    for number in range(10):
+        key = KeyPair((1000 + number).to_bytes(32)).public
+        node.set_paths(node.add_peer(PeerSettings(str(number), key), 0.0), [Path(0, (f"192.0.2.{number}", 1))], 0.0)
+    initiated = Counter[str]()
+
+    def fail_once(peer: Peer, now: float) -> list[Output]:
+        out = handle_timeout(peer, now)
+        if peer.name == "3" and not initiated[peer.name]:
+            initiated[peer.name] += 1
+            raise ZeroDivisionError
+        initiated[peer.name] += len(datagrams(out, wire.INITIATION))
+        return out
+
+    monkeypatch.setattr(module, "handle_timeout", fail_once)
+    now, faults = 5.0, 0
+    while node.next_deadline() <= (now := max(now, node.next_deadline())) <= 5.0 + c.RECOVER_S:
+        try:
+            node.handle_next(now)
+        except ZeroDivisionError:
+            faults += 1
+    assert faults == 1
+    assert len(initiated) == len(node.peers) == 11
+    assert min(initiated.values()) >= 2
 
 
 def test_many_peers_that_are_due_together_are_handled_in_parts() -> None:

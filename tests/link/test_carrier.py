@@ -17,7 +17,7 @@ from tests.samples import attitude, command, raws
 from uavlinkd.config.model import PeerConfig
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.drops import DropReason
-from uavlinkd.core.outputs import Deliver, Dropped, Output, SessionEstablished
+from uavlinkd.core.outputs import Deliver, Dropped, Output, SessionEstablished, Transmit
 from uavlinkd.core.path import Path, relayed
 from uavlinkd.core.relay_records import wrap
 from uavlinkd.core.settings import PeerSettings
@@ -93,7 +93,7 @@ class Scene:
             drops=drops,
             evidence=SimpleNamespace(add_dropped=lambda *_: None),
         )
-        self.relays = parts.relays
+        self.relays, self.node = parts.relays, node
         self.carrier = FrameCarrier(cast("DaemonParts", parts))
 
     def receive(self, datagram: bytes, path: Path, now: float) -> list[Output]:
@@ -160,6 +160,44 @@ async def test_data_along_a_relay_is_unwrapped_or_dropped() -> None:
         DropReason.RELAY_MALFORMED,
         DropReason.RELAY_UNEXPECTED_TOKEN,
     ]
+
+
+async def test_fault_costs_one_datagram(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also the last one that its sender has waiting: the others have their turns, and so has this sender later."""
+    reports: list[object] = []
+    asyncio.get_running_loop().set_exception_handler(lambda _, context: reports.append(context["exception"]))
+    scene = Scene([(0, [NEW]), (0, [OLD])] * 10)
+    receive = scene.receive
+
+    def fail_once(datagram: bytes, path: Path, now: float) -> list[Output]:
+        if datagram == ENVELOPE + b"bad" and not reports:
+            raise ZeroDivisionError
+        return receive(datagram, path, now)
+
+    monkeypatch.setattr(scene.node, "receive", fail_once)
+    monkeypatch.setattr(scene.node, "claimed_sender", lambda datagram, _: datagram)
+    monkeypatch.setattr(module, "TURN_S", 0.0)
+    scene.read(ENVELOPE, *[ENVELOPE + b"bad", ENVELOPE + b"good"] * 2)
+    for _ in range(6):
+        await asyncio.sleep(0)
+    assert len(reports) == 1
+    assert [datagram for datagram, _ in scene.received] == [
+        ENVELOPE,
+        *(ENVELOPE + rest for rest in (b"good", b"bad", b"good")),
+    ]
+    assert not scene.carrier.waiting(monotonic()), "no sender waits for a turn"
+
+
+async def test_fault_costs_one_output() -> None:
+    """Those behind it are executed, also of other links."""
+    reports: list[object] = []
+    asyncio.get_running_loop().set_exception_handler(lambda _, context: reports.append(context["exception"]))
+    scene = Scene()
+    payload = b"".join(raws([NEW]))
+    deliver = Deliver(scene.peer, payload)
+    scene.carrier.perform([Transmit(b"", AT_A), deliver, Deliver(scene.peer, cast("bytes", None)), deliver])
+    assert len(reports) == 2, "there are no senders, and that is no payload"
+    assert scene.delivered == raws([NEW]) * 2
 
 
 async def handled(*datagrams: bytes) -> tuple[list[bytes], int]:

@@ -32,6 +32,7 @@ MAPS = (
 """Objects whose keys are names of the configuration or addresses."""
 COUNTS: Mapping[str, int] = {
     "drops": 1,
+    "faults": 1,
     "stale": 1,
     "unrouted": 1,
     "send_failures": 1,

@@ -69,14 +69,14 @@ def test_hanging_manager_does_not_delay_the_daemon(manager: Manager, path: str) 
 
 
 def test_watchdog_is_fed_twice_per_interval(manager: Manager, path: str) -> None:
-    """Only a turn of the loop feeds it: just before half of the interval it does not, at half it does."""
+    """Only a turn of the loop in which work moves: just before half of the interval not, at half and later, yes."""
     environ = {"NOTIFY_SOCKET": path, "WATCHDOG_USEC": "6000000", "WATCHDOG_PID": str(PID)}
     supervisor = Supervisor(environ, PID)
     received = []
-    for now in (10.0, 11.0, 12.999, 13.0, 15.999, 16.0):
-        supervisor.turn("", now)
+    for now in (10.0, 11.0, 12.999, 13.0, 15.999, 16.0, 19.5):
+        supervisor.turn("", now, work_moves=now != 16.0)
         received.append(manager.received())
-    assert received == [["WATCHDOG=1"], [], [], ["WATCHDOG=1"], [], ["WATCHDOG=1"]]
+    assert received == [["WATCHDOG=1"], [], [], ["WATCHDOG=1"], [], [], ["WATCHDOG=1"]]
     supervisor.stopping()
 
 

@@ -10,23 +10,27 @@ from typing import Any
 
 import pytest
 
+from uavlinkd.system import tasks
 from uavlinkd.system.tasks import Threads, keep_running
 
 
-async def test_failure_is_reported_at_once() -> None:
-    """The report does not wait for the end of the process."""
+async def test_failure_is_reported_at_once_and_the_work_begins_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The report does not wait for the end of the process, and what depends on the task works again."""
+    monkeypatch.setattr(tasks, "RESTART_S", 0.0)
     reports: list[dict[str, Any]] = []
     asyncio.get_running_loop().set_exception_handler(lambda _, context: reports.append(context))
+    begun, third = 0, asyncio.Event()
 
-    async def fail() -> None:
-        raise ZeroDivisionError
+    async def fail_twice() -> None:
+        nonlocal begun
+        begun += 1
+        if begun < 3:
+            raise ZeroDivisionError
+        third.set()
 
-    task = keep_running(fail(), "the search for drone1")
-    await asyncio.wait([task])
-    await asyncio.sleep(0)
-    assert reports[0]["message"] == "the search for drone1 has failed"
-    assert isinstance(reports[0]["exception"], ZeroDivisionError)
-    assert reports[0]["task"] is task
+    await keep_running(fail_twice, "the search for drone1")
+    assert third.is_set()
+    assert [type(report["exception"]) for report in reports] == [ZeroDivisionError] * 2
 
 
 async def test_cancelled_run_does_not_wait_for_a_hanging_call() -> None:

@@ -181,6 +181,8 @@ COOKIES_PER_PEER = 8
 """Received and held: one for each path to the peer."""
 HINTS_INTERVAL_S = 1.0
 """An unknown index from a peer's address makes us initiate at most this often."""
+RECOVER_S = 1.0
+"""After a fault in the work for a peer, all its timers expire within this time."""
 INDEX_QUARANTINE_S = 600.0
 """An index that carried a session is not used again for this long: a late envelope is late, not forged."""
 QUARANTINED_PER_PEER = 1024

@@ -176,9 +176,12 @@ def receive_close(peer: Peer, session: Session, now: float) -> list[Output]:
 def close(peer: Peer, now: float, *, sends: bool = True) -> list[Output]:
     """Send a close on the current session, unless ``sends`` is false, and forget every key."""
     session, out = peer.sessions.current, list[Output]()
-    if sends and session is not None and now < session.reject_at:
-        out += seal(peer, session, wire.Close().encode(), peer.paths.routes[Class.CRITICAL], now)
-    out += freshness.end(peer, peer.sessions.clear(now))
+    try:
+        if sends and session is not None and now < session.reject_at:
+            out += seal(peer, session, wire.Close().encode(), peer.paths.routes[Class.CRITICAL], now)
+    finally:  # also if no close can be sent
+        ended = peer.sessions.clear(now)
+    out += freshness.end(peer, ended)
     peer.initiator.cancel()
     peer.is_up = False
     peer.timers.stop_all()

@@ -2,7 +2,7 @@
 
 Three inputs: a datagram, frames to send, the passing of time. Each call returns what the shell has to do, in
 order. ``now`` is monotonic seconds and never goes back. Nothing here raises for anything that a peer or a stranger
-sends; any exception is a fault of ours.
+sends; any exception is a fault of ours. README.md, section 14.
 """
 
 from __future__ import annotations
@@ -301,21 +301,45 @@ class Node:
             return [drop.reply, self._count(datagram, drop, path)]
         except Drop as drop:
             return [self._count(datagram, drop, path)]
+        except Exception:
+            if (claimed := self._claimed_peer(datagram)) is not None:
+                self._wake(claimed, now)
+            raise
 
     def handle_timeout(self, now: float) -> list[Output]:
         """Do what is due, for at most :data:`PEERS_AT_ONCE`. Call it at :meth:`next_deadline`, or at any time."""
         out: list[Output] = []
-        for peer in self._schedule.pop(now, PEERS_AT_ONCE):
-            if now >= peer.provisional_until:
-                out += [*self.remove_peer(peer, now), PeerExpired(peer)]
-                continue
-            out += handle_timeout(peer, now)
-            self._schedule.update(peer)
+        for _ in range(PEERS_AT_ONCE):
+            out += self.handle_next(now)
+            if now < self._schedule.next_at:
+                break
+        return out
+
+    def handle_next(self, now: float) -> list[Output]:
+        """Do what is due of the peer whose turn it is: a fault costs no other one its timers or outputs."""
+        due = self._schedule.pop(now, 1)
+        if not due:
+            return []
+        (peer,) = due
+        if now >= peer.provisional_until:
+            return [*self.remove_peer(peer, now), PeerExpired(peer)]
+        try:
+            out = handle_timeout(peer, now)
+        except Exception:
+            self._wake(peer, now)
+            raise
+        self._schedule.update(peer)
         return out
 
     def next_deadline(self) -> float:
         """When :meth:`handle_timeout` is to be called next; infinity for never."""
         return self._schedule.next_at
+
+    def _wake(self, peer: Peer, now: float) -> None:
+        """A fault left the work for a peer half-done. All its timers expire soon: each finds what is due."""
+        for timer, at in enumerate(peer.timers.deadlines):
+            peer.timers.set(Timer(timer), min(at, now + c.RECOVER_S))
+        self._schedule.update(peer)
 
     def close(self, now: float) -> list[Output]:
         """Close the sessions with every peer, first those along a relay: its own close ends their handles."""

@@ -128,10 +128,11 @@ class Schedule(Generic[T]):
     def pop(self, now: float, most: float = inf) -> list[T]:
         """The owners whose deadline has come, at most so many. Call :meth:`update` with each when it was handled."""
         due: list[T] = []
-        while self._heap and len(due) < most:
+        while self._heap:
             at, _, owner = self._heap[0]
             timers = owner.timers
-            if now < at == timers.scheduled_at == timers.next_at:
+            is_enough = len(due) == most and timers.next_at <= now
+            if at == timers.scheduled_at and (is_enough or now < at == timers.next_at):
                 break
             heappop(self._heap)
             if at != timers.scheduled_at:

@@ -10,6 +10,7 @@ from math import inf
 from typing import Any
 
 from uavlinkd.system.clock import monotonic
+from uavlinkd.system.guard import run
 from uavlinkd.system.stall import STALE, STALL_S, Backlog, StallWatch
 
 try:
@@ -89,6 +90,7 @@ class Reader:
 
     def stop(self) -> None:
         """Read no more. Call it before the socket is closed."""
+        self.backlog.close()
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -119,6 +121,7 @@ class Reader:
             self.renew()
             return
         self._deliver([(bytes(_buffer[:size]), source)], now, stall.epoch, 0.0)
+        self.backlog.read_at = now
         self._done_at = monotonic()
 
     def _on_several(self, now: float, *, is_quiet: bool) -> None:
@@ -204,6 +207,6 @@ class Reader:
         """Whether the error means that the queue is empty. Report any other."""
         if isinstance(error, BlockingIOError):
             return True
-        self._on_failure(error)
+        run(self._on_failure, error)
         self.renew()
         return False

@@ -8,6 +8,7 @@ import os
 import sys
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
+from functools import partial
 from math import inf
 
 from serialx import BaseSerial, serial_for_url
@@ -179,7 +180,7 @@ class SerialEndpoint(StreamEndpoint):
         self._opener = Opener(f"serial-{name}", url)
 
     def start(self) -> None:
-        opening = self._opener.keep_open(self.handler.stall, self._use, self.could_not_open)
+        opening = partial(self._opener.keep_open, self.handler.stall, self._use, self.could_not_open)
         self._task = keep_running(opening, f"the endpoint {self.name}")
 
     def close(self) -> None:

@@ -17,6 +17,7 @@ import termios
 from collections import Counter, deque
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from math import inf
 from threading import Thread
 from typing import Final
@@ -28,6 +29,7 @@ from uavlinkd.endpoints.ports import failure_name
 from uavlinkd.endpoints.serial import LATE_S, TERMINAL_BYTES, Opener
 from uavlinkd.endpoints.url import SerialUrl
 from uavlinkd.system.clock import monotonic
+from uavlinkd.system.guard import run
 from uavlinkd.system.stall import STALE, Backlog, StallWatch
 from uavlinkd.system.tasks import keep_running
 
@@ -118,7 +120,7 @@ class SerialLine:
         return self._device is not None
 
     def start(self) -> None:
-        opening = self._opener.keep_open(self._stall, self._use, self._could_not_open)
+        opening = partial(self._opener.keep_open, self._stall, self._use, self._could_not_open)
         self._task = keep_running(opening, f"the serial network {self._name}")
 
     def close(self) -> None:
@@ -205,7 +207,7 @@ class SerialLine:
         self.decoder.reset()
         self._backlog = Backlog(self._stall, device.fileno(), lambda: TERMINAL_BYTES, epoch)
         asyncio.get_running_loop().add_reader(device.fileno(), self._on_readable)
-        self._on_change()
+        run(self._on_change)
         await self._lost.wait()
 
     def _could_not_open(self, error: str) -> None:
@@ -255,6 +257,8 @@ class SerialLine:
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
+        if self._backlog is not None:
+            self._backlog.close()
         self._device = self._backlog = None
         self.reason = reason
         self.cts.end()

@@ -20,6 +20,7 @@ from uavlinkd.mavlink.frames import MAX_GAP_S, Frame, StreamSplitter
 from uavlinkd.mavlink.policy.delivery import Source
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.error_meanings import NAME_NOT_RESOLVED, meaning_of
+from uavlinkd.system.guard import run
 from uavlinkd.system.stall import STALE, Backlog
 
 READ_BYTES = 4096  # from one connection in a wake-up; the costliest bytes take some 10 ms
@@ -158,6 +159,8 @@ class Connection(LocalPort):
             epoch = self._stall.epoch if self._splitter.is_fresh else STALE
             self.endpoint.handler.on_frames(self, frames, now, epoch)
         self.outgoing.queue.drop_stale(now)
+        if self.outgoing.queue.count and not self._awaits_writable and self._room_timer is None:
+            self._flush(now)  # a fault has interrupted the last one
         if self._blocked_since is not None and now - self._blocked_since >= STALLED_S:
             self.lose("stalled")
 
@@ -173,6 +176,7 @@ class Connection(LocalPort):
         """Stop watching the channel, and drop the frames that wait."""
         self._is_open = False
         self._loop.remove_reader(self._fd)
+        self._backlog.close()
         if self._awaits_writable:
             self._loop.remove_writer(self._fd)
         if self._room_timer is not None:
@@ -303,7 +307,7 @@ class StreamEndpoint(Endpoint):
 
     def do_housekeeping(self, now: float) -> None:
         for connection in self.ports:
-            connection.check(now)
+            run(connection.check, now)
 
     def close(self) -> None:
         super().close()
@@ -315,8 +319,13 @@ class StreamEndpoint(Endpoint):
     def open(self, channel: ByteChannel, name: str, now: float, opened_in: int) -> Connection:
         """Add a connection and report its port. ``opened_in`` is the epoch in which opening it began."""
         connection = Connection(self, channel, name, now, opened_in)
+        try:
+            self.handler.on_port_opened(connection)
+        except Exception:
+            connection.stop()
+            self.dispose(connection)
+            raise
         self._connections.append(connection)
-        self.handler.on_port_opened(connection)
         return connection
 
     def could_not_open(self, reason: str) -> None:
@@ -333,7 +342,7 @@ class StreamEndpoint(Endpoint):
             self._connections.remove(connection)
             if monotonic() - connection.opened_at >= LASTED_S:
                 self._logged.clear()
-            self.handler.on_port_closed(connection)
+            run(self.handler.on_port_closed, connection)
             self.dispose(connection)
             connection.lost.set()
 

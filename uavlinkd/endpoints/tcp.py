@@ -139,6 +139,7 @@ class TcpServer(StreamEndpoint):
             self._resume.cancel()
         if self.listener.fileno() >= 0:
             asyncio.get_running_loop().remove_reader(self.listener.fileno())
+            self._backlog.close()
             self.listener.close()
         super().close()
 
@@ -175,7 +176,7 @@ class TcpClient(StreamEndpoint):
         self._threads = Threads(1, f"look-up-{name}")
 
     def start(self) -> None:
-        self._task = keep_running(self._keep_connected(), f"the endpoint {self.name}")
+        self._task = keep_running(self._keep_connected, f"the endpoint {self.name}")
 
     async def _keep_connected(self) -> None:
         rng = SystemRandom()

@@ -13,6 +13,7 @@ import errno
 import socket
 from abc import abstractmethod
 from collections.abc import Sequence
+from functools import partial
 from math import inf
 
 import structlog
@@ -32,6 +33,7 @@ from uavlinkd.mavlink.frames import Frame, StreamSplitter, parse_frames
 from uavlinkd.mavlink.policy.delivery import Source
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic
+from uavlinkd.system.guard import report
 from uavlinkd.system.resolver import LONGEST_WAIT_S, Resolved, keep_resolving
 from uavlinkd.system.stall import STALE
 from uavlinkd.system.tasks import keep_running
@@ -121,21 +123,27 @@ class UdpEndpoint(Endpoint):
             if address not in self._ports and not self._is_welcome(address):
                 continue
             self.bytes_received += len(datagram)
-            frames = received.setdefault(address, [])
-            stream = self._streams.pop(address, None)
-            if stream is None:
-                end, fault = parse_frames(datagram, 0, frames, self.counters, is_expected=True)
-                if fault is not None:
-                    datagram = datagram[end:]  # noqa: PLW2901
-                    stream = StreamSplitter(self.counters, max_hold_s=MAX_HOLD_S, gives_up=True)
-            if stream is not None:
-                frames += stream.feed(datagram, now, epoch)
-                if not stream.is_fresh:
-                    stale.add(address)
-                if stream.pending_bytes:
-                    self._hold(stream, address)
+            try:
+                frames = received.setdefault(address, [])
+                stream = self._streams.pop(address, None)
+                if stream is None:
+                    end, fault = parse_frames(datagram, 0, frames, self.counters, is_expected=True)
+                    if fault is not None:
+                        datagram = datagram[end:]  # noqa: PLW2901
+                        stream = StreamSplitter(self.counters, max_hold_s=MAX_HOLD_S, gives_up=True)
+                if stream is not None:
+                    frames += stream.feed(datagram, now, epoch)
+                    if not stream.is_fresh:
+                        stale.add(address)
+                    if stream.pending_bytes:
+                        self._hold(stream, address)
+            except Exception as error:  # a fault costs this datagram
+                report(error)
         for address, frames in received.items():
-            self._deliver(address, frames, now, STALE if address in stale else epoch, waited_s)
+            try:
+                self._deliver(address, frames, now, STALE if address in stale else epoch, waited_s)
+            except Exception as error:  # of this client
+                report(error)
 
     def _deliver(self, address: SocketAddress, frames: list[Frame], now: float, epoch: int, waited_s: float) -> None:
         port = (self._ports.get(address) or self._admit(address, now)) if frames else None
@@ -198,8 +206,8 @@ class UdpEndpoint(Endpoint):
 
     def _open(self, address: SocketAddress, received_at: float | None) -> UdpPort:
         port = UdpPort(self, str(Address.of(address)), address, received_at)
-        self._ports[address] = port
         self.handler.on_port_opened(port)
+        self._ports[address] = port
         return port
 
     def _forget(self, port: UdpPort) -> None:
@@ -298,7 +306,7 @@ class UdpClient(UdpEndpoint):
         """Read whenever datagrams are there, and resolve the name again when its address is silent."""
         super().start()
         log = structlog.get_logger().bind(endpoint=self.name)
-        following = keep_resolving(self._remote, self._interval_s, self._on_resolved, log)
+        following = partial(keep_resolving, self._remote, self._interval_s, self._on_resolved, log)
         self._task = keep_running(following, f"the search for {self._remote}")
 
     def do_housekeeping(self, now: float) -> None:

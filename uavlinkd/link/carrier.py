@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Hashable, Iterable, Iterator
+from collections.abc import Callable, Hashable, Iterable, Iterator
 from time import thread_time
 from typing import Final
 
 from uavlinkd.core import outputs as o
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.drops import DropReason
+from uavlinkd.core.node import PEERS_AT_ONCE
 from uavlinkd.core.outputs import Deliver, Output, Transmit
 from uavlinkd.core.path import Path, SocketAddress
 from uavlinkd.core.relay_records import Bind, FilterTest, FleetRecord
@@ -30,6 +31,7 @@ from uavlinkd.link.relays import TOKEN_START
 from uavlinkd.mavlink.frames import Frame, parse_frames, pass_faults
 from uavlinkd.ops.recorder import FROM_PEER
 from uavlinkd.system.clock import monotonic
+from uavlinkd.system.guard import report, run
 
 HANDSHAKES_S: Final = 0.01
 """CPU time for handshake messages before the envelopes have their turn: about twenty of them."""
@@ -66,7 +68,7 @@ class Turns:
 
     def __init__(self) -> None:
         self.queues: dict[Hashable, deque[tuple[WaitingDatagram, int]]] = {}
-        """By sender: datagrams that wait, with the epoch of their reading. Empty if none waits."""
+        """By sender: datagrams that wait, with the epoch of their reading. No queue here is empty."""
         self._bytes: dict[Hashable, int] = {}
 
     def put(self, sender: Hashable, datagram: bytes, path: Path, epoch: int) -> list[WaitingDatagram]:
@@ -90,15 +92,16 @@ class Turns:
         """One turn of each sender that has datagrams waiting, all of one epoch. The rest waits for the next round."""
         for sender, queue in list(self.queues.items()):
             epoch = queue[0][1]
-            yield self._turn(sender, epoch), epoch
-            if not self.queues[sender]:
-                del self.queues[sender], self._bytes[sender]
+            yield self._turn(sender, queue, epoch), epoch
 
-    def _turn(self, sender: Hashable, epoch: int) -> Iterator[WaitingDatagram]:
-        queue = self.queues[sender]
+    def _turn(
+        self, sender: Hashable, queue: deque[tuple[WaitingDatagram, int]], epoch: int
+    ) -> Iterator[WaitingDatagram]:
         while queue and queue[0][1] == epoch:
             waiting, _ = queue.popleft()
             self._bytes[sender] -= _size(waiting[0])
+            if not queue:  # before anything can fail
+                del self.queues[sender], self._bytes[sender]
             yield waiting
 
 
@@ -133,6 +136,7 @@ class FrameCarrier:
         self._frames: dict[PeerLink, list[Frame]] = {}  # delivered, but not forwarded yet
         self._is_turn = False  # frames gather until its end
         self._cost = 0
+        self._turned_at = 0.0  # when a round of turns ended last
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at = NEVER
 
@@ -144,8 +148,10 @@ class FrameCarrier:
         arrived: list[WaitingDatagram] = []
         for datagram, address in datagrams:
             if datagram[:1] in _OF_RELAYS:
-                if (inside := self._unwrap(socket, datagram, address)) is not None:
-                    arrived.append(inside)
+                try:
+                    self._unwrap(socket, datagram, address, arrived)
+                except Exception as error:
+                    report(error)
                 continue
             path = paths.get((socket, address))
             if path is None:
@@ -155,38 +161,37 @@ class FrameCarrier:
             arrived.append((datagram, path))
         if len(arrived) == 1 and not (self._turns.queues or self._handshakes):  # one datagram needs no clock
             self._read_at, self._epoch = now, epoch
-            self.perform(self._node.receive(*arrived[0], now))
+            try:
+                self.perform(self._node.receive(*arrived[0], now))
+            except Exception as error:  # a fault costs this datagram
+                report(error)
             if epoch != self._stall.epoch:
                 self._drop_held()
         elif arrived:
             self._receive_several(arrived, now, epoch)
         if (relay := self._parts.relay) is not None and relay.is_due:
-            relay.settle(monotonic())
+            run(relay.settle, monotonic())
 
-    def _unwrap(self, socket: int, data: bytes, source: SocketAddress) -> WaitingDatagram | None:
-        """The datagram inside one of a relay or a member, with its path. None: it was handled, or dropped."""
+    def _unwrap(self, socket: int, data: bytes, source: SocketAddress, arrived: list[WaitingDatagram]) -> None:
+        """Add the datagram inside one of a relay or a member, with its path, unless it is handled or dropped here."""
         relays, relay = self._parts.relays, self._parts.relay
         is_data = data[:1] == RELAYED_START
         inside = self._sockets.handles.unwrap(socket, data, source) if is_data and relays.by_name else None
         if isinstance(inside, tuple):
-            return inside
-        if is_data and relay is not None:
+            arrived.append(inside)
+        elif is_data and relay is not None:
             relay.forwarding.take(socket, data, source)
-            return None
-        path = Path(socket, source)
-        if is_data:
-            if inside is not None:
-                self._drop_datagram(inside, path=path)
-                if inside is DropReason.RELAY_UNKNOWN_HANDLE:
-                    relays.on_unknown_handle(path, monotonic())
-                    self.arm()
-                return None
-        elif relays.by_name:
-            if not relays.filter_tests.take_token(data, path):
+        elif is_data and inside is not None:
+            self._drop_datagram(inside, path=(path := Path(socket, source)))
+            if inside is DropReason.RELAY_UNKNOWN_HANDLE:
+                relays.on_unknown_handle(path, monotonic())
+                self.arm()
+        elif not is_data and relays.by_name:
+            if not relays.filter_tests.take_token(data, path := Path(socket, source)):
                 self._drop_datagram(DropReason.RELAY_UNEXPECTED_TOKEN, path=path)
             self.arm()
-            return None
-        return data, path  # the core drops it: this daemon has no relay
+        else:
+            arrived.append((data, Path(socket, source)))  # the core drops it: this daemon has no relay
 
     def _receive_several(self, arrived: list[WaitingDatagram], now: float, epoch: int) -> None:
         was_busy = self._is_busy
@@ -197,12 +202,15 @@ class FrameCarrier:
                 self._do_turn(arriving, now, epoch)
                 envelopes = list(arriving)
             for datagram, path in envelopes:
-                sender = self._node.claimed_sender(datagram, path)
-                for pushed_out in self._turns.put(sender, datagram, path, epoch):
-                    self.perform((self._node.refuse(*pushed_out),))
+                run(self._wait, datagram, path, epoch)
         finally:  # an exception must not leave what waits without a turn
             if self._is_busy and not was_busy:
                 self._loop.call_soon(self._do_turns)
+
+    def _wait(self, datagram: bytes, path: Path, epoch: int) -> None:
+        sender = self._node.claimed_sender(datagram, path)
+        for pushed_out in self._turns.put(sender, datagram, path, epoch):
+            self.perform((self._node.refuse(*pushed_out),))
 
     @property
     def _is_busy(self) -> bool:
@@ -216,48 +224,55 @@ class FrameCarrier:
         they must not keep the envelopes of the first sessions waiting either, or these sessions would be lost again.
         """
         envelopes: list[WaitingDatagram] = []
-        was_waiting, waiting = bool(self._handshakes), self._handshakes
+        was_waiting = bool(self._handshakes)
         for datagram, path in arrived:
             if datagram[:1] in ENVELOPE_STARTS:
                 envelopes.append((datagram, path))
-                continue
-            # A sender repeats its initiation with other keys. The newest takes the place of the one before it.
-            key = self._node.handshake_source(datagram, path, now)
-            if key is None:  # it must not push out others
-                self.perform(self._node.receive(datagram, path, now))
-                continue
-            if (before := waiting.get(key)) is not None:
-                self.perform((self._node.refuse(*before),))
-            elif len(waiting) >= WAITING_HANDSHAKES:
-                self.perform((self._node.refuse(*waiting.pop(next(iter(waiting)))),))
-            waiting[key] = datagram, path
+            else:
+                run(self._hold_handshake, datagram, path, now)
         if not was_waiting:
             self._read_at, self._epoch = now, epoch
             self._do_handshakes()
         return envelopes
+
+    def _hold_handshake(self, datagram: bytes, path: Path, now: float) -> None:
+        # A sender repeats its initiation with other keys. The newest takes the place of the one before it.
+        waiting, key = self._handshakes, self._node.handshake_source(datagram, path, now)
+        if key is None:  # it must not push out others
+            self._do(datagram, path, now)
+            return
+        if (before := waiting.get(key)) is not None:
+            self.perform((self._node.refuse(*before),))
+        elif len(waiting) >= WAITING_HANDSHAKES:
+            self.perform((self._node.refuse(*waiting.pop(next(iter(waiting)))),))
+        waiting[key] = datagram, path
 
     def _do_handshakes(self) -> None:
         """Receive handshake messages that wait, the first source first, for at most :data:`HANDSHAKES_S`."""
         ends_at = thread_time() + HANDSHAKES_S if len(self._handshakes) > 1 else 0.0
         while self._handshakes:
             datagram, path = self._handshakes.pop(next(iter(self._handshakes)))
-            self.perform(self._node.receive(datagram, path, self._read_at))
+            run(self._do, datagram, path, self._read_at)
             if self._handshakes and thread_time() >= ends_at:
                 break
 
+    def _do(self, datagram: bytes, path: Path, now: float) -> None:
+        self.perform(self._node.receive(datagram, path, now))
+
     def _do_turns(self) -> None:
         """Do one turn of each sender. Then the sockets, the timer and the control socket have theirs."""
-        self._stall.turn(monotonic())
         try:
+            self._stall.turn(monotonic())
             for turn, epoch in self._turns.round():
                 self._do_turn(turn, monotonic(), epoch)
             self._read_at, self._epoch = monotonic(), self._stall.epoch
             self._do_handshakes()
         finally:
+            self._turned_at = monotonic()
             if self._is_busy:
                 self._loop.call_soon(self._do_turns)
             if (relay := self._parts.relay) is not None and relay.is_due:
-                relay.settle(monotonic())
+                run(relay.settle, monotonic())
 
     def _do_turn(self, arriving: Iterator[WaitingDatagram], now: float, epoch: int) -> None:
         """Receive datagrams until there are no more, or the turn is over. Then forward their frames."""
@@ -266,12 +281,15 @@ class FrameCarrier:
         ends_at = thread_time() + TURN_S
         try:
             for datagram, path in arriving:
-                self.perform(self._node.receive(datagram, path, now))
+                try:
+                    self.perform(self._node.receive(datagram, path, now))
+                except Exception as error:
+                    report(error)
                 if self._cost >= TURN_FRAMES or thread_time() >= ends_at:
                     break
         finally:
             self._is_turn = False
-        self.perform(())
+        run(self.perform, ())
         if epoch != self._stall.epoch:
             self._drop_held()
 
@@ -282,54 +300,63 @@ class FrameCarrier:
     # Outputs of the core.
 
     def perform(self, outputs: Iterable[Output]) -> None:
-        """Execute outputs of the core. Frames that it delivers are forwarded at once, or at the end of the turn."""
+        """Execute outputs of the core. Frames that it delivers are forwarded at once, or at the end of the turn.
+
+        A fault costs one output, or the frames of one link.
+        """
         for output in outputs:
-            if isinstance(output, Transmit):
-                path = output.path
-                try:
-                    self._sockets.senders[path.socket](output.datagram, path.address)
-                except OSError as error:
-                    self._sockets.on_send_error(path.socket, output.datagram, path.address, error)
-            elif isinstance(output, Deliver):
-                peer, payload, order = output
-                link = self._links.get(peer)
-                if link is None:  # whatever a policy says
-                    self._drop_datagram(DropReason.FRAMES_NOT_ALLOWED, peer.name)
-                    continue
-                # As split_payload, without one call.
-                frames: list[Frame] = []
-                position, fault = parse_frames(payload, 0, frames, link.counters, is_expected=True)
-                if fault is not None:
-                    pass_faults(payload, position, fault, frames, link.counters)
-                if self._is_turn:
-                    self._cost += cost_of(payload, len(frames))
-                if order:  # the peer has several paths
-                    came, frames = len(frames), link.pick_newest(frames, order, self._read_at)
-                    if count := came - len(frames):
-                        reason = ShellReason.SUPERSEDED
-                        self._parts.drops.add("frames_dropped", reason, link.name, count, monotonic())
-                elif link.output.repair.is_on:
-                    link.note_requests(frames, self._read_at)
-                if link in self._frames:
-                    self._frames[link] += frames
+            try:
+                if isinstance(output, Transmit):
+                    path = output.path
+                    try:
+                        self._sockets.senders[path.socket](output.datagram, path.address)
+                    except OSError as error:
+                        self._sockets.on_send_error(path.socket, output.datagram, path.address, error)
+                elif isinstance(output, Deliver):
+                    peer, payload, order = output
+                    link = self._links.get(peer)
+                    if link is None:  # whatever a policy says
+                        self._drop_datagram(DropReason.FRAMES_NOT_ALLOWED, peer.name)
+                        continue
+                    # As split_payload, without one call.
+                    frames: list[Frame] = []
+                    position, fault = parse_frames(payload, 0, frames, link.counters, is_expected=True)
+                    if fault is not None:
+                        pass_faults(payload, position, fault, frames, link.counters)
+                    if self._is_turn:
+                        self._cost += cost_of(payload, len(frames))
+                    if order:  # the peer has several paths
+                        came, frames = len(frames), link.pick_newest(frames, order, self._read_at)
+                        if count := came - len(frames):
+                            reason = ShellReason.SUPERSEDED
+                            self._parts.drops.add("frames_dropped", reason, link.name, count, monotonic())
+                    elif link.output.repair.is_on:
+                        link.note_requests(frames, self._read_at)
+                    if link in self._frames:
+                        self._frames[link] += frames
+                    else:
+                        self._frames[link] = frames
+                elif isinstance(output, o.Dropped):
+                    now = monotonic()
+                    self._parts.drops.add_dropped(output, now)
+                    self._parts.evidence.add_dropped(output, now)
+                elif isinstance(output, o.RecordReceived):
+                    self._on_record(output)
                 else:
-                    self._frames[link] = frames
-            elif isinstance(output, o.Dropped):
-                now = monotonic()
-                self._parts.drops.add_dropped(output, now)
-                self._parts.evidence.add_dropped(output, now)
-            elif isinstance(output, o.RecordReceived):
-                self._on_record(output)
-            else:
-                self._on_event(output)
+                    self._on_event(output)
+            except Exception as error:
+                report(error)
         if self._frames and not self._is_turn:
             delivered, self._frames = self._frames, {}
             for link, frames in delivered.items():
                 if link.peer not in self._links:  # revoked since these frames came
                     continue
-                if link.recorder is not None:
-                    link.recorder.add(link.name, [frame.raw for frame in frames], FROM_PEER, self._read_at)
-                self._switch.forward(link, frames, self._read_at, self._epoch)
+                try:
+                    if link.recorder is not None:
+                        link.recorder.add(link.name, [frame.raw for frame in frames], FROM_PEER, self._read_at)
+                    self._switch.forward(link, frames, self._read_at, self._epoch)
+                except Exception as error:
+                    report(error)
         if self._node.next_deadline() < self._timer_at:
             self.arm()
 
@@ -357,7 +384,7 @@ class FrameCarrier:
     def _on_event(self, event: o.Event) -> None:
         now, parts = monotonic(), self._parts
         if parts.fleet is not None:
-            parts.fleet.on_event(event, now)
+            run(parts.fleet.on_event, event, now)
         if isinstance(event, o.PeerAdmitted | o.PeerExpired):  # no other part knows it yet
             return
         if self._handshakes and isinstance(event, o.SessionEstablished):  # its peer waits for no other answer
@@ -365,11 +392,11 @@ class FrameCarrier:
                 if (waiting := self._handshakes.pop(key, None)) is not None:
                     self.perform((self._node.refuse(*waiting),))
         if parts.relay is not None:
-            parts.relay.on_event(event, now)
-        parts.relays.on_event(event, now)
+            run(parts.relay.on_event, event, now)
+        run(parts.relays.on_event, event, now)
         link = self._links.get(event.peer)
         if link is not None and not isinstance(event, o.PathSuspected):
-            parts.events.write(event, now)
+            run(parts.events.write, event, now)
             if isinstance(event, o.PeerLost | o.PeerClosed):
                 link.on_down(now, is_closed=isinstance(event, o.PeerClosed))
             elif not isinstance(event, o.PeerUp):
@@ -395,18 +422,33 @@ class FrameCarrier:
 
     def _on_timer(self) -> None:
         now, self._timer_at = monotonic(), -NEVER  # nothing sets the timer meanwhile
-        self._stall.turn(now)
         try:
-            self.perform(self._node.handle_timeout(now))
+            self._stall.turn(now)
+            for _ in range(PEERS_AT_ONCE):
+                if now < self._node.next_deadline():
+                    break
+                run(self._perform_of, self._node.handle_next, now)  # a fault costs one peer its timers
             for link in self._waiting.pop(now):
-                link.send_waiting(now)
+                run(link.send_waiting, now)
             if now >= self._parts.relays.next_at:
-                self.perform(self._parts.relays.handle_timeout(now))
+                run(self._perform_of, self._parts.relays.handle_timeout, now)
             if self._parts.fleet is not None and now >= self._parts.fleet.next_at:
-                self._parts.fleet.do_due(now)
+                run(self._parts.fleet.do_due, now)
         finally:
             self._timer_at = NEVER
             self.arm()
+
+    def _perform_of(self, source: Callable[[float], list[Output]], now: float) -> None:
+        self.perform(source(now))
+
+    def waiting(self, now: float) -> dict[Hashable, float]:
+        """The work that waits here, each with a time that changes when some of it is done."""
+        work: dict[Hashable, float] = {}
+        if self._is_busy:
+            work["turns"] = self._turned_at
+        if (deadline := self._node.next_deadline()) < now:
+            work["timers"] = deadline
+        return work
 
     def stop(self) -> None:
         """Forget the datagrams that wait, close the sessions with the peers, and do nothing more."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 from contextlib import suppress
+from math import inf
 from typing import TYPE_CHECKING
 
 import structlog
@@ -32,13 +33,15 @@ from uavlinkd.ops.sdnotify import Supervisor
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.base64_text import to_base64
 from uavlinkd.system.clock import monotonic
+from uavlinkd.system.guard import report, run
 from uavlinkd.system.tasks import on_signal
 from uavlinkd.system.terminal import printable
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Hashable, Iterable
 
     from uavlinkd.core.outputs import Output
+    from uavlinkd.relay.service import RelayService
 
 HOUSEKEEPING_S = INTERVAL_S
 """How often links are measured, and idle clients forgotten."""
@@ -62,6 +65,8 @@ class Daemon:
         self._supervisor = Supervisor(os.environ, os.getpid())
         self._reload_lock = asyncio.Lock()
         self._hangups: set[asyncio.Task[None]] = set()
+        self._work: dict[Hashable, float] = {}
+        self._is_stuck = False
 
     def _perform(self, outputs: Iterable[Output]) -> None:
         self.carrier.perform(outputs)
@@ -73,7 +78,7 @@ class Daemon:
         stop = asyncio.Event()
         for name in ("SIGTERM", "SIGINT"):
             on_signal(name, stop.set)
-        self._loop.set_exception_handler(self.parts.drops.on_loop_failure)
+        self._loop.set_exception_handler(self.parts.guard.on_failure)
         on_signal("SIGHUP", self.on_hangup)
         await self.start()
         try:
@@ -124,6 +129,8 @@ class Daemon:
         self._close_sockets()
         if self._control is not None:
             await self._control.stop()
+        if parts.fleet is not None:
+            await parts.fleet.stop()
         now = monotonic()
         for link in parts.links.values():
             parts.events.check_link(link, now)
@@ -218,12 +225,16 @@ class Daemon:
             self.log.error("configuration_refused", problems=problems)
             raise
         self.parts.history.refused_file = []
-        self.carrier.peers.follow(config, changes)
-        for name in changes.closed_endpoints:
-            local.close_one(name)
-        local.start()
-        for endpoint_config in changes.changed_endpoints:
-            local.change(endpoint_config)
+        try:
+            self.carrier.peers.follow(config, changes)
+            for name in changes.closed_endpoints:
+                local.close_one(name)
+            local.start()
+            for endpoint_config in changes.changed_endpoints:
+                local.change(endpoint_config)
+        except Exception as error:  # neither configuration is in force: start again with the file
+            report(error, most=1)
+            raise
         self._write_warnings()
         self.log.info("configuration_reloaded", **changes.summary())
         self.carrier.arm()
@@ -234,39 +245,57 @@ class Daemon:
         now, parts = monotonic(), self.parts
         self._housekeeping = self._loop.call_later(HOUSEKEEPING_S, self._do_housekeeping)
         parts.stall.turn(now)
-        self._supervisor.turn(self.carrier.peers.summary(), now)
+        self._feed_watchdog(now)
         if parts.relay is not None:
-            if parts.fleet is not None:
-                parts.relay.introductions.renew(parts.fleet.trust.held)
-            parts.relay.do_housekeeping(now)
-            for reason, name, count in parts.relay.count_drops():
-                parts.drops.add("datagrams_dropped", reason, name, count, now)
+            run(self._do_housekeeping_of_relay, parts.relay, now)
         if parts.recorder is not None:
-            parts.recorder.do_housekeeping(now)
-        sockets, links = parts.peer_sockets, parts.links.values()
-        sockets.do_housekeeping()
+            run(parts.recorder.do_housekeeping, now)
+        sockets, links = parts.peer_sockets, list(parts.links.values())
+        run(sockets.do_housekeeping)
         if rates := sockets.serial.follow_rates(sockets.budgets, links, now):
-            parts.node.set_rates(rates, now)
-        parts.relays.do_housekeeping(now)
+            run(parts.node.set_rates, rates, now)
+        run(parts.relays.do_housekeeping, now)
         for link in links:
-            link.measure(now)
-            link.report_refusals(now)
-            parts.events.check_link(link, now)
-        parts.history.sample(links, ((one, parts.local.policies[one.name]) for one in parts.local.endpoints), now)
-        parts.local.do_housekeeping(radio_figures(links), now)
-        parts.local.write_note(self._notes.next(links, now), now)
+            run(link.measure, now)
+            run(link.report_refusals, now)
+            run(parts.events.check_link, link, now, most=inf)
+        endpoints = [(one, parts.local.policies[one.name]) for one in parts.local.endpoints]
+        run(parts.history.sample, links, endpoints, now, most=inf)
+        run(parts.local.do_housekeeping, radio_figures(links), now)
+        run(parts.local.write_note, self._notes.next(links, now), now)
         self._reporting = self._loop.call_soon(self._report, now)  # datagrams must not wait for all of it
 
+    def _feed_watchdog(self, now: float) -> None:
+        """Feed it unless work that waited a second ago still waits, and nothing of its kind was done meanwhile."""
+        before, self._work = self._work, self.parts.stall.unread() | self.carrier.waiting(now)
+        stuck = [kind for kind, at in self._work.items() if before.get(kind) == at]
+        if stuck and not self._is_stuck:
+            self.log.error("work_stuck", count=len(stuck), kinds=list(map(str, stuck)))
+        self._is_stuck = bool(stuck)
+        self._supervisor.turn(self.carrier.peers.summary(), now, work_moves=not stuck)
+
+    def _do_housekeeping_of_relay(self, relay: RelayService, now: float) -> None:
+        parts = self.parts
+        if parts.fleet is not None:
+            relay.introductions.renew(parts.fleet.trust.held)
+        relay.do_housekeeping(now)
+        for reason, name, count in relay.count_drops():
+            parts.drops.add("datagrams_dropped", reason, name, count, now)
+
     def _report(self, now: float) -> None:
+        """Report what is wrong. A fault here ends no process that carries frames."""
         parts, links = self.parts, self.parts.links.values()
-        findings = parts.findings = find(parts, now)
-        parts.events.write_findings(findings, now)
-        codes = own_codes(findings, is_cut_off=has_no_client(findings, len(parts.local.endpoints)))
+        run(self._find, now, most=inf)
+        codes = own_codes(parts.findings, is_cut_off=has_no_client(parts.findings, len(parts.local.endpoints)))
         for link in links:
-            link.report_problems(codes, now)
-        parts.drops.check(now)
-        parts.events.check(now)
+            run(link.report_problems, codes, now)
+        run(parts.drops.check, now, most=inf)
+        run(parts.events.check, now, most=inf)
         self.carrier.arm()
+
+    def _find(self, now: float) -> None:
+        findings = self.parts.findings = find(self.parts, now)
+        self.parts.events.write_findings(findings, now)
 
 
 def ping(parts: DaemonParts, carrier: FrameCarrier, name: str, now: float) -> dict[str, object]:

@@ -73,6 +73,14 @@ def daemon_problems(moment: Moment) -> Iterator[Found]:
             "find the sender with `sudo tcpdump -ni any udp`; never block a peer's address: a sender can forge it."
             " Links that are up go on",
         )
+    guard = daemon.guard
+    if guard.faults and now - guard.last_at <= traffic.SECURITY_S:
+        places = listed(f"{place} ({count}x)" for place, count in guard.faults.most_common())
+        yield warning(
+            "fault_inside",
+            f"the daemon caught faults of its own: {places}",
+            "send what `uavlinkd report` writes, and the log, to the developers; frames pass meanwhile",
+        )
     paused = daemon.history.paused
     if paused is not None and now - paused[0] <= EVIDENCE_S:
         yield warning(

@@ -39,6 +39,7 @@ from uavlinkd.mavlink.policy.settings import read_settings
 from uavlinkd.relay.service import RelayService
 from uavlinkd.system.base64_text import from_base64
 from uavlinkd.system.clock import monotonic
+from uavlinkd.system.guard import run
 
 EVENT_S: Final = 600.0
 """An event of bulletins is shown for so long, or until a newer bulletin counts."""
@@ -112,10 +113,10 @@ class FleetMembers:
     def do_due(self, now: float) -> None:
         """Send what is due. Call it at :attr:`next_at`."""
         for key, record in self.exchange.do_due(now):
-            self._send(key, record, now)
+            run(self._send, key, record, now)
         if self._has_required and now >= self._settled_at:
             for key, who in self._questions.pop_due(role_bits(self.config.call), now):
-                self._send(key, who, now)
+                run(self._send, key, who, now)
         if now >= self._disk.again_at:
             self._disk.write()
 
@@ -335,7 +336,7 @@ class FleetMembers:
 
     def _react(self, reaction: Reaction, now: float, who: str = "this machine") -> None:
         for key in reaction.ended:
-            self._end(key, now)
+            run(self._end, key, now)
         if reaction.persists:
             self._events.clear()
             self._unread = ""
@@ -366,16 +367,18 @@ class FleetMembers:
 
     def _end(self, key: bytes, now: float) -> None:
         """Nothing of this key is accepted any more. It gets no close: it is not a peer."""
-        self.forget(key)
-        if self._relay is not None:
-            self._relay.end(key, now)
-        for name, relay in list(self._relays.by_name.items()):
-            if relay.config.settings.public_key == key:
-                self._relays.remove(name, now)
-        for name in [name for name, link in self._links.items() if link.key == key]:
-            self._membership.remove_peer(name, closes=False)
-        if (peer := self._node.find(key)) is not None:
-            self._node.remove_peer(peer, now, closes=False)
+        try:
+            self.forget(key)
+            if self._relay is not None:
+                self._relay.end(key, now)
+            for name, relay in list(self._relays.by_name.items()):
+                if relay.config.settings.public_key == key:
+                    self._relays.remove(name, now)
+            for name in [name for name, link in self._links.items() if link.key == key]:
+                self._membership.remove_peer(name, closes=False)
+        finally:  # whatever failed before: the core accepts nothing of this key
+            if (peer := self._node.find(key)) is not None:
+                self._node.remove_peer(peer, now, closes=False)
 
     def forget(self, key: bytes) -> None:
         """A peer or relay with this key is gone."""
@@ -384,6 +387,10 @@ class FleetMembers:
         self._limits.pop(key, None)
 
     # The disk.
+
+    async def stop(self) -> None:
+        """Wait for the disk: what it is to hold counts already."""
+        await self._disk.stop()
 
     def _state(self) -> FleetState:
         held = self.trust.held

@@ -31,6 +31,7 @@ from uavlinkd.mavlink.policy.delivery import Source
 from uavlinkd.mavlink.policy.gate import REFUSALS, Refusal
 from uavlinkd.mavlink.routing import SystemComponent
 from uavlinkd.system.clock import monotonic
+from uavlinkd.system.guard import run
 from uavlinkd.system.stall import StallWatch
 
 # TCP and serial are imported only if configured: a daemon on UDP starts faster and stays smaller.
@@ -155,12 +156,12 @@ class LocalEndpoints:
 
     def on_port_opened(self, port: LocalPort) -> None:
         """A local client connected: accept frames from it, and send frames to it."""
-        self._events.write_client("client_connected", port.endpoint.name, port.name, monotonic())
         self._switch.add(port, self.policies[port.endpoint.name])
+        run(self._events.write_client, "client_connected", port.endpoint.name, port.name, monotonic())
 
     def on_port_closed(self, port: LocalPort) -> None:
         """A local client disconnected."""
-        self._events.write_client("client_disconnected", port.endpoint.name, port.name, monotonic())
+        run(self._events.write_client, "client_disconnected", port.endpoint.name, port.name, monotonic())
         self._switch.remove(port)
 
     def on_port_silent(self, port: LocalPort) -> None:
@@ -176,7 +177,7 @@ class LocalEndpoints:
     def do_housekeeping(self, radio: LinkFigures | None, now: float) -> None:
         """Forget clients that have gone, and send RADIO_STATUS. Call it once a second."""
         for endpoint in self.endpoints:
-            endpoint.do_housekeeping(now)
+            run(endpoint.do_housekeeping, now)
             source, _ = self._sources[endpoint.name]
             if source is not None and radio is not None:
                 self._write(endpoint, source.frame(radio), now)

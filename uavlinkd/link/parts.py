@@ -30,6 +30,7 @@ from uavlinkd.ops.findings import Finding
 from uavlinkd.ops.recorder import Recorder
 from uavlinkd.relay.service import RelayService, RelayShell
 from uavlinkd.system.clock import monotonic
+from uavlinkd.system.guard import FaultGuard
 from uavlinkd.system.stall import StallWatch
 
 
@@ -56,6 +57,7 @@ class DaemonParts:
         relay_links: dict[str, RelayLink] = {}
         limits = LineLimits()
         self.drops = DropSummary(log, limits)
+        self.guard = FaultGuard(log, self.drops.on_loop_failure)
         self.evidence = Evidence(self.links, config.public_key, relay_links)
         self.history = History(now)
         self.findings: list[Finding] = []

@@ -189,8 +189,10 @@ class PeerLink:
 
     def send_waiting(self, now: float) -> None:
         """Send the waiting frames that are due, and schedule the next ones."""
-        self.output.send_waiting(now)
-        self._set_deadline(now)
+        try:
+            self.output.send_waiting(now)
+        finally:
+            self._set_deadline(now)
 
     def report_refusals(self, now: float) -> None:
         """Report to the peer which of its frames the policy refuses. Call it about once a second."""

@@ -41,7 +41,7 @@ class PeerNames:
             # A name; or an interface, whose number may change.
             failing, wake = set[str](), asyncio.Event()
             interval_s, on_resolved = partial(self.interval_s, address), partial(self._set, address)
-            work = keep_resolving(address.address, interval_s, on_resolved, log, failing, wake)
+            work = partial(keep_resolving, address.address, interval_s, on_resolved, log, failing, wake)
             self._searches.append((keep_running(work, f"the search for {address}"), wake, failing))
 
     def _set(self, address: PeerAddress, resolved: Resolved) -> bool:

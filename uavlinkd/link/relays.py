@@ -28,6 +28,7 @@ from uavlinkd.link.direct_search import DirectSearch, OwnSocket, Place, own_sock
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.peer_sockets import PeerSockets
 from uavlinkd.link.relay_link import RelayLink
+from uavlinkd.system.guard import report
 
 SILENT_S: Final = 0.5
 """If nothing comes along a relay for so long from a peer that sent :data:`STEADY` envelopes a second, the relay is
@@ -268,7 +269,14 @@ class Relays:
         """Ask relays, bind peers, name candidates and ask those of peers. Call it at :attr:`next_at`."""
         if now >= self._look_at:
             self._look(now)
-        return [output for part in self._parts() if now >= part.next_at for output in part.do_due(now)]
+        out: list[Output] = []
+        for part in self._parts():
+            if now >= part.next_at:
+                try:
+                    out += part.do_due(now)
+                except Exception as error:  # of one relay, search or test
+                    report(error)
+        return out
 
     def on_event(self, event: o.Event, now: float) -> None:
         """An event of a relay, or of any other peer."""

@@ -104,6 +104,7 @@ def _status(
             for endpoint in daemon.local.endpoints
         },
         "drops": _counts(node.drops),
+        "faults": dict(daemon.guard.faults),
         "stale": dict(daemon.stall.dropped),
         "unrouted": _counts(daemon.switch.router.unrouted),
         "send_failures": dict(daemon.peer_sockets.failures),

@@ -22,6 +22,7 @@ from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.delivery import Source
 from uavlinkd.mavlink.routing import Router
 from uavlinkd.system.clock import monotonic
+from uavlinkd.system.guard import report
 from uavlinkd.system.stall import STALL_S, StallWatch
 
 MAX_FLOWS = 2048
@@ -112,21 +113,28 @@ class Switch:
         batches: dict[Port, list[Frame]] = {}
         for frame in frames:
             route = routes.get(frame.header)
-            if route is None:
-                ports = self._route(frame, source, now)
-            else:
-                ports, has_one_route, is_conditional = route
-                if is_conditional:
-                    ports = self._pass(frame, source, route, now)
-                elif not has_one_route and not router.is_first(frame.raw, source, now):
-                    continue
+            try:
+                if route is None:
+                    ports = self._route(frame, source, now)
+                else:
+                    ports, has_one_route, is_conditional = route
+                    if is_conditional:
+                        ports = self._pass(frame, source, route, now)
+                    elif not has_one_route and not router.is_first(frame.raw, source, now):
+                        continue
+            except Exception as error:  # a fault costs this frame: no policy let it pass
+                report(error)
+                continue
             for port in ports:
                 if port in batches:
                     batches[port].append(frame)
                 else:
                     batches[port] = [frame]
         for port, batch in batches.items():
-            port.send(batch, known.source, now, waited_s)
+            try:
+                port.send(batch, known.source, now, waited_s)
+            except Exception as error:
+                report(error)
 
     def _route(self, frame: Frame, source: Port, now: float) -> tuple[Port, ...]:
         """The ports where the first frame of a flow goes. Remember them for the next one."""

@@ -165,7 +165,7 @@ class WebRelay:
         self._peer, self._receive, self._on_change = peer, receive, on_change
         self._udp_silent_at = monotonic() + UDP_FIRST_S if has_udp else -inf
         if self._task is None:
-            self._task = keep_running(self._keep(), f"the connection to {self.written}")
+            self._task = keep_running(self._keep, f"the connection to {self.written}")
 
     def stop(self) -> None:
         """End the connection, and make no other one."""

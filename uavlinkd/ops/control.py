@@ -12,9 +12,11 @@ import os
 import socket
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
+from math import inf
 from pathlib import Path
 from typing import Any
 
+from uavlinkd.system.guard import report
 from uavlinkd.system.terminal import CommandError, printable
 
 MAX_REQUEST_BYTES = 8192  # enough for the attacks of a man in the middle with all their parameters
@@ -102,8 +104,7 @@ class ControlServer:
             if isinstance(answer, Awaitable):
                 answer = await answer
         except Exception as error:  # a fault of the daemon, whose links go on
-            context = {"message": f"a request on the control socket failed: {error!r}", "exception": error}
-            asyncio.get_running_loop().call_exception_handler(context)
+            report(error, most=inf)
             return {"error": FAILED_INSIDE.format(type(error).__name__)}
         return {"error": UNKNOWN} if answer is None else answer
 

@@ -15,6 +15,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
 
 from structlog.typing import FilteringBoundLogger
 
@@ -84,7 +85,7 @@ class Recorder:
     def do_housekeeping(self, now: float) -> None:
         """Write the buffer in the thread, unless that still writes the one before."""
         if (self._writing is None or self._writing.done()) and self._buffered_bytes:
-            self._writing = keep_running(self._write(now), "recorder")
+            self._writing = keep_running(partial(self._write, now), "recorder")
         offset_s = self._clock() - now
         if self._offset_s is not None and abs(offset_s - self._offset_s) >= CLOCK_STEP_S:
             self._epoch += 1
@@ -107,8 +108,10 @@ class Recorder:
                 self.bytes += await self._thread.run(self._files.append, peer, records, epoch, now)
                 self.frames += len(records)
                 left -= len(records)
-        except OSError as error:
+        except Exception as error:
             self.frames_lost += left
+            if not isinstance(error, OSError):
+                raise
             self._on_failure(error)
             self._paused_until = now + RETRY_S
             return

@@ -54,8 +54,8 @@ class Supervisor:
             self._socket.close()
             self._socket = None
 
-    def turn(self, status: str, now: float) -> None:
-        """Feed the watchdog and report the status line. Call it from the loop, several times per watchdog interval.
+    def turn(self, status: str, now: float, *, work_moves: bool = True) -> None:
+        """Feed the watchdog, if work moves, and report the status line. Call it several times per watchdog interval.
 
         ``systemctl status`` shows ``status``.
         """
@@ -63,7 +63,7 @@ class Supervisor:
         line = status + self._note
         if line != self._line and self._send(f"STATUS={line}"):
             self._line = line
-        if now >= self._ping_at and self._send("WATCHDOG=1"):
+        if work_moves and now >= self._ping_at and self._send("WATCHDOG=1"):
             self._ping_at = now + self._ping_interval_s
 
     def _send_in_order(self, message: str) -> None:

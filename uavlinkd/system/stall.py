@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import select
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from contextlib import suppress
 from weakref import WeakSet
 
@@ -50,20 +50,21 @@ class StallWatch:
 
     def _mark_readable(self) -> None:
         """Mark the queues that are readable now. In an empty queue, the first frame after the pause is new."""
-        if not hasattr(select, "poll"):  # Windows
-            for backlog in self.backlogs:
+        for backlog in self._readable() if hasattr(select, "poll") else self.backlogs:
+            with suppress(OSError):  # closed meanwhile, and the number is another one's
                 backlog.mark()
-            return
-        by_fd: dict[int, list[Backlog]] = {}
+
+    def _readable(self) -> list[Backlog]:
         poll = select.poll()
         for backlog in self.backlogs:
-            by_fd.setdefault(backlog.fd, []).append(backlog)
             poll.register(backlog.fd, select.POLLIN)
-        for fd, events in poll.poll(0):
-            if not events & select.POLLNVAL:  # closed meanwhile
-                for backlog in by_fd[fd]:
-                    with suppress(OSError):  # closed meanwhile, and the number is another one's
-                        backlog.mark()
+        fds = {fd for fd, events in poll.poll(0) if not events & select.POLLNVAL}  # which is closed
+        return [backlog for backlog in self.backlogs if backlog.fd in fds]
+
+    def unread(self) -> dict[Hashable, float]:
+        """The queues that are readable now, by the number of the file, with the time of the last read of each."""
+        readable = self._readable() if hasattr(select, "poll") else []  # Windows
+        return {backlog.fd: backlog.read_at for backlog in sorted(readable, key=lambda one: one.read_at)}
 
 
 class Backlog:
@@ -72,7 +73,7 @@ class Backlog:
     Call :meth:`begin` before each read and :meth:`end` after it.
     """
 
-    __slots__ = ("__weakref__", "_capacity", "_watch", "fd", "left")
+    __slots__ = ("__weakref__", "_capacity", "_watch", "fd", "left", "read_at")
 
     def __init__(self, watch: StallWatch, fd: int, capacity: Callable[[], int], opened_in: int | None = None) -> None:
         """``capacity`` returns how much the queue can hold now, in the units of :meth:`end`.
@@ -81,6 +82,8 @@ class Backlog:
         queue is stale, a new one is stale too: it may be the same socket, shared on a reload.
         """
         self.fd = fd
+        self.read_at = 0.0
+        """When it was read last."""
         self._watch = watch
         self._capacity = capacity
         self.left = 0  # how much of the queue may still be from before a pause
@@ -100,7 +103,7 @@ class Backlog:
 
     def begin(self, now: float) -> int:
         """The epoch of the next read: :data:`STALE`, or the present one."""
-        epoch = self._watch.turn(now)
+        epoch, self.read_at = self._watch.turn(now), now
         return STALE if self.left > 0 else epoch
 
     def end(self, count: int, *, is_empty: bool) -> None:

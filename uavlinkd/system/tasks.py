@@ -11,26 +11,33 @@ from collections.abc import Callable, Coroutine
 from concurrent.futures import Future
 from functools import partial
 from threading import Lock, Thread
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
+
+from uavlinkd.system.guard import report
 
 T = TypeVar("T")
 
+RESTART_S: Final = 1.0
+"""Work of a task that failed begins again after this time."""
 
-def keep_running(work: Coroutine[object, object, None], name: str) -> asyncio.Task[None]:
+
+def keep_running(work: Callable[[], Coroutine[object, object, None]], name: str) -> asyncio.Task[None]:
     """Start a task in the running loop for work that ends only by cancellation.
 
-    The task reports a failure to the loop's exception handler at once. Otherwise asyncio would report it at the end
-    of the process, and an endpoint that depends on the task would stop silently.
+    The task reports a failure to the guard at once, and begins the work again: otherwise an endpoint that depends on
+    it would stop silently.
     """
-    loop = asyncio.get_running_loop()
 
-    def on_done(task: asyncio.Task[None]) -> None:
-        if not task.cancelled() and (error := task.exception()) is not None:
-            loop.call_exception_handler({"message": f"{name} has failed", "exception": error, "task": task})
+    async def repeat() -> None:
+        while True:
+            try:
+                await work()
+                return
+            except Exception as error:
+                report(error)
+            await asyncio.sleep(RESTART_S)
 
-    task = loop.create_task(work, name=name)
-    task.add_done_callback(on_done)
-    return task
+    return asyncio.get_running_loop().create_task(repeat(), name=name)
 
 
 def on_signal(name: str, callback: Callable[[], object]) -> None:
