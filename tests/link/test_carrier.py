@@ -23,19 +23,19 @@ from uavlinkd.core.relay_records import wrap
 from uavlinkd.core.settings import PeerSettings
 from uavlinkd.core.wire import ENVELOPE_STARTS
 from uavlinkd.link import carrier as module
-from uavlinkd.link.carrier import (
-    SHARED_BYTES,
-    STARTS_OF_A_FRAME,
-    WAITING_BYTES,
-    WAITING_OVERHEAD_BYTES,
-    FrameCarrier,
-    Turns,
-    cost_of,
-)
+from uavlinkd.link.carrier import FrameCarrier
 from uavlinkd.link.parts import DaemonParts
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.relay_link import RELAYED_START, RelayHandles
 from uavlinkd.link.relays import TOKEN_START
+from uavlinkd.link.turns import (
+    SHARED_BYTES,
+    STARTS_OF_A_FRAME,
+    WAITING_BYTES,
+    WAITING_OVERHEAD_BYTES,
+    Turns,
+    cost_of,
+)
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.stall import StallWatch
