@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
@@ -45,7 +43,6 @@ def test_window_is_a_set_of_counters(first: int, steps: list[int]) -> None:
             continue
         expected = counter <= highest - W or counter in accepted
         assert [is_refused(window, counter) for _ in range(2)] == [expected] * 2
-        assert window.holds(counter) == (counter > highest - W)
         if not expected:
             window.mark(counter)
             accepted.add(counter)
@@ -54,17 +51,12 @@ def test_window_is_a_set_of_counters(first: int, steps: list[int]) -> None:
 
 
 def test_full_and_empty_windows() -> None:
-    """Each counter of the first window is new at first, and all are used after a full pass.
-
-    A session that was never used has no window: a relay with 4,000 members may have many, 32 KiB each.
-    """
+    """Each counter of the first window is new at first, and all are used after a full pass."""
     window = ReplayWindow()
     assert not any(is_refused(window, counter) for counter in range(3 * W))
-    assert sys.getsizeof(window._slots) < 200
     for counter in range(3 * W):
         window.mark(counter)
     assert all(window.is_used(counter) for counter in range(3 * W))
-    assert sys.getsizeof(window._slots) > 4 * W
 
 
 GAPS = st.lists(st.sampled_from((0.0, 0.01, 0.1, 0.24, 0.25, 0.3, 1.0, 1.9, 2.0, 2.3, 9.0)), max_size=60)

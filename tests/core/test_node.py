@@ -489,8 +489,8 @@ def test_replays_and_strangers_cost_few_key_exchanges(monkeypatch: pytest.Monkey
 
 def test_memory_for_initiations_is_bounded_and_belongs_to_each_peer(monkeypatch: pytest.MonkeyPatch) -> None:
     """The one before the last so many is answered as if it were new. Only authentic ones of the peer count."""
-    assert c.REMEMBERED_INITIATIONS == 1024
-    monkeypatch.setattr(c, "REMEMBERED_INITIATIONS", 3)
+    monkeypatch.setattr(c, "REMEMBERED_LEAST", 3)
+    monkeypatch.setattr(c, "REMEMBERED_INITIATIONS", 0)
     pair = established()
     node, memory = pair.b.node, pair.b.node._handshakes.remembered
     noisy = node.add_peer(PeerSettings("noisy", KEY_C.public), 1.0)

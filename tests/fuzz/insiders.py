@@ -240,7 +240,7 @@ class Insider:
         assert len(peer.initiator.pending) <= c.PENDING_PER_PEER, "too many initiations"
         owned = len(sessions.confirmed) + len(sessions.unconfirmed) + len(peer.initiator.pending)
         assert len(self.node._indices.owners) == owned, "an index without an owner"
-        assert len(peer.remembered) == len(self.node._handshakes.remembered) <= c.REMEMBERED_INITIATIONS
+        assert len(peer.remembered) == len(self.node._handshakes.remembered) <= c.REMEMBERED_MOST
         assert len(peer.echo_requests) <= 64, "too many echo requests"
         assert len(peer.refusal_claims.recent()) <= c.REFUSALS_KEPT, "too many claims"
         assert len(peer.problem_claim.codes) <= c.PROBLEMS_PER_REPORT, "too many problems"

@@ -14,7 +14,7 @@ LIMITS: dict[str, int] = {
     "pending initiations of a peer": c.PENDING_PER_PEER,
     "unconfirmed sessions of a peer": 2 * c.UNCONFIRMED_PER_KIND,
     "confirmed sessions of a peer": c.USABLE_PER_PEER,
-    "remembered initiations of a peer": c.REMEMBERED_INITIATIONS,
+    "remembered initiations of a peer": c.REMEMBERED_MOST,
     "sources under load": c.SOURCES_TRACKED,
     "networks that get cookies": c.SOURCES_TRACKED,
     "sources of group work": c.SOURCES_TRACKED,

@@ -128,9 +128,11 @@ USABLE_PER_PEER = 3
 """Current session and those kept for receiving: two that came up at once, and the one before them."""
 COOKIED_ANSWERS_PER_S = 20
 """Responses a second to one peer with cookies, from all addresses: so it cannot use up the session indices."""
-REMEMBERED_INITIATIONS = 1024
-"""A peer's authentic initiations: an exact replay costs a look-up, no key exchange. Some 250 bytes each: with 200
-peers 50 MB, and not before 34 hours of flight."""
+REMEMBERED_INITIATIONS = 65_536
+"""Authentic initiations of all peers together: an exact replay costs a look-up, no key exchange. Some 300 bytes each.
+Each peer has an equal share, from :data:`REMEMBERED_LEAST` to :data:`REMEMBERED_MOST`."""
+REMEMBERED_LEAST = 16
+REMEMBERED_MOST = 1024
 INITIATION_COPIES_S = 60.0
 """A copy may come so late: mobile networks hold datagrams back for up to a minute. A later one is a recording."""
 INITIATIONS = Rate(50.0, 50)
@@ -329,6 +331,9 @@ HELD_BYTES = 65536
 HELD_OVERHEAD_BYTES = 64
 """Counted with each of them, so that many small ones are bounded too."""
 
+ARRIVALS = 2048
+"""Envelopes of which a session with several paths remembers when each arrived, and along which: a second of them, as
+more than 2,000 frames a second share envelopes."""
 REPLAY_WINDOW = 8192
 """Envelopes that may overtake one another: 0.8 s at 10,000 a second, for paths that differ by half of that."""
 MIN_ENVELOPE_LIMIT = 320

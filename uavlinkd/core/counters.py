@@ -6,47 +6,46 @@ from array import array
 from collections import deque
 
 from uavlinkd.core import constants as c
-from uavlinkd.core.constants import REPLAY_WINDOW
+from uavlinkd.core.constants import ARRIVALS, REPLAY_WINDOW
 
-_NONE = array("I")
+_BLOCK_BITS = 64
+_BLOCKS = REPLAY_WINDOW // _BLOCK_BITS + 1
+"""One more than the window has: the newest block is not full."""
+_NONE = array("Q")
 
 
 class ReplayWindow:
-    """The sliding window of RFC 6479, over the last :data:`REPLAY_WINDOW` counters.
-
-    RFC 6479 keeps a ring of bit blocks and clears blocks as the window advances. Here a ring of slots
-    remembers *which* counter came last at that place, so advancing, by one or by a billion, clears nothing.
+    """The sliding window of RFC 6479, over the last :data:`REPLAY_WINDOW` counters: a ring of bits, 1 KiB.
 
     Two steps, because nothing may be written before the tag is verified: :meth:`is_used`, verify, :meth:`mark`.
     A counter above :attr:`highest` is never used.
     """
 
-    __slots__ = ("_slots", "highest")
+    __slots__ = ("_blocks", "highest")
 
     def __init__(self) -> None:
         self.highest = -1
         """The highest counter accepted, -1 before the first."""
-        self._slots = _NONE
-
-    def holds(self, counter: int) -> bool:
-        """Whether it is known of this counter, which is at most the highest, if it was accepted."""
-        return counter > self.highest - REPLAY_WINDOW
+        self._blocks = _NONE
 
     def is_used(self, counter: int) -> bool:
         """Whether a counter up to the highest must not be accepted: it was before, or is below the window."""
         if counter <= self.highest - REPLAY_WINDOW:
             return True
-        return self._slots[counter % REPLAY_WINDOW] == counter
+        return bool(self._blocks[counter // _BLOCK_BITS % _BLOCKS] >> counter % _BLOCK_BITS & 1)
 
     def mark(self, counter: int) -> None:
         """Remember an authentic counter that was not used."""
-        if self.highest < 0:
-            # Not before: a relay with 4,000 members may have many sessions that were never confirmed.
-            self._slots = array("I", bytes(4 * REPLAY_WINDOW))
-            # Slot 0 would claim to have seen counter 0; 1 belongs to another slot, so it claims nothing.
-            self._slots[0] = 1
-        self._slots[counter % REPLAY_WINDOW] = counter
-        self.highest = max(self.highest, counter)
+        block = counter // _BLOCK_BITS
+        if counter > self.highest:
+            newest = self.highest // _BLOCK_BITS  # -1 before the first counter
+            if block > newest:
+                if not self._blocks:  # not before: a relay may have many sessions that were never confirmed
+                    self._blocks = array("Q", bytes(8 * _BLOCKS))
+                for cleared in range(max(newest, block - _BLOCKS) + 1, block + 1):
+                    self._blocks[cleared % _BLOCKS] = 0
+            self.highest = counter
+        self._blocks[block % _BLOCKS] |= 1 << counter % _BLOCK_BITS
 
 
 class CounterHistory:
@@ -90,36 +89,36 @@ class CounterHistory:
 
 
 class Arrivals:
-    """The first arrivals of the last :data:`REPLAY_WINDOW` counters. Only a peer with several paths needs it."""
+    """The first arrivals of the last :data:`ARRIVALS` counters. Only a peer with several paths needs it: 18 KiB."""
 
     __slots__ = ("_along", "_at", "_began_at", "_paths")
 
     def __init__(self, now: float) -> None:
         self._began_at = now  # single precision keeps a tenth of a millisecond for half an hour
-        self._at = array("f", bytes(4 * REPLAY_WINDOW))
-        self._paths = bytearray(REPLAY_WINDOW)
-        self._along = array("I", bytes(4 * REPLAY_WINDOW))  # a bit for each path along which it arrived
+        self._at = array("f", bytes(4 * ARRIVALS))
+        self._paths = bytearray(ARRIVALS)
+        self._along = array("I", bytes(4 * ARRIVALS))  # a bit for each path along which it arrived
 
     def note(self, counter: int, path: int, now: float) -> None:
         """A counter was accepted, along the path with this number, which is not 0."""
-        slot = counter % REPLAY_WINDOW
+        slot = counter % ARRIVALS
         self._at[slot] = now - self._began_at
         self._paths[slot] = path
         self._along[slot] = _bit(path)
 
     def note_copy(self, counter: int, path: int) -> bool:
-        """An accepted counter of the window arrived again. Returns whether for the first time along this path."""
-        slot = counter % REPLAY_WINDOW
+        """An accepted counter among them arrived again. Returns whether for the first time along this path."""
+        slot = counter % ARRIVALS
         is_first = not self._along[slot] & _bit(path)
         self._along[slot] |= _bit(path)
         return is_first
 
     def first(self, counter: int, now: float) -> tuple[int, float]:
-        """The path along which an accepted counter of the window arrived first, and how many seconds ago.
+        """The path along which an accepted counter among them arrived first, and how many seconds ago.
 
         The path is 0 for a counter that was accepted before its path was noted.
         """
-        slot = counter % REPLAY_WINDOW
+        slot = counter % ARRIVALS
         return self._paths[slot], max(0.0, now - self._began_at - self._at[slot])
 
 

@@ -6,7 +6,7 @@ Functions change it, in modules by topic: :mod:`.send`, :mod:`.receive`, :mod:`.
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -112,7 +112,7 @@ class Peer:
         """CPU time for the groups of its suites that it may cause from anywhere."""
         self.proven_group_work = TokenBucket(*c.GROUP_WORK_PER_PEER, now)
         """The same in addition, where it proves to be at its own address."""
-        self.remembered: list[bytes] = []
+        self.remembered: deque[bytes] = deque()
         """Ephemerals of its initiations, the oldest first."""
         self.recent: list[tuple[float, bytes]] = []
         """Critical envelopes, and when they were sent, if a path leads through a relay: a new path may carry them."""

@@ -130,10 +130,10 @@ def _receive_copy(
         state.bytes_received += len(datagram)
         state.duplicates += 1
         if session.arrivals is not None:
-            is_known = session.window.holds(counter)
+            is_known = counter > session.window.highest - c.ARRIVALS
             number, lag_s = session.arrivals.first(counter, now) if is_known else (0, 0.0)
-            # Twice along one path: the peer, the network or an attacker repeats it. It hides no loss. Below the
-            # window this end cannot tell, so such a copy does not count either.
+            # Twice along one path: the peer, the network or an attacker repeats it. It hides no loss. Of an
+            # older one this end cannot tell, so such a copy does not count either.
             if is_known and session.arrivals.note_copy(counter, state.number):
                 if session is peer.sessions.current:
                     state.received += 1

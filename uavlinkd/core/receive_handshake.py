@@ -98,8 +98,9 @@ class HandshakeReceiver:
         # A memory for each peer: no peer can make us forget what another sent.
         self.remembered[ephemeral] = Remembered(peer, mac1, now)
         peer.remembered.append(ephemeral)
-        if len(peer.remembered) > c.REMEMBERED_INITIATIONS:
-            self.remembered.pop(peer.remembered.pop(0), None)
+        share = c.REMEMBERED_INITIATIONS // max(1, len(self.peers))
+        while len(peer.remembered) > min(c.REMEMBERED_MOST, max(c.REMEMBERED_LEAST, share)):
+            self.remembered.pop(peer.remembered.popleft(), None)
 
     def forget(self, peer: Peer) -> None:
         """Accept nothing from this peer any more."""
