@@ -126,6 +126,12 @@ class Radios:
         """Send frames (one by default) of a class."""
         self.act(side, side.node.send(side.peer, frames or (FRAME,), self.now, cls))
 
+    def measure_lengths(self) -> Radios:
+        """Each side sends frames together, and tests how long envelopes may be."""
+        for side in (self.a, self.b):
+            self.send(side, Class.STREAM, FRAME, FRAME)
+        return self.run(1.0)
+
     def sender(self, side: Side, cls: Class = Class.STREAM) -> Callable[[], None]:
         """For :meth:`run`: one frame at a time."""
         return lambda: self.send(side, cls)

@@ -286,12 +286,12 @@ def test_envelopes_along_a_slow_path_that_is_down_cause_few_questions() -> None:
 
 def test_the_limit_of_a_path_of_an_idle_link_needs_few_long_probes() -> None:
     """Each test of a length comes with a short question, so the silence after it says something."""
-    radios = Radios()
+    radios = Radios().run(1.0)
     radios.radios[1].loses = lambda datagram: len(datagram) > 600
-    radios.run(40.0)
+    radios.measure_lengths().run(40.0)
     tests = [sent for sent in radios.envelopes(radios.a, 0.0) if len(sent.datagram) > 600 and sent.path.socket == 1]
-    assert radios.state(radios.a, 1).envelope_limit.limit == c.SMALLER_LIMITS[0]
-    assert len(tests) == c.LIMIT_TESTS
+    assert radios.state(radios.a, 1).envelope_limit.limit == 548
+    assert len(tests) == 3 * c.LIMIT_TESTS
 
 
 def test_path_whose_connection_ended_carries_nothing_more() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from itertools import count
 
 import pytest
@@ -62,13 +63,14 @@ def test_critical_envelope_goes_along_every_path_and_is_delivered_once(radios: R
 
 def test_critical_envelopes_are_short_while_two_paths_work(radios: Radios) -> None:
     """At most 320 bytes, which each path carries; a longer frame goes alone. Others may be longer."""
+    radios.measure_lengths()
     frames = [FRAME] * 30 + [b"\xfd" + bytes(800)] + [FRAME] * 30
     critical = {out.datagram for out in of(radios.a.node.send(radios.a.peer, frames, 1.0, CRITICAL), Transmit)}
     lengths = sorted(map(len, critical))
     assert lengths[-1] > 800
     assert lengths[-2] <= c.CRITICAL_ENVELOPE_LIMIT
     assert max(map(len, datagrams(radios.a.node.send(radios.a.peer, [FRAME] * 60, 1.0)))) > 1000
-    radios = Radios(delays_s=(0.02,)).run(1.0)
+    radios = Radios(delays_s=(0.02,)).run(1.0).measure_lengths()
     (sent,) = datagrams(radios.a.node.send(radios.a.peer, [FRAME] * 50, radios.now, CRITICAL))
     assert len(sent) > c.CRITICAL_ENVELOPE_LIMIT
     assert not radios.a.peer.paths.is_multiple
@@ -78,7 +80,7 @@ def test_frames_do_not_fit_the_path_that_carries_only_short_envelopes() -> None:
     """Envelopes are as long as the best path carries; a copy does not go where it would be lost."""
     radios = Radios(link_a=link(Redundancy.ALL))
     radios.radios[1].loses = lambda datagram: len(datagram) > 600
-    radios.run(20.0, 0.1, radios.sender(radios.a))
+    radios.run(4.0, 0.1, radios.sender(radios.a)).measure_lengths()
     assert radios.state(radios.a, 1).condition is PathCondition.USABLE
     assert targets(radios, STREAM, *[LONG] * 5) == [at_b(0)]
     assert targets(radios, STREAM, LONG) == [at_b(0), at_b(1)]
@@ -238,3 +240,48 @@ def test_slow_path_does_not_bring_doubt_back() -> None:
     ]
     assert len(ages) > 140
     assert max(ages) < 0.03, "none was held for a round trip"
+
+
+# The longest envelope.
+
+BURST = [LONG] * 6
+
+
+@pytest.mark.parametrize("delays_s", [(0.02,), (0.3,), (0.02, 0.05)])
+def test_path_that_drops_long_envelopes_in_flight_gets_short_ones(delays_s: tuple[float, ...]) -> None:
+    """The peer's counts show it within 2 s. The tests themselves are no losses, and lose no frames."""
+    radios = Radios(delays_s, both_configured=True).run(3.0)
+    best, sent_at = radios.state(radios.a, 0), list[float]()
+
+    def burst() -> None:
+        sent_at.append(radios.now)
+        radios.send(radios.a, STREAM, *BURST)
+        radios.send(radios.b)
+        radios.b.peer.missing(radios.now)
+
+    radios.run(3.0, 0.1, burst)
+    assert best.envelope_limit.limit == c.DEFAULT_ENVELOPE_LIMIT
+    for radio in radios.radios:
+        radio.loses = lambda datagram: len(datagram) > 1096
+    radios.run(2.0, 0.1, burst)
+    assert best.envelope_limit.limit < 1096
+    since = radios.now
+    radios.run(30.0, 0.1, burst).run(1.0)
+    arrived = b"".join(out.payload for out in radios.delivered(radios.b, since + delays_s[0]))
+    assert arrived.count(LONG) == len(BURST) * sum(at >= since for at in sent_at)
+    assert (best.envelope_limit.limit, best.envelope_limit.dropped) == (1024, c.DEFAULT_ENVELOPE_LIMIT)
+    assert best.loss_out < 0.01
+    assert radios.b.peer.missing(radios.now) < 20
+
+
+@pytest.mark.parametrize("delays_s", [(0.02,), (0.02, 0.05)])
+def test_bad_radio_does_not_seem_to_drop_long_envelopes(delays_s: tuple[float, ...]) -> None:
+    """A fifth of all datagrams is lost, in each direction."""
+    radios, rng = Radios(delays_s, both_configured=True).run(3.0), random.Random(1)
+    for radio in radios.radios:
+        radio.loses = lambda _: rng.random() < 0.2
+    radios.run(120.0, 0.2, lambda: radios.send(radios.a, STREAM, *BURST), radios.sender(radios.b))
+    limit = radios.state(radios.a, 0).envelope_limit
+    assert (limit.limit, limit.dropped) == (c.DEFAULT_ENVELOPE_LIMIT, 0)
+    tests = [sent for sent in radios.envelopes(radios.a, 3.0) if len(sent.datagram) == c.DEFAULT_ENVELOPE_LIMIT]
+    assert len(tests) < 60 * len(delays_s)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from collections import Counter
+from dataclasses import dataclass, field
 
 import pytest
 
@@ -183,50 +184,92 @@ def test_a_path_that_was_the_best_for_long_does_not_wait() -> None:
 # The longest envelope.
 
 LONGEST = 1232
+NONE = c.MIN_ENVELOPE_LIMIT
+
+
+@dataclass
+class Narrow:
+    """A limit, and a path that carries envelopes up to a length."""
+
+    carries: int
+    answers: bool = True
+    """Whether short questions are answered."""
+    limit: EnvelopeLimit = field(default_factory=EnvelopeLimit)
+    sizes: list[int] = field(default_factory=list)
+
+    def run(self, until: float) -> tuple[int, int]:
+        """Send what is due. Returns the limit and the length that the path drops."""
+        limit = self.limit
+        while (now := limit.next_at) <= until:
+            if size := limit.next_size(LONGEST, now - 0.01 if self.answers else -1.0, 0.02, now):
+                self.sizes.append(size)
+                if size <= self.carries:
+                    limit.acknowledge(size, now)
+        return limit.limit, limit.dropped
 
 
 @pytest.mark.parametrize(
     ("carries", "result", "sizes"),
     [
-        (LONGEST, c.MAX_ENVELOPE_LIMIT, [LONGEST]),
-        (600, 548, [LONGEST] * c.LIMIT_TESTS + [548]),
-        (400, 320, [LONGEST] * c.LIMIT_TESTS + [548] * c.LIMIT_TESTS),
+        (LONGEST, (LONGEST, 0), [LONGEST]),
+        (1096, (1024, LONGEST), [LONGEST] * c.LIMIT_TESTS + [1024]),
+        (400, (NONE, 548), [size for size in (LONGEST, 1024, 768, 548) for _ in range(c.LIMIT_TESTS)]),
     ],
 )
-def test_the_limit_is_lowered_until_tests_are_answered(carries: int, result: int, sizes: list[int]) -> None:
-    """The session's length, then 548 bytes, then 320, without a test. A changed network is tested again."""
-    limit, sent, now = EnvelopeLimit(), list[int](), 10.0
-    assert limit.size_to_test(LONGEST, answered_at=0.0, now=1e9) == 0, "not before the path is proved"
-    limit.begin(now)
-    while limit.next_at != NEVER:
-        now = limit.next_at
-        if size := limit.size_to_test(LONGEST, answered_at=now - 0.1, now=now):
-            sent.append(size)
-            limit.asked(len(sent), now)
-            if size <= carries:
-                limit.receive_answer(len(sent))
-    assert (limit.limit, sent) == (result, sizes)
-    limit.begin(100.0)
-    assert limit.limit == c.MAX_ENVELOPE_LIMIT
-    assert limit.size_to_test(LONGEST, answered_at=99.0, now=100.0) == LONGEST
-    limit.asked(1, 100.0)
-    assert limit.size_to_test(LONGEST, answered_at=100.5, now=100.0 + c.LIMIT_TEST_S - 0.01) == 0
-    assert limit.size_to_test(LONGEST, answered_at=100.5, now=100.0 + c.LIMIT_TEST_S) == LONGEST
+def test_the_limit_is_the_longest_envelope_that_was_acknowledged(
+    carries: int, result: tuple[int, int], sizes: list[int]
+) -> None:
+    """The path is tested from the session's length on; a path whose network changed is tested again."""
+    path = Narrow(carries)
+    assert path.run(1e9) == (NONE, 0), "not before the path is proved"
+    path.limit.begin(100.0)
+    assert path.run(110.0) == result
+    assert path.sizes == sizes
+    path.limit.begin(120.0)
+    assert path.limit.limit == NONE
+    assert path.run(130.0) == result
+    assert path.sizes == sizes * 2
 
 
-@pytest.mark.parametrize("answered", [False, True])
-def test_limit_is_not_lowered_without_other_answers_nor_below_that_of_the_session(answered: bool) -> None:
-    """The silence says nothing about length then. A session with the shortest envelopes ends the search."""
-    limit = EnvelopeLimit()
-    limit.begin(0.0)
-    for number in range(c.LIMIT_TESTS if answered else 9):
-        at = number - 0.1 if answered else -1.0
-        assert limit.size_to_test(LONGEST, answered_at=at, now=float(number)) == LONGEST
-        limit.asked(number + 1, float(number))
-    assert limit.limit == c.MAX_ENVELOPE_LIMIT
-    if answered:
-        assert limit.size_to_test(c.MIN_ENVELOPE_LIMIT, answered_at=2.5, now=float(c.LIMIT_TESTS)) == 0
-        assert (limit.limit, limit.next_at) == (c.MIN_ENVELOPE_LIMIT, NEVER)
+def test_limit_is_not_lowered_without_other_answers() -> None:
+    """The silence says nothing about length then."""
+    path = Narrow(0, answers=False)
+    path.limit.begin(0.0)
+    assert path.run(60.0) == (NONE, 0)
+    assert {*path.sizes} == {LONGEST}
+
+
+def test_path_that_carries_more_again_is_noticed_by_one_test_a_minute() -> None:
+    """Meanwhile the limit stays."""
+    path = Narrow(1096)
+    path.limit.begin(0.0)
+    path.run(10.0)
+    path.sizes.clear()
+    assert path.run(10.0 + 2 * c.LIMIT_RAISE_S) == (1024, LONGEST)
+    assert path.sizes == [LONGEST] * 2
+    path.carries = LONGEST
+    assert path.run(10.0 + 4 * c.LIMIT_RAISE_S) == (LONGEST, 0)
+    assert path.sizes == [LONGEST] * 3
+
+
+def test_losses_make_a_path_acknowledge_its_limit_again() -> None:
+    """Frames share short envelopes until then. It happens at most every ten seconds."""
+    path = Narrow(1096)
+    path.limit.begin(0.0)
+    path.run(10.0)
+    path.sizes.clear()
+    path.limit.note_lost(c.LIMIT_LOSSES - 1, 20.0)
+    assert path.limit.limit == 1024
+    path.limit.note_lost(c.LIMIT_LOSSES, 20.0)
+    assert path.limit.limit == NONE
+    path.limit.note_lost(c.LIMIT_LOSSES, 20.0)
+    assert path.run(20.0) == (1024, LONGEST)
+    path.limit.note_lost(c.LIMIT_LOSSES, 20.0 + c.LIMIT_DOUBT_S - 0.01)
+    assert path.limit.limit == 1024
+    path.carries = 800
+    path.limit.note_lost(c.LIMIT_LOSSES, 20.0 + c.LIMIT_DOUBT_S)
+    assert path.run(40.0) == (768, 1024)
+    assert path.sizes == [1024] + [1024] * c.LIMIT_TESTS + [768]
 
 
 # Missing envelopes.
@@ -247,7 +290,9 @@ OLD_S = REGULAR_AFTER_S
         pytest.param(["ask 0 5 old", "count 1 2 2", "count 2 5 5", "count 3 6 5"], id="several gaps"),
         pytest.param(["answer 0 0 old", "count 1 3 3"], id="answers alone"),
         pytest.param(["ask 0 0 old", "count 20 3 0", "count 20.1 4 4", "count 20.2 5 5"], id="reports end"),
-        pytest.param(["ask 0 0 0.1", "ask 7 0 0.1", "count 8 3 0", "count 8.1 3 3"], id="first question"),
+        pytest.param(
+            ["ask 0 0 0.1", "count 2 1 0", "ask 4 0 0.1", "count 8 4 0", "count 8.1 5 4"], id="first question"
+        ),
         pytest.param(
             ["ask 0 0 old", "count 20.1 3 3", "ask 21 0 0", "count 23 8 3", "ask 26 2 old", "count 27 8 5"],
             id="a question once none waits",

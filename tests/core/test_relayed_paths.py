@@ -116,10 +116,13 @@ def test_new_handles_cost_little_along_a_metered_standby_path() -> None:
 
 def test_envelopes_along_a_relay_are_shorter() -> None:
     """With what the relay adds they are as long as direct ones. The longest direct one gets no copy there."""
-    for cls in (Class.STREAM, Class.BULK):
-        assert linked(LTE_A).longest(cls) == c.DEFAULT_ENVELOPE_LIMIT - c.RELAY_BYTES
-        assert linked(LTE).longest(cls) > c.DEFAULT_ENVELOPE_LIMIT
+    for path, longest in ((LTE_A, c.DEFAULT_ENVELOPE_LIMIT - c.RELAY_BYTES), (LTE, c.MAX_ENVELOPE_LIMIT)):
+        paths = linked(path)
+        of(paths, path).envelope_limit.acknowledge(c.MAX_ENVELOPE_LIMIT, 1.0)
+        paths.update(PEER, 1.0)
+        assert [paths.longest[cls] for cls in (Class.STREAM, Class.BULK)] == [longest] * 2
     paths = linked(LTE, LTE_A)
+    of(paths, LTE_A).envelope_limit.acknowledge(c.MAX_ENVELOPE_LIMIT, 1.0)
     sizes = c.RELAYED_ENVELOPE_LIMIT, c.RELAYED_ENVELOPE_LIMIT + 1
     assert [paths.carries(of(paths, LTE_A), size) for size in sizes] == [True, False]
     assert [made.has_relayed for made in (linked(LTE, MESH), path_set(), paths)] == [False, False, True]

@@ -239,7 +239,7 @@ def two_radios(limits: dict[int, int]) -> Radios:
     radios = Radios((0.02, 0.2), link(), link(), both_configured=True)
     for side in (radios.a, radios.b):
         side.node.facts.envelope_limits = limits
-    radios.run(8.0, 0.1, radios.sender(radios.a), radios.sender(radios.b))
+    radios.run(8.0, 0.1, radios.sender(radios.a), radios.sender(radios.b)).measure_lengths()
     assert all(radios.state(radios.a, radio).works for radio in (LTE, SIK))
     return radios
 
@@ -289,14 +289,15 @@ def test_stream_that_is_too_long_for_the_slow_path_is_not_copied_there() -> None
     assert lengths[LTE] == lengths[SIK] != []
 
 
-def test_the_only_path_has_its_limit_too() -> None:
+@pytest.mark.parametrize(("limits", "envelopes"), [({0: LIMIT}, 4), ({}, 1)])
+def test_the_only_path_has_its_limit_too(limits: dict[int, int], envelopes: int) -> None:
     """Frames of all classes share its envelopes."""
     radios = Radios((0.2,), link(), link(), both_configured=True)
-    radios.a.node.facts.envelope_limits = {0: LIMIT}
-    radios.run(3.0, 0.1, radios.sender(radios.a))
-    assert max(sent_lengths(radios, Class.STREAM, [FRAME] * 20)[0]) <= LIMIT
-    radios.a.node.facts.envelope_limits = {}
-    assert len(sent_lengths(radios, Class.STREAM, [FRAME] * 20)[0]) == 1
+    radios.a.node.facts.envelope_limits = limits
+    radios.run(3.0, 0.1, radios.sender(radios.a)).measure_lengths()
+    lengths = sent_lengths(radios, Class.STREAM, [FRAME] * 20)[0]
+    assert len(lengths) == envelopes
+    assert not limits or max(lengths) <= LIMIT
 
 
 def test_a_question_joins_an_envelope_only_within_the_limit() -> None:

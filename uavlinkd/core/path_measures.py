@@ -99,63 +99,73 @@ def datagram_loss(lost: int, sent: int, repeats: list[int]) -> float:
     return (low + high) / 2 if lost else 0.0
 
 
-def limit_at(budget_bits_s: float, carrier_bytes: int = c.LINE_BYTES) -> int:
-    """The longest envelope, in bytes, that several frames share on a slow network with this budget.
+def limit_at(budget_bits_s: float, carrier_bytes: int = c.LINE_BYTES, most: int = c.SLOW_ENVELOPE_MOST) -> int:
+    """The longest envelope, in bytes, that several frames share on a network with this budget.
 
     So much as it carries in :data:`c.ENVELOPE_AIR_S`: a command waits no longer for the envelope before it.
     ``carrier_bytes``: what the network adds to a datagram; by default the framing of a serial line.
     """
     size = int(budget_bits_s * c.ENVELOPE_AIR_S / 8) - carrier_bytes
-    return min(max(size, c.SLOW_ENVELOPE_LEAST), c.SLOW_ENVELOPE_MOST)
+    return min(max(size, c.SLOW_ENVELOPE_LEAST), most)
 
 
 class EnvelopeLimit:
-    """The limit of one path: that of the session until padded probes of this length were not answered.
+    """The longest envelope that several frames share along one path: the longest one that was acknowledged.
 
-    A path may drop long datagrams and report nothing: short probes are answered there, and frames are lost.
+    A path may drop long datagrams and report nothing. The answer to a padded probe acknowledges its length.
     """
 
-    __slots__ = ("_asked", "_asked_at", "_tries", "limit", "next_at")
+    __slots__ = ("_aim", "_asked_at", "_doubted_at", "_tries", "dropped", "limit", "next_at")
 
     def __init__(self) -> None:
-        self.limit = c.MAX_ENVELOPE_LIMIT
-        """Bytes. Longer envelopes are not sent along the path."""
+        self.limit = c.MIN_ENVELOPE_LIMIT
+        """Bytes. Every path carries the longest frame, whose envelope is not longer."""
+        self.dropped = 0
+        """The length that the path drops, as far as is known; 0 for none."""
         self.next_at = c.NEVER
-        """When the next test is due; infinity without one."""
-        self._asked = 0  # the question of the last test; 0 without one
-        self._asked_at = c.NEVER
+        """When to look for a test; infinity before the path is proved."""
+        self._aim = c.MAX_ENVELOPE_LIMIT  # the length to be tested
+        self._asked_at = c.NEVER  # when the test was sent; infinity without one
+        self._doubted_at = -c.NEVER
         self._tries = 0
 
-    def begin(self, now: float) -> None:
-        """The path was proved, or may have changed: test it."""
-        self.limit, self._asked, self._tries = c.MAX_ENVELOPE_LIMIT, 0, 0
+    def begin(self, now: float, aim: int = c.MAX_ENVELOPE_LIMIT) -> None:
+        """The path was proved, or may have changed: test this length, and then shorter ones."""
+        self.limit, self._aim, self._asked_at, self._tries = c.MIN_ENVELOPE_LIMIT, aim, c.NEVER, 0
         self.next_at = now
 
-    def size_to_test(self, longest: int, answered_at: float, now: float) -> int:
-        """The length of the envelope to be sent as a test now; 0 for none.
+    def note_lost(self, lost: int, now: float) -> None:
+        """The path lost so many envelopes recently: perhaps all long ones."""
+        is_long = self.limit > c.MIN_ENVELOPE_LIMIT
+        if is_long and lost >= c.LIMIT_LOSSES and now >= self._doubted_at + c.LIMIT_DOUBT_S:
+            self._doubted_at = now
+            self.begin(now, self.limit)
 
-        ``longest``: of the session, or of the network if that is less. ``answered_at``: when a short
-        question was answered last.
+    def next_size(self, longest: int, answered_at: float, wait_s: float, now: float) -> int:
+        """The length of the test to be sent at :attr:`next_at`; 0 for none.
+
+        ``longest``: of the session, or of the network if that is less. ``answered_at``: when a question was answered
+        last. ``wait_s``: how long an answer may take.
         """
-        if now < self.next_at:
-            return 0
-        if self._asked and answered_at > self._asked_at:  # the path works, and the test got no answer
+        size = min(self._aim, longest)
+        if answered_at > self._asked_at:  # the path works, and the test got no answer
             self._tries += 1
             if self._tries >= c.LIMIT_TESTS:
-                shorter = (size for size in c.SMALLER_LIMITS if size < min(self.limit, longest))
-                self.limit, self._tries = next(shorter, c.SMALLER_LIMITS[-1]), 0
-        size = min(self.limit, longest)
-        self.next_at = c.NEVER if size <= c.SMALLER_LIMITS[-1] else now + c.LIMIT_TEST_S
-        return 0 if self.next_at == c.NEVER else size
+                self.dropped, self._tries = size, 0
+                self._aim = size = next((less for less in c.SMALLER_LIMITS if less < size), 0)
+        if size > self.limit:
+            self._asked_at, self.next_at = now, now + max(c.LIMIT_TEST_S, 2 * wait_s)
+            return size
+        # Later, a single test shows whether the path carries more.
+        self._aim, self._asked_at, self._tries = c.MAX_ENVELOPE_LIMIT, c.NEVER, c.LIMIT_TESTS - 1
+        self.next_at = now + c.LIMIT_RAISE_S
+        return 0
 
-    def asked(self, question: int, now: float) -> None:
-        """The test was sent with this question."""
-        self._asked, self._asked_at = question, now
-
-    def receive_answer(self, answer: int) -> None:
-        """A question was answered. If it was the test, the path carries the limit."""
-        if answer == self._asked:
-            self._asked, self.next_at = 0, c.NEVER
+    def acknowledge(self, size: int, now: float) -> None:
+        """A test of this length was answered."""
+        self.limit, self._asked_at, self.next_at = max(size, self.limit), c.NEVER, now
+        if size >= self.dropped:
+            self.dropped = 0
 
 
 WAITS_S = 20.0
@@ -175,12 +185,13 @@ class MissingEnvelopes:
     Such a peer reports how many datagrams it sent along each path. Its gaps count only as far as these lost some too.
     """
 
-    __slots__ = ("_gaps", "_lost", "_seen", "_until", "total")
+    __slots__ = ("_asked_at", "_gaps", "_lost", "_seen", "_until", "total")
 
     def __init__(self) -> None:
         self.total = 0
         self._seen = 0
         self._until = -c.NEVER  # gaps wait for reports until then
+        self._asked_at = -c.NEVER
         self._gaps: _Counts = []
         self._lost: _Counts = []
 
@@ -193,6 +204,8 @@ class MissingEnvelopes:
             self._until = now + WAITS_S
         elif asks and now > self._until:
             self._until = now + FIRST_WAITS_S
+        if asks:
+            self._asked_at = now
         _add(self._lost, lost, now)
 
     def count(self, gaps: int, now: float) -> int:
@@ -200,7 +213,9 @@ class MissingEnvelopes:
         _add(self._gaps, gaps - self._seen, now)
         self._seen = gaps
         if now > self._until:
-            self.total += sum(number for _, number in self._gaps)
+            # The last report knew those before it. A gap is found so long after its envelope was lost.
+            known_until = self._asked_at + c.LATE_AFTER_S + c.LATE_STEP_S
+            self.total += sum(number for at, number in self._gaps if at > known_until)
             self._gaps.clear()
             self._lost.clear()
         while self._gaps and self._lost:

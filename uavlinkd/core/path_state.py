@@ -36,6 +36,8 @@ class Question(NamedTuple):
     sent: int
     """Envelopes of the session sent along the path until then, the question included."""
     repeats: Repeats = NO_REPEATS
+    size: int = 0
+    """The length of its envelope, if that was padded."""
 
 
 @dataclass(slots=True, eq=False, repr=False)
@@ -216,11 +218,13 @@ class PathState:
 
     # Probes.
 
-    def make_test(self, question: int, now: float) -> Probe:
-        """The record of a padded probe. It may well get no answer, so it makes no path suspect."""
-        self.envelope_limit.asked(question, now)
-        self._wait_for(question, Question(now, 0), now)
-        return Probe(question, 0, self.sent + 1, self.received, self._lag_ms(now))
+    def make_test(self, question: int, size: int, now: float) -> Probe:
+        """The record of a probe that is padded to this length; 0: of the short one beside it.
+
+        It may well get no answer. So it makes no path suspect, and a padded one is left out of what was sent.
+        """
+        self._wait_for(question, Question(now, 0, size=size), now)
+        return Probe(question, 0, self.sent + (not size), self.received, self._lag_ms(now))
 
     def take_questions(self, candidate: PathState) -> None:
         """The path was asked as a candidate, before it had a slot: the answers to those questions count."""
@@ -264,7 +268,8 @@ class PathState:
         asked = self._waiting.get(answer)
         if asked is None:
             return None
-        self.envelope_limit.receive_answer(answer)
+        if asked.size:
+            self.envelope_limit.acknowledge(asked.size, now)
         del self._waiting[answer]
         # Earlier questions say no more than this one: only the later ones count as unanswered.
         later = [other.sent_at for other in self._waiting.values() if other.sent_at > asked.sent_at and other.sent]
@@ -278,12 +283,14 @@ class PathState:
         self._add_round_trip(round_trip_s)
         if received is not None and asked.sent:
             self._loss_out.add(asked.sent_at, asked.sent, received, asked.repeats)
+            self.envelope_limit.note_lost(self._loss_out.recent(c.SUSPECT_WINDOW_S)[1], now)
         return round_trip_s
 
     def note_echo(self, round_trip_s: float, now: float) -> None:
         """An echo request along the only path was answered."""
         self._note_answered(now)
         self._add_round_trip(round_trip_s)
+        self.envelope_limit.note_lost(self.loss_by_echo.recent(c.SUSPECT_WINDOW_S)[1], now)
 
     def _note_answered(self, now: float) -> None:
         if not self.is_validated:

@@ -124,6 +124,10 @@ class PathSet(PathSlots):
         """Whether the class of a frame matters: it decides about its paths, or about a relay's next handle."""
         self.routes = _NO_ROUTES
         """The paths of each class; all empty before a path is known."""
+        self.shares_envelopes = False
+        """Whether several frames were ever sent together. Before that no long envelope is needed."""
+        self.longest: Mapping[Class, int] = dict.fromkeys(Class, c.MIN_ENVELOPE_LIMIT)
+        """The longest envelope that frames of each class share, in bytes. A longer one holds a single frame."""
         self.echo_route: Route = ()
         """Of echo requests that are repeated if they are lost, and of their replies."""
         self.stream_route: Route = ()
@@ -196,7 +200,7 @@ class PathSet(PathSlots):
         if self.best is not None and len(self.by_path) == 1:
             self.best.note_echo(round_trip_s, now)
             self.note_answer(self.best, now)
-            if self.reports_single and not self.best.is_reported:
+            if (self.reports_single and not self.best.is_reported) or now >= self.test_at(self.best):
                 self.revise(now)
 
     def note_echo_counts(self, asked_at: float, sent: int, repeats: Repeats, received: int) -> None:
@@ -292,6 +296,7 @@ class PathSet(PathSlots):
         self.stream_route = stream
         self.echo_route = alone if best.condition is PathCondition.USABLE else critical
         self.routes = {Class.CRITICAL: critical, Class.STREAM: stream, Class.BULK: alone}
+        self.longest = {cls: self._longest(route, cls) for cls, route in self.routes.items()}
 
     def _without_spares(self, best: PathState, others: list[PathState]) -> list[PathState]:
         """Without the relayed paths that carry no copies: better paths from the same socket do.
@@ -322,15 +327,15 @@ class PathSet(PathSlots):
 
     # Lengths of envelopes.
 
-    def longest(self, cls: Class) -> int:
-        """The longest envelope that frames of this class share, in bytes. A longer one holds a single frame.
-
-        There must be a path.
-        """
-        route = self.routes[cls]
+    def _longest(self, route: Route, cls: Class) -> int:
         if cls is Class.CRITICAL and len(route) > 1:  # bit-identical copies along the whole route
             return min(c.CRITICAL_ENVELOPE_LIMIT, *(self.network_limit(state) for state in route))
         return min(route[0].envelope_limit.limit, self.network_limit(route[0]))
+
+    def test_at(self, state: PathState) -> float:
+        """When to test how long the envelopes of a path may be."""
+        is_due = self.shares_envelopes and state.condition is PathCondition.USABLE
+        return state.envelope_limit.next_at if is_due else c.NEVER
 
     def carries(self, state: PathState, size: int) -> bool:
         """Whether a copy of so many bytes may go along a path. Each path carries the longest frame."""
@@ -401,7 +406,5 @@ class PathSet(PathSlots):
         for state in self.by_path.values():
             interval_s = c.NEVER if state.is_off else self.interval_s(state, now)
             state.question_at = c.NEVER if interval_s == c.NEVER else max(now, state.questioned_at + interval_s)
-            moments += [state.question_at, state.next_check()]
-            if self.has_several and state.condition is PathCondition.USABLE:
-                moments.append(state.envelope_limit.next_at)
+            moments += [state.question_at, state.next_check(), self.test_at(state)]
         self.next_at = min(moments)

@@ -7,7 +7,7 @@ from uavlinkd.core.counters import Arrivals
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.outputs import Output
 from uavlinkd.core.path import Path
-from uavlinkd.core.path_state import PathCondition, PathState
+from uavlinkd.core.path_state import PathState
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.probe import ANSWER_BYTES, QUESTION_BYTES, Probe
 from uavlinkd.core.send import resend, seal
@@ -82,7 +82,7 @@ def ask_candidates(peer: Peer, now: float) -> list[Output]:
     for state in peer.paths.to_ask(now):
         if not peer.candidate_questions.take(now):
             break
-        session.candidate_questions += 1
+        session.uncounted += 1
         out += _send(peer, session, state, peer.new_question(), 0, now)
     if out:
         peer.paths.searched_at = now
@@ -143,7 +143,7 @@ def handle_timeout(peer: Peer, now: float) -> list[Output]:
         if now >= state.question_at:
             out += ask(peer, session, state, now)
             state.questioned_at = now  # also if nothing could be sent
-        if peer.paths.has_several and state.condition is PathCondition.USABLE:
+        if now >= peer.paths.test_at(state):
             out += _test_limit(peer, session, state, now)
     peer.paths.schedule(now)
     peer.set_paths_timer()
@@ -151,16 +151,18 @@ def handle_timeout(peer: Peer, now: float) -> list[Output]:
 
 
 def _test_limit(peer: Peer, session: Session, state: PathState, now: float) -> list[Output]:
-    """Send a padded probe if a test of the longest envelope is due."""
+    """Test how long envelopes may be: if a short probe beside the padded one is answered alone, that was too long."""
     longest = min(session.max_envelope, peer.paths.network_limit(state))
-    size = state.envelope_limit.size_to_test(longest, state.answered_at, now)
-    padding = size - session.envelope_bytes(QUESTION_BYTES)
-    if padding <= 0:
-        return []
-    record = state.make_test(peer.new_question(), now)
-    out = seal(peer, session, record.encode(padding=padding), (state,), now, is_answer=True)
-    # If a short question alone is answered, the length is the reason.
-    return out if state.questioned_at == now else out + ask(peer, session, state, now)
+    size = state.envelope_limit.next_size(longest, state.answered_at, state.wait_s, now)
+    out: list[Output] = []
+    for length in (size, 0) if size else ():
+        record = state.make_test(peer.new_question(), length, now)
+        padding = max(0, length - session.envelope_bytes(QUESTION_BYTES))
+        out += seal(peer, session, record.encode(padding=padding), (state,), now, is_answer=True)
+        if length:
+            session.uncounted += 1
+            state.sent -= 1
+    return out
 
 
 def _send(peer: Peer, session: Session, state: PathState, question: int, answer: int, now: float) -> list[Output]:

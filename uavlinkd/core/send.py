@@ -33,12 +33,14 @@ def send_frames(peer: Peer, frames: Sequence[bytes], now: float, cls: Class) -> 
         # On a slow network, a request about freshness measures the round trip too: it comes first if frames arrive.
         least_s = (1 + c.VERIFY_REPEAT_SHARE) * paths.pace.interval_s
         peer.timers.set(Timer.PROBE, now + max(peer.durations.probe_interval_s, least_s))
-    limit = session.payload_limit
+    limit = session.payload_limit - max(0, session.max_envelope - paths.longest[cls])
     asks_at = NEVER
+    if len(frames) > 1 and not paths.shares_envelopes:
+        paths.shares_envelopes = True
+        paths.schedule(now)
+        peer.set_paths_timer()
     if len(paths.by_path) > 1:
         _note_activity(peer, now)
-    if paths.is_multiple or paths.has_relayed or paths.facts.envelope_limits:
-        limit = min(limit, session.payload_limit_of(paths.longest(cls)))
     if paths.is_multiple and cls is not Class.CRITICAL and len(route) == 1:
         asks_at = route[0].question_at - c.QUESTION_EARLY_S
     out: list[Output] = []
@@ -194,7 +196,7 @@ def ask_for_echo(peer: Peer, session: Session, now: float, route: Route = ()) ->
     session.verification.asked(now, repeat_s)
     peer.set_freshness()
     repeats = NO_REPEATS if peer.paths.best is None else peer.paths.best.repeats
-    token = peer.echo_requests.add(session, now, session.send_counter + 1 - session.candidate_questions, repeats)
+    token = peer.echo_requests.add(session, now, session.send_counter + 1 - session.uncounted, repeats)
     echo = wire.Echo(False, token, session.received, session.expected)
     out = send_echo(peer, session, echo, route or peer.paths.routes[Class.CRITICAL], now)
     peer.asked_at = now

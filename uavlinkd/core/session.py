@@ -66,8 +66,8 @@ class Session:
         self.reject_at = now + lifetime_s
         self.send_counter = 0
         self.received = 0
-        self.candidate_questions = 0
-        """Envelopes to addresses where the peer may not be: they are not lost if they do not arrive."""
+        self.uncounted = 0
+        """Questions to candidates and tests of a path's limit: they are not lost if they do not arrive."""
         self.window = ReplayWindow()
         self.trusted_until = now + c.LATE_AFTER_S
         """An envelope that arrives until then is new: the silence before it was short."""

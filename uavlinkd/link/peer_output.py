@@ -143,10 +143,10 @@ class PeerOutput:
         if session is None or path is None:
             return
         self._critical_limit = session.payload_limit_of(
-            min(CRITICAL_ENVELOPE_LIMIT, peer.paths.longest(Class.CRITICAL))
+            min(CRITICAL_ENVELOPE_LIMIT, peer.paths.longest[Class.CRITICAL])
         )
         if self.egress is not None:
-            limit = min(session.payload_limit, session.payload_limit_of(peer.paths.longest(Class.STREAM)))
+            limit = min(session.payload_limit, session.payload_limit_of(peer.paths.longest[Class.STREAM]))
             seal = session.parameters.max_envelope - session.payload_limit
             self.egress.set_shape(EnvelopeShape(limit, seal, carrier_bytes(path)))
 

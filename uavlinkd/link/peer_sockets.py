@@ -14,8 +14,10 @@ from typing import TYPE_CHECKING, Final
 from structlog.typing import FilteringBoundLogger
 
 from uavlinkd.config.model import HttpsServer, NetworkConfig, PeerAddress
+from uavlinkd.core.constants import IP_BYTES, MAX_ENVELOPE_LIMIT
 from uavlinkd.core.node import Node
 from uavlinkd.core.path import Path, SocketAddress, relay_name
+from uavlinkd.core.path_measures import limit_at
 from uavlinkd.endpoints.ports import failure_name
 from uavlinkd.endpoints.reader import PAUSE_S, Reader
 from uavlinkd.endpoints.sockets import (
@@ -222,7 +224,9 @@ class PeerSockets:
                 self.budgets.update({sock.number: budget for sock in network.sockets})
         budgets = {number: budget.bits_s for number, budget in self.budgets.items() if budget.bits_s}
         self._node.facts.set_budgets(budgets)
-        self._node.facts.envelope_limits = {line.number: line.envelope_limit for line in self.serial.networks}
+        limits = {number: limit_at(bits_s, IP_BYTES, MAX_ENVELOPE_LIMIT) for number, bits_s in budgets.items()}
+        limits |= {line.number: line.envelope_limit for line in self.serial.networks}
+        self._node.facts.envelope_limits = limits
         self._choose_senders()
 
     def use_relays(self) -> None:

@@ -370,6 +370,7 @@ def _path_status(link: PeerLink | RelayLink, state: PathState, way_of: WayOf, no
     relay_address = way_of(state.path)[1]
     return _path_now(link, state, way_of) | {
         "relay_address": None if relay_address is None else str(Address.of(relay_address)),
+        "envelope_bytes": state.envelope_limit.limit,
         "own_address": own if isinstance(own := state.path.address[-1], str) else None,
         "is_configured": state.is_configured,
         "state_s": now - state.since,

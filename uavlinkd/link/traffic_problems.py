@@ -133,7 +133,7 @@ def up_problems(peer: PeerFacts) -> Iterator[Found]:
 
 
 def _losses(peer: PeerFacts) -> Iterator[Found]:
-    """Loss by direction. A network may lose in one only."""
+    """Loss by direction, which a network may have in one only, and paths that drop long datagrams."""
     directions = ("from it to here", "from here to it")
     shares = [
         (direction, min(1.0, lost / max(1, sent)))
@@ -146,6 +146,14 @@ def _losses(peer: PeerFacts) -> Iterator[Found]:
             f"many datagrams are lost: {' and '.join(f'{share:.0%} {direction}' for direction, share in shares)}",
             "look for a bad radio, a full network or a rate limit in this direction",
         )
+    for state in peer.link.peer.paths.states:
+        if state.works and (dropped := state.envelope_limit.dropped):
+            yield warning(
+                "long_datagrams_dropped",
+                f"the path to {shown(state.path.address)} drops datagrams of {dropped:,} bytes, so frames share"
+                f" shorter ones: up to {state.envelope_limit.limit:,} bytes",
+                "nothing is lost by that; if the path should carry more, look for a tunnel with a small MTU",
+            )
 
 
 def _about_systems(part: PartFacts, systems: Mapping[int, int], which: str) -> tuple[str, str]:

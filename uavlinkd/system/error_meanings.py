@@ -55,7 +55,7 @@ ERROR_MEANINGS: Final[Mapping[str, str]] = {
     "EAFNOSUPPORT": "this machine cannot use addresses of this family (IPv4 or IPv6)",
     "EINVAL": "the address cannot be used from here: a link-local address (fe80::) needs its interface, as in %wlan0,"
     " and a daemon that listens on loopback reaches only this machine",
-    "EMSGSIZE": "the datagram is larger than the path permits: reduce max_envelope_bytes",
+    "EMSGSIZE": "the datagram is larger than the path permits: the daemon finds out what the path carries",
     "EAGAIN": "the network card or its driver accepts no more data now: the machine sends more than it can carry",
     "ENOBUFS": "the network card or its driver accepts no more data now: the machine sends more than it can carry",
     NAME_NOT_RESOLVED: "the name has no address now: see `getent hosts NAME`, or write an IP address."
