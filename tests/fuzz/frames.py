@@ -15,7 +15,7 @@ from tests.link.test_switch import Client, policy
 from uavlinkd.link import switch as switching
 from uavlinkd.link.drop_summary import DropSummary
 from uavlinkd.link.switch import Port, Switch
-from uavlinkd.mavlink import headers, routing
+from uavlinkd.mavlink import headers, routing, sendings
 from uavlinkd.mavlink.dialect import MESSAGES, SETUP_SIGNING
 from uavlinkd.mavlink.frames import (
     MAVLINK1,
@@ -191,7 +191,8 @@ _CLAIMS: Final = (None, {1, 2, 4, 5}, {1, 2, 3}, None, {6}, {7})
 
 
 _BOUNDS = (
-    (routing, ("MAX_ADDRESSES_PER_PORT", "MAX_FRAMES_REMEMBERED", "MAX_DECISIONS")),
+    (routing, ("MAX_ADDRESSES_PER_PORT",)),
+    (sendings, ("MAX_FRAMES_REMEMBERED",)),
     (gates, ("MAX_COUNTED", "MAX_BUCKETS", "MAX_DECISIONS")),
     (switching, ("MAX_FLOWS",)),
 )
@@ -263,8 +264,7 @@ def _check_received(clients: list[Client], source: int, frames: list[Frame]) -> 
 def _check_tables(router: Router[Port], switch: Switch, policies: list[Policy]) -> None:
     for received_at in router._received_at.values():
         assert len(received_at) <= routing.MAX_ADDRESSES_PER_PORT, "too many addresses"
-    assert len(router._seen) <= routing.MAX_FRAMES_REMEMBERED
-    assert len(router._decisions) <= routing.MAX_DECISIONS
+    assert len(router.sendings._seen) <= sendings.MAX_FRAMES_REMEMBERED
     for flows in (known.flows for known in switch._ports.values()):
         assert len(flows) <= switching.MAX_FLOWS
     for client_policy in policies:

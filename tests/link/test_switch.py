@@ -14,6 +14,7 @@ from tests.mavlink.policy.smuggling import v2
 from uavlinkd.endpoints.ports import Endpoint, LocalPort, PortHandler
 from uavlinkd.link import switch as switch_module
 from uavlinkd.link.drop_summary import DropSummary, ShellReason
+from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.switch import Switch
 from uavlinkd.mavlink.frames import Frame, SplitCounters, split_datagram
 from uavlinkd.mavlink.headers import Header
@@ -54,6 +55,17 @@ class Client(Endpoint):
 
     def close(self) -> None:
         """Nothing to close."""
+
+
+class Peer(PeerLink):
+    """Keeps the frames that it receives."""
+
+    def __init__(self) -> None:
+        self.name = "peer"
+        self.received: list[bytes] = []
+
+    def send(self, frames: Sequence[Frame], source: Source, now: float, waited_s: float) -> None:
+        self.received += [raw for raw, _ in frames]
 
 
 class Stage:
@@ -131,20 +143,26 @@ def test_each_frame_of_a_message_goes_to_the_same_ports_once(stage: Stage) -> No
     assert stage.router.unrouted == {Unrouted.DUPLICATE: 1}
 
 
-def test_duplicates_are_looked_for_where_a_frame_can_arrive_by_two_routes(stage: Stage) -> None:
-    """Not while policy accepts a system from one port alone; from the moment on at which another may send it too."""
-    for system, client in enumerate((stage.a, stage.b, stage.c), start=1):
-        stage.switch.set_policy(client.port, policy(system_ids=[system]))
+def test_copies_are_looked_for_where_a_frame_can_arrive_again(stage: Stage) -> None:
+    """Not while one port alone may send as a system, and peers alone get its frames. Else from the next frame on."""
+    peer = Peer()
+    stage.switch.remove(stage.b.port)
+    stage.switch.remove(stage.c.port)
+    stage.switch.add(peer, policy(system_ids=[2]))
     for number in range(3):
         stage.forward(stage.a.port, [attitude(number)], 0.1)
-    assert stage.delivered() == (0, 3, 3)
-    assert len(stage.router._seen) == 1, "the first frame of the flow"
-    stage.switch.set_policy(stage.c.port, policy(system_ids=[1, 3]))
+    assert len(peer.received) == 3
+    assert len(stage.router.sendings._seen) == 1, "the first frame of the flow"
+    stage.switch.set_policy(peer, policy(system_ids=[1, 2]))
     for number in range(3, 6):
         stage.forward(stage.a.port, [attitude(number)], 0.2)
-        stage.forward(stage.c.port, [attitude(number)], 0.2)
-    assert stage.delivered() == (0, 3, 3)
+        stage.switch.forward(peer, [attitude(number)], 0.2, stage.stall.epoch)
+    assert (len(peer.received), stage.delivered()) == (6, (0, 0, 0))
     assert stage.router.unrouted == {Unrouted.DUPLICATE: 3}
+    stage.switch.add(stage.b.port, policy(system_ids=[3]))
+    stage.switch.set_policy(peer, policy(system_ids=[2]))
+    stage.forward(stage.a.port, [attitude(6), attitude(7), attitude(7)], 0.3)
+    assert (len(peer.received), stage.delivered()) == (8, (0, 2, 0)), "it returned from the other client"
 
 
 def test_a_new_rule_holds_for_the_next_frame(stage: Stage) -> None:

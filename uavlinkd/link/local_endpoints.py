@@ -189,11 +189,10 @@ class LocalEndpoints:
         for endpoint in self.endpoints:
             _, source = self._sources[endpoint.name]
             if source is not None:
-                raw = source.frame(note)
-                self._switch.router.note_own(raw, now)
-                self._write(endpoint, raw, now)
+                self._write(endpoint, source.frame(note), now)
 
     def _write(self, endpoint: Endpoint, raw: bytes, now: float) -> None:
+        self._switch.router.sendings.note_own(raw, endpoint.ports, now)
         frames = split_payload(raw, SplitCounters())
         for port in endpoint.ports:
             port.send(frames, self._own, now, 0.0)

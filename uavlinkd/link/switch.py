@@ -2,7 +2,7 @@
 
 A port is a local client or a peer. The switch works in batches: the frames that arrived in one wake-up leave in one
 call per port. It remembers a flow: the ports where all frames of a source with one header go. So a frame of a known
-flow costs a look-up. Where a frame can arrive by two routes, it costs the check for duplicates too.
+flow costs a look-up. Where a frame can arrive again, it costs the check whether it is new too.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ class Route(NamedTuple):
     """Where the frames of one source with one header go."""
 
     ports: tuple[Port, ...]
-    has_one_route: bool
-    """No other port may send frames of this system, so none of them is a duplicate."""
+    comes_once: bool
+    """No other port may send frames of this system, and none goes from one local client to another: all are new."""
     is_conditional: bool
     """A policy decides about each frame, by its contents or by a rate limit. Otherwise all of them pass."""
 
@@ -69,11 +69,12 @@ class Switch:
 
     def add(self, port: Port, policy: Policy) -> None:
         """Accept frames from this port, and send frames to it, as far as its policy allows."""
-        source = Source(_owner(port), policy.incoming, self._report, self.router.forget_frame)
+        source = Source(_owner(port), policy.incoming, self._report, self.router.sendings.forget)
         self._ports[port] = _Known(policy, source, next(self._unused))
         _set_outgoing(port, policy)
         self._senders.clear()
-        self.router.add_port(port, is_peer=isinstance(port, PeerLink))
+        endpoint = None if isinstance(port, PeerLink) else port.endpoint
+        self.router.add_port(port, is_peer=endpoint is None, endpoint=endpoint)
 
     def set_policy(self, port: Port, policy: Policy) -> None:
         """Change the rules of a port. Systems whose frames it may no longer send are not looked for behind it."""
@@ -117,10 +118,10 @@ class Switch:
                 if route is None:
                     ports = self._route(frame, source, now)
                 else:
-                    ports, has_one_route, is_conditional = route
+                    ports, comes_once, is_conditional = route
                     if is_conditional:
                         ports = self._pass(frame, source, route, now)
-                    elif not has_one_route and not router.is_first(frame.raw, source, now):
+                    elif not comes_once and not router.sendings.is_new(frame, source, ports, now):
                         continue
             except Exception as error:  # a fault costs this frame: no policy let it pass
                 report(error)
@@ -153,7 +154,9 @@ class Switch:
                 del known.flows[next(iter(known.flows))]
             gates = (incoming, *(self._ports[port].policy.outgoing for port in ports))
             is_conditional = not all(gate.always_passes(header) for gate in gates)
-            known.flows[header] = Route(ports, self._has_one_route(header.system), is_conditional)
+            is_local = isinstance(source, LocalPort) and any(isinstance(port, LocalPort) for port in ports)
+            comes_once = not is_local and self._has_one_route(header.system)
+            known.flows[header] = Route(ports, comes_once, is_conditional)
         return self._pass_outgoing(frame, ports, now)
 
     def _pass(self, frame: Frame, source: Port, route: Route, now: float) -> tuple[Port, ...]:
@@ -162,7 +165,7 @@ class Switch:
         if refusal is not None:
             self._report(_owner(source), frame.header, refusal, now)
             return ()
-        if not route.has_one_route and not self.router.is_first(frame.raw, source, now):
+        if not route.comes_once and not self.router.sendings.is_new(frame, source, route.ports, now):
             return ()
         return self._pass_outgoing(frame, route.ports, now)
 
