@@ -19,7 +19,9 @@ from uavlinkd.link.evidence import ELSEWHERE, EVIDENCE_S
 from uavlinkd.link.facts import EndpointFacts, Found, Moment, PeerFacts, details_at, fault, listed, security, warning
 from uavlinkd.link.fleet_problems import fleet_problems, pinned_problems
 from uavlinkd.link.parts import DaemonParts
+from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.serial_networks import RECENT_S
+from uavlinkd.link.switch import Port
 from uavlinkd.ops.findings import Finding, Subject
 from uavlinkd.ops.log import shown
 from uavlinkd.relay.service import RelayMember
@@ -94,12 +96,30 @@ def daemon_problems(moment: Moment) -> Iterator[Found]:
             f"the last reload was refused, and the configuration before is in force: {listed(problems, 1)}",
             f"correct what `uavlinkd check --config {daemon.config.path}` prints, and run `uavlinkd reload`",
         )
+    yield from _circles(moment)
     if daemon.recorder is not None and not daemon.recorder.is_recording:
         yield warning(
             "recording_stopped",
             f"no frame is recorded now ({listed(daemon.recorder.failures)})",
             "make room on its disk, and let the daemon's user write there",
         )
+
+
+def _circles(moment: Moment) -> Iterator[Found]:
+    """Ports from which frames come back that this daemon sent elsewhere."""
+    for port, circle in moment.daemon.switch.router.sendings.circles.items():
+        if moment.now - circle.returned_at <= EVIDENCE_S and (len(circle.systems) > 1 or circle.is_suspected):
+            ways = " or ".join(sorted(map(_described, circle.through - {port}))) or "it"
+            yield warning(
+                "frames_in_circle",
+                f"frames that went to {ways} came back from {_described(port)}, and are dropped: a client, a bridge"
+                " or a radio joins both, or a sender there repeats equal frames",
+                "let what joins them no longer forward from one to the other; give each sender its own system id",
+            )
+
+
+def _described(port: Port) -> str:
+    return port.name if isinstance(port, PeerLink) else f"{port.endpoint.name} ({port.name})"
 
 
 def member_problems(moment: Moment) -> Iterator[Found]:
