@@ -136,6 +136,7 @@ class Network:
         self._rng = random.Random(seed)
         self._arriving: list[tuple[float, int, Callable[[], None]]] = []
         self._number = 0
+        self._arrived_at: dict[tuple[End, int], float] = {}  # a radio keeps the order, also when its delay changes
         self.alpha.link.set_paths([self._path_to(number, self.bravo) for number in range(len(radios))], 0.0)
 
     def transmit(self, sender: End, datagram: bytes, path: Path) -> None:
@@ -145,7 +146,9 @@ class Network:
             return
         receiver = self.bravo if sender is self.alpha else self.alpha
         source = self._path_to(path.socket, sender)
-        self.at(self.now + radio.delay_s, lambda: receiver.perform(receiver.node.receive(datagram, source, self.now)))
+        arrives_at = max(self.now + radio.delay_s, self._arrived_at.get((sender, path.socket), 0.0))
+        self._arrived_at[sender, path.socket] = arrives_at
+        self.at(arrives_at, lambda: receiver.perform(receiver.node.receive(datagram, source, self.now)))
 
     def _path_to(self, number: int, end: End) -> Path:
         if self.radios[number].is_relayed:

@@ -84,6 +84,23 @@ class Flow:
         return max((later - earlier for earlier, later in pairwise(times)), default=math.inf)
 
 
+class Sequence:
+    """The frames of all classes from one drone to another: the number that their sender gives each of them."""
+
+    def __init__(self) -> None:
+        self.numbers: dict[bytes, int] = {}
+        self.newest = -1
+        self.overtaken = 0
+        """Frames that were delivered after later ones: a gap for a client, and a signature that it rejects."""
+
+    def send(self, frame: bytes) -> None:
+        self.numbers[frame] = len(self.numbers)
+
+    def deliver(self, frame: bytes) -> None:
+        self.overtaken += self.numbers[frame] < self.newest
+        self.newest = max(self.newest, self.numbers[frame])
+
+
 def class_in(frame: bytes) -> Class:
     """The class that a frame says it has."""
     return _CLASSES[frame[-9]]

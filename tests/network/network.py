@@ -16,7 +16,7 @@ from typing import Protocol, Self, TypeVar
 
 from tests.network.air import Address, Air, Crossing, Endpoint, Hop
 from tests.network.drone import Drone, session_name, share_a_session
-from tests.network.flow import FRAME_BYTES, Flow, FlowKey, class_in, every_second_may_be_old, split_frames
+from tests.network.flow import FRAME_BYTES, Flow, FlowKey, Sequence, class_in, every_second_may_be_old, split_frames
 from tests.network.serial_line import SIK, SerialLine
 from uavlinkd.core import wire
 from uavlinkd.core.constants import PROBLEMS_PER_REPORT, REFUSALS_KEPT
@@ -71,6 +71,7 @@ class Network:
         self.owners: dict[Address, str] = {}
         """The drone that had an address last. Behind a NAT, an address is used once."""
         self.flows: dict[FlowKey, Flow] = {}
+        self.sequences: dict[tuple[str, str], Sequence] = {}
         self.lines: dict[Endpoint, SerialLine] = {}
         """The serial line at a socket of a drone. Both its ends are here."""
         self.attackers: dict[Address, Attacker] = {}
@@ -152,6 +153,10 @@ class Network:
         key = sender.name, receiver.name, cls
         return self.flows.setdefault(key, Flow(*key))
 
+    def sequence(self, sender: Drone, receiver: Drone) -> Sequence:
+        """The frames of every class from one drone to another, in the order in which they were sent."""
+        return self.sequences.setdefault((sender.name, receiver.name), Sequence())
+
     def flows_between(self, sender: str, receiver: str) -> list[Flow]:
         """The frames of every class from one drone to another."""
         return [self.flows.setdefault(key, Flow(*key)) for cls in Class for key in ((sender, receiver, cls),)]
@@ -160,6 +165,7 @@ class Network:
         if sender.node is None or receiver.name not in sender.node.peers:
             return False
         frame = self.flow(sender, receiver, cls).frame(self.now)
+        self.sequence(sender, receiver).send(frame)
         self.perform(sender, sender.node.send(sender.peer(receiver), [frame], sender.local_now, cls))
         return True
 
@@ -378,6 +384,7 @@ class Network:
         assert order or not drone.peer(sender).paths.is_multiple, "the order is unknown, and copies may overtake it"
         for frame in split_frames(payload):
             self.flow(sender, drone, class_in(frame)).deliver(frame, self.now, order)
+            self.sequence(sender, drone).deliver(frame)
 
     def _send(self, datagram: bytes, source: Address, destination: Address) -> None:
         self.datagrams += 1

@@ -359,6 +359,12 @@ RELAYED_COPIES = 2
 """From one socket, copies go through so many relays, and with so many handles of one relay."""
 COPIES_PER_SOCKET = 3
 """Paths from one socket along which copies go, if one of them leads through a relay."""
+EARLY_MOST_S = 0.1
+"""Frames do not wait for a path that is slower by more than this."""
+EARLY_MARGIN_S = 0.01
+"""They wait longer than that path is slower, by this: delays vary."""
+EARLY_ENVELOPES = 64
+"""Envelopes whose frames wait for those before them."""
 RESENT_S = LATE_AFTER_S
 """A new relayed path carries the critical envelopes of this time again: the former paths may have failed. A peer
 drops older ones as late."""

@@ -160,7 +160,8 @@ def adopt(peer: Peer, session: Session, path: Path, now: float) -> list[Output]:
 
 def receive_close(peer: Peer, session: Session, now: float) -> list[Output]:
     """The peer ends this session and those ranked below it."""
-    out = freshness.end(peer, peer.sessions.end_up_to(session, now))
+    out: list[Output] = [] if peer.early is None else peer.early.release(c.NEVER)
+    out += freshness.end(peer, peer.sessions.end_up_to(session, now))
     if peer.sessions.current is None:
         peer.is_up = False
         peer.unverified_since = None

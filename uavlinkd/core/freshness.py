@@ -97,6 +97,8 @@ def receive_answer(peer: Peer, echo: wire.Echo, now: float) -> list[Output]:
 def handle_timeout(peer: Peer, now: float) -> list[Output]:
     """On each session: ask again, and drop what was held for too long."""
     out: list[Output] = []
+    if peer.early is not None:
+        out += peer.early.release(now)
     for session in peer.sessions.confirmed:
         held, verification = session.held, session.verification
         if now >= held.due_at:

@@ -352,7 +352,7 @@ class Node:
     # For a busy shell.
 
     def pop_held(self) -> list[Output]:
-        """Hold no frames any more that wait for a proof of freshness.
+        """Hold no frames any more that wait for a proof of freshness, or for others.
 
         Only for a shell that drops them: this process stood still, and they may be from before that.
         """
@@ -361,6 +361,8 @@ class Node:
             for peer in self.peers.values()
             for session in peer.sessions.confirmed
             for payload in session.held.pop_all()
+        ] + [
+            frames for peer in self.peers.values() if peer.early is not None for frames in peer.early.release(c.NEVER)
         ]
 
     def claimed_sender(self, datagram: bytes, path: Path) -> Hashable:

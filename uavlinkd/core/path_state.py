@@ -216,6 +216,11 @@ class PathState:
         """A copy arrived along this path, so much later than the first; 0 for the first itself."""
         self._lags.append((now, lag_s))
 
+    def head_start_s(self, slower: PathState) -> float:
+        """How much earlier than along a slower path the peer's envelopes arrive here, at most, as far as is known."""
+        lag_s, own_lag_s = (path._lags[-1][1] if path._lags else 0.0 for path in (slower, self))
+        return max(lag_s - own_lag_s, ((slower.srtt_s or 0.0) - (self.srtt_s or 0.0)) / 2)
+
     # Probes.
 
     def make_test(self, question: int, size: int, now: float) -> Probe:

@@ -255,6 +255,8 @@ class PathSet(PathSlots):
         before, self._reported_best = self._reported_best, self.best
         if self.best is not None and before is not None and self.best is not before:
             changes.insert(0, PathChanged(peer, self.best.path, before.path, reason or "session"))
+            # The next frames of the stream have a question in front: it shows the peer where they go now.
+            self.best.questioned_at = now + c.QUESTION_EARLY_S - self.interval_s(self.best, now)
         self._set_routes(now)
         self.schedule(now)
         return changes

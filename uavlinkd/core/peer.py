@@ -14,6 +14,7 @@ from uavlinkd.core import constants as c
 from uavlinkd.core import wire
 from uavlinkd.core.crypto import Entropy, KeyPair
 from uavlinkd.core.drops import Detail, DropReason
+from uavlinkd.core.early import EarlyFrames
 from uavlinkd.core.initiator import Initiator, Pending
 from uavlinkd.core.limits import TokenBucket
 from uavlinkd.core.outputs import Dropped, Output, PeerLost, PeerUp
@@ -75,7 +76,7 @@ class Peer:
 
     __slots__ = (
         *("answers", "answers_while_up", "asked_at", "candidate_questions", "cookied_answers", "durations"),
-        *("echo_after_s", "echo_at", "echo_requests", "entropy", "established_at", "group_work"),
+        *("early", "echo_after_s", "echo_at", "echo_requests", "entropy", "established_at", "group_work"),
         *("handshake_after_s", "handshake_s", "hinted_at", "indices", "initiator", "is_up", "losses"),
         *("lost_after_s", "name", "offered_at", "own_problems", "own_refusals", "paths", "problem_claim"),
         *("proven_group_work", "provisional_until", "received_at", "recent", "refusal_claims", "remembered"),
@@ -118,6 +119,8 @@ class Peer:
         """Critical envelopes, and when they were sent, if a path leads through a relay: a new path may carry them."""
         self.paths = PathSet(settings.link.redundancy, settings.link.idle_probe_s, shared.known, shared.facts)
         """Where the peer is, or may be."""
+        self.early: EarlyFrames | None = None
+        """Its frames that wait for others along a slower path; None before it has several paths."""
         self.paths.reports_single = bool(settings.link.features & c.FEATURE_RECORDS)
         self.handshake_s = 0.0
         """How long the last response took; 0 after a question was answered since."""
@@ -295,4 +298,5 @@ class Peer:
     def set_freshness(self) -> None:
         """Set when a session has to ask the peer again, or to drop frames that it holds."""
         moments = (min(session.held.due_at, session.verification.due_at) for session in self.sessions.confirmed)
-        self.timers.set(Timer.FRESHNESS, min(moments, default=c.NEVER))
+        early_at = c.NEVER if self.early is None else self.early.due_at
+        self.timers.set(Timer.FRESHNESS, min(early_at, min(moments, default=c.NEVER)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from uavlinkd.core import constants as c
 from uavlinkd.core.counters import Arrivals
 from uavlinkd.core.drops import DropReason
+from uavlinkd.core.early import EarlyFrames
 from uavlinkd.core.outputs import Output
 from uavlinkd.core.path import Path
 from uavlinkd.core.path_state import PathState
@@ -32,6 +33,8 @@ def follow_paths(peer: Peer, now: float) -> None:
     """
     peer.set_waits()
     pace, has_copies = peer.paths.pace, peer.paths.has_several or peer.paths.has_relayed
+    if has_copies and peer.early is None:
+        peer.early = EarlyFrames(peer.paths)
     for session in peer.sessions.confirmed:
         session.set_pace(pace, peer.verify_interval_s, now)
         if has_copies and session.arrivals is None:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 from uavlinkd.core import constants as c
 from uavlinkd.core import freshness, probing, wire
 from uavlinkd.core.drops import Drop, DropReason
+from uavlinkd.core.early import Envelope
 from uavlinkd.core.establish import adopt, receive_close
 from uavlinkd.core.outputs import Deliver, Output, RecordReceived
 from uavlinkd.core.path import Path
@@ -20,6 +21,7 @@ from uavlinkd.core.refusals import RefusalReport
 from uavlinkd.core.relay_records import FleetRecord, parse_record
 from uavlinkd.core.send import may_echo, send_echo
 from uavlinkd.core.session import Session
+from uavlinkd.core.timers import Timer
 
 _PROBE = bytes((PROBE,))
 _ANSWERED_BYTES = ANSWER_BYTES, QUESTION_BYTES, wire.ECHO_REQUEST_BYTES
@@ -93,22 +95,35 @@ def receive_envelope(
             out += probing.update(peer, now)
     if not payload:
         return out
+    is_along_best = False
     if payload[0] < wire.FRAMES_FROM:
         arrived = Arrived(peer, session, counter, state, now, is_new, is_superseded)
         controlled, payload = _receive_control(arrived, payload)
         out += controlled
         if not payload:
             return out
-    if counter != session.window.highest:
-        traffic.out_of_order += 1
+        is_along_best = True  # a probe in front of frames
+    early = peer.early
+    traffic.out_of_order += (
+        counter < session.window.highest if early is None else session.order_base + counter < early.highest
+    )
     if is_superseded:
         out += peer.drop(DropReason.DELAYED, 1)
     elif not is_new:
         out += freshness.hold(peer, session, counter, payload, now)
-    elif now < session.verification.look_at:
-        out.append(Deliver(peer, payload, 0 if session.arrivals is None else session.order_of(counter)))
     else:
-        out += freshness.deliver(peer, session, counter, payload, now)
+        order = 0 if session.arrivals is None else session.order_of(counter)  # without a call for one path
+        delivered: list[Output] = [Deliver(peer, payload, order)]
+        if now >= session.verification.look_at:
+            delivered = freshness.deliver(peer, session, counter, payload, now)
+        if early is not None:
+            out += [output for output in delivered if not isinstance(output, Deliver)]
+            frames = [output for output in delivered if isinstance(output, Deliver)]
+            envelope = Envelope(session.order_base + counter, session, state, frames, is_along_best)
+            delivered = early.arrive(envelope, now)
+            if early.due_at < peer.timers.deadlines[Timer.FRESHNESS]:
+                peer.timers.set(Timer.FRESHNESS, early.due_at)
+        out += delivered
     return out
 
 
