@@ -210,7 +210,7 @@ def test_reports_leave_room_for_frames(budget: int) -> None:
     link.report_refusals(1.0)
     assert len(of(sent, Transmit)) == (0 if budget else 1)
     if budget and link.output.egress is not None:
-        link.output.egress.clear(2.0)
+        link.output.egress.queue.clear(2.0)
         before = link.output.egress.demand(30.0)
         link.report_refusals(30.0)
         assert len(of(sent, Transmit)) == 1

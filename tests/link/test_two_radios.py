@@ -148,7 +148,7 @@ def test_peer_that_stops_waiting_lets_others_use_the_network(is_removed: bool) -
     other.send([attitude(2)], pair.now, 0.0)
     other.send_waiting(pair.now)
     assert other.egress is not None
-    assert other.egress.queued_frames == 1
+    assert other.egress.queue.queued_frames == 1
     if is_removed:
         pair.alpha.link.leave(pair.now)
     else:
@@ -156,4 +156,4 @@ def test_peer_that_stops_waiting_lets_others_use_the_network(is_removed: bool) -
         pair.alpha.link.change(config, pair.now)
     later = pair.now + 0.95
     assert budget.all.level(later) > 150
-    assert other.egress.take(later) == [attitude(2)]
+    assert other.egress.queue.take(later) == [attitude(2)]

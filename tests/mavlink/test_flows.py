@@ -73,5 +73,5 @@ def test_invented_flows_use_bounded_memory_and_a_flow_in_use_is_kept() -> None:
     newest = NewestStates()
     for number in range(1, 4 * MAX_FLOWS):
         newest.pick([attitude(number), heartbeat(0, 1 + number % 250, 1 + number // 250)], 2 * number)
-        assert len(newest._orders) + len(newest._earlier) <= 2 * MAX_FLOWS
+        assert len(newest._orders) <= MAX_FLOWS
         assert newest.pick([attitude(number - 1)], 2 * number - 1) == []

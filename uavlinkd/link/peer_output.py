@@ -77,7 +77,7 @@ class PeerOutput:
         Returns whether :meth:`send_waiting` has something to do.
         """
         if self.egress is not None:
-            self.egress.put(frames, now - waited_s)
+            self.egress.queue.put(frames, now - waited_s)
             return True
         self._send_runs(frames, now)
         return bool(self.copies.waiting)
@@ -87,7 +87,7 @@ class PeerOutput:
         peer = self._peer
         if self.egress is not None:
             self.charge(now)
-            while batch := self.egress.take(now):
+            while batch := self.egress.queue.take(now):
                 self._send_runs(batch, now)
                 self.charge(now)
         if self.copies.waiting:
@@ -104,12 +104,12 @@ class PeerOutput:
 
     def next_deadline(self, now: float) -> float:
         """When :meth:`send_waiting` is due."""
-        at = NEVER if self.egress is None else self.egress.next_deadline()
+        at = NEVER if self.egress is None else self.egress.queue.next_deadline()
         return min(at, self.copies.next_deadline(now)) if self.copies.waiting else at
 
     def has_room(self, payload_bytes: int, now: float) -> bool:
         """Whether an envelope with this payload may go out now."""
-        return self.egress is None or self.egress.has_room(payload_bytes, now)
+        return self.egress is None or self.egress.queue.has_room(payload_bytes, now)
 
     def charge(self, now: float) -> None:
         """Charge the peer's own budget for all datagrams to it, handshakes and echoes too."""
@@ -128,7 +128,7 @@ class PeerOutput:
     def change(self, settings: EgressSettings, now: float) -> None:
         """Another budget or delay. What waits is dropped. What was sent before is not charged."""
         if self.egress is not None:
-            self.egress.clear(now)  # and leave the lines of other peers
+            self.egress.queue.clear(now)  # and leave the lines of other peers
         self._settings = settings
         self.egress = PeerEgress(settings, now) if settings.is_needed else None
         self._networks = []
@@ -179,7 +179,7 @@ class PeerOutput:
         self.copies.clear()
         self.repair.end()
         if self.egress is not None:
-            self.egress.clear(now)
+            self.egress.queue.clear(now)
 
     # Envelopes.
 

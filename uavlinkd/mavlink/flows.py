@@ -22,8 +22,7 @@ FlowKey = tuple[int | bytes, ...]
 COMMANDS: Final = -1  # in place of the message id in the flow of commands and answers
 
 MAX_FLOWS: Final = 1024
-"""Flows that are remembered at least, of those used last; at most twice as many. A peer that invents more flows
-forgets its own only."""
+"""Flows that are remembered: those used last. A peer that invents more flows forgets its own only."""
 
 
 def flow_key(frame: Frame) -> FlowKey:
@@ -45,12 +44,10 @@ def flow_key(frame: Frame) -> FlowKey:
 class NewestStates:
     """The order of the last delivered state of each flow, of one peer of the core."""
 
-    __slots__ = ("_earlier", "_orders")
+    __slots__ = ("_orders",)
 
     def __init__(self) -> None:
-        # Two generations: a flow that is in use moves to the younger one before the older one is forgotten.
-        self._orders: dict[FlowKey, int] = {}
-        self._earlier: dict[FlowKey, int] = {}
+        self._orders: dict[FlowKey, int] = {}  # the flows used last are at its end
 
     def pick(self, frames: list[Frame], order: int) -> list[Frame]:
         """The frames of one envelope without the states that are superseded.
@@ -67,12 +64,8 @@ class NewestStates:
         return frames if kept is None else kept
 
     def _is_newest(self, flow: FlowKey, order: int) -> bool:
-        orders = self._orders
-        last = orders.get(flow)
-        if last is None:
-            last = self._earlier.get(flow, order)
-            if len(orders) >= MAX_FLOWS:
-                self._earlier = orders
-                orders = self._orders = {}
-        orders[flow] = max(order, last)
+        last = self._orders.pop(flow, order)
+        self._orders[flow] = max(order, last)
+        if len(self._orders) > MAX_FLOWS:
+            del self._orders[next(iter(self._orders))]
         return order >= last

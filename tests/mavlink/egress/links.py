@@ -40,11 +40,11 @@ class Link:
         for raw in raws(frames):
             assert raw not in self.offered, "frames of a test differ in their bytes"
             self.offered[raw] = now
-        self.egress.put(frames, now)
+        self.egress.queue.put(frames, now)
         self.flush(now)
 
     def flush(self, now: float) -> None:
-        while batch := self.egress.take(now):
+        while batch := self.egress.queue.take(now):
             sent = raws(batch)
             self.envelopes.append((now, sent))
             self.sent += [(now, raw) for raw in sent]
@@ -66,7 +66,7 @@ class Link:
     def run(self, until: float) -> None:
         """Let time pass: the egress is called at its deadlines and never else."""
         for _ in range(1_000_000):
-            deadline = self.egress.next_deadline()
+            deadline = self.egress.queue.next_deadline()
             if deadline > until:
                 return
             self.flush(deadline)

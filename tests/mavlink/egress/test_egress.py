@@ -31,11 +31,11 @@ def test_frames_share_an_envelope_after_the_delay() -> None:
     for n, waiting in enumerate(frames):
         link.put(waiting, now=n * 0.01)
     assert not link.sent
-    assert link.egress.next_deadline() == 0.05
-    assert link.egress.take(0.0499) == []
+    assert link.egress.queue.next_deadline() == 0.05
+    assert link.egress.queue.take(0.0499) == []
     link.flush(0.05)
     assert link.envelopes == [(0.05, raws(frames))]
-    assert link.egress.next_deadline() == inf
+    assert link.egress.queue.next_deadline() == inf
 
 
 def test_full_envelope_does_not_wait() -> None:
@@ -45,7 +45,7 @@ def test_full_envelope_does_not_wait() -> None:
     for waiting in frames:
         link.put(waiting, now=0.1)
     assert link.envelopes == [(0.1, raws(frames[:7]))]
-    assert link.egress.next_deadline() == pytest.approx(0.6)
+    assert link.egress.queue.next_deadline() == pytest.approx(0.6)
     link.run(1.0)
     assert [raw for _, raw in link.sent] == raws(frames)
 
@@ -70,7 +70,7 @@ def test_core_traffic_counts() -> None:
     assert not link.sent
     # 331 bytes are in the bucket (one largest frame in an envelope); 628 went; 72 are needed at 500 bytes a second.
     due = (628 - 331 + 72) / 500
-    assert link.egress.next_deadline() == pytest.approx(due)
+    assert link.egress.queue.next_deadline() == pytest.approx(due)
     link.run(due - 0.01)
     assert not link.sent
     link.run(due + 0.01)
@@ -83,7 +83,7 @@ def test_debt_after_an_outage_is_bounded() -> None:
     for n in range(200):
         link.transmit(1400, now=n * 1.5)
     link.put(heartbeat(1), now=300.0)
-    assert link.egress.next_deadline() - 300.0 <= (500 + 1428 + 72) / 500
+    assert link.egress.queue.next_deadline() - 300.0 <= (500 + 1428 + 72) / 500
 
 
 def test_newest_state_replaces_the_older() -> None:
@@ -91,7 +91,7 @@ def test_newest_state_replaces_the_older() -> None:
     link = Link(SLOW)
     link.fill(0.0)
     link.put(*(attitude(n) for n in range(5)), *(attitude(n, system=2) for n in range(5)), now=0.0)
-    assert link.egress.queued_frames == 2
+    assert link.egress.queue.queued_frames == 2
     assert link.egress.totals == {EgressDrop.THINNED: 8}
     link.run(1.0)
     assert {raw for _, raw in link.sent} == {attitude(4).raw, attitude(4, system=2).raw}
@@ -148,7 +148,7 @@ def test_invented_flows_do_not_displace_the_known() -> None:
 
 def egress_of(link: Link) -> Egress:
     """The queue of a link with a budget."""
-    queue = link.egress._queue
+    queue = link.egress.queue
     assert isinstance(queue, Egress)
     return queue
 
@@ -174,9 +174,9 @@ def test_fresh_frames_beside_stale_ones_and_what_waits_for_a_lost_peer(settings:
     link.put(heartbeat(2), now=1.5)
     assert [raw for _, raw in link.sent] == [heartbeat(2).raw]
     link.put(attitude(3), parameter(1), now=1.6)
-    link.egress.clear(1.65)
+    link.egress.queue.clear(1.65)
     assert link.egress.totals == {EgressDrop.STALE: 1, EgressDrop.CLOSED: 2}
-    assert (link.egress.queued_frames, link.egress.next_deadline()) == (0, inf)
+    assert (link.egress.queue.queued_frames, link.egress.queue.next_deadline()) == (0, inf)
 
 
 def test_lanes_are_bounded_and_drop_the_oldest() -> None:
@@ -236,7 +236,7 @@ def test_whatever_happens_the_rules_hold(seed: int, budget: int, coalesce: float
             core += 100 + shape.carrier_bytes
             link.transmit(100, now)
     link.run(now + 5)
-    assert len(link.offered) == len(link.sent) + egress.totals.total() + egress.queued_frames
+    assert len(link.offered) == len(link.sent) + egress.totals.total() + egress.queue.queued_frames
     assert len({raw for _, raw in link.sent}) == len(link.sent)
     assert all(raw in link.offered and at - link.offered[raw] <= 1.0 for at, raw in link.sent)
     assert all(sum(map(len, batch)) <= limit for _, batch in link.envelopes)
@@ -256,8 +256,8 @@ def test_whatever_happens_the_rules_hold(seed: int, budget: int, coalesce: float
             level = max(0.0, level - (at - before) * budget / 8) + size
             before = at
             assert level <= burst + core + 1
-    assert egress.queued_frames == 0
-    assert egress.next_deadline() == inf
+    assert egress.queue.queued_frames == 0
+    assert egress.queue.next_deadline() == inf
 
 
 def test_demand_says_how_much_is_sent_and_dropped() -> None:

@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from uavlinkd.mavlink.egress.bucket import Bucket, Supply
 from uavlinkd.mavlink.egress.budgeted import Coalescer, Egress, EgressSettings, EnvelopeShape
 from uavlinkd.mavlink.egress.lanes import EgressDrop
-from uavlinkd.mavlink.frames import MAX_FRAME_BYTES, Frame
+from uavlinkd.mavlink.frames import MAX_FRAME_BYTES
 
 
 class PeerEgress:
-    """The frames that wait for one peer. Its methods are those of an :class:`.Egress`."""
+    """The queue of the frames that wait for one peer, and the budgets that they wait for."""
 
     def __init__(self, settings: EgressSettings, now: float) -> None:
         self.settings = settings
@@ -22,17 +22,13 @@ class PeerEgress:
         if settings.budget_bits_s:
             self._own = Bucket(settings.budget_bits_s, now, self._shape.overhead + MAX_FRAME_BYTES)
         self._supply = self._urgent_supply = Supply(self._own)
-        self._queue = self._make_queue(now)
+        self.queue = self._make_queue(now)
 
     def set_shape(self, shape: EnvelopeShape) -> None:
         """Envelopes to this peer have another size from now on."""
-        self._shape = self._queue.shape = shape
+        self._shape = self.queue.shape = shape
         if self._own is not None:
             self._own.set_least_burst(shape.overhead + MAX_FRAME_BYTES)
-
-    @property
-    def queued_frames(self) -> int:
-        return self._queue.queued_frames
 
     def set_networks(self, networks: Sequence[Bucket | None], now: float) -> None:
         """The networks along which critical frames go now, the best path's first; None for one without a budget.
@@ -41,33 +37,18 @@ class PeerEgress:
         """
         self._urgent_supply = Supply(self._own, networks)
         self._supply = Supply(self._own, networks[:1]) if len(networks) > 1 else self._urgent_supply
-        waiting = self._queue.pop_all()
-        self._queue = self._make_queue(now)
+        waiting = self.queue.pop_all()
+        self.queue = self._make_queue(now)
         for frame, put_at in waiting:  # with the age that they have
-            self._queue.put([frame], put_at)
+            self.queue.put([frame], put_at)
 
     def demand(self, now: float) -> float:
         return self._supply.demand(now)
-
-    def has_room(self, payload_bytes: int, now: float) -> bool:
-        return self._queue.has_room(payload_bytes, now)
-
-    def put(self, frames: Sequence[Frame], now: float) -> None:
-        self._queue.put(frames, now)
-
-    def take(self, now: float) -> list[Frame]:
-        return self._queue.take(now)
-
-    def next_deadline(self) -> float:
-        return self._queue.next_deadline()
 
     def spend(self, datagram_bytes: int, now: float, datagrams: int = 1) -> None:
         """Charge datagrams to the peer to its own budget."""
         if self._own is not None:
             self._own.spend(datagram_bytes + datagrams * self._shape.carrier_bytes, now)
-
-    def clear(self, now: float) -> None:
-        self._queue.clear(now)
 
     def _make_queue(self, now: float) -> Egress | Coalescer:
         if self._supply.is_limited:
