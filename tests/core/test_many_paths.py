@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from functools import partial
 from itertools import count
 
 import pytest
@@ -280,8 +281,12 @@ def test_bad_radio_does_not_seem_to_drop_long_envelopes(delays_s: tuple[float, .
     radios, rng = Radios(delays_s, both_configured=True).run(3.0), random.Random(1)
     for radio in radios.radios:
         radio.loses = lambda _: rng.random() < 0.2
-    radios.run(120.0, 0.2, lambda: radios.send(radios.a, STREAM, *BURST), radios.sender(radios.b))
+    senders = partial(radios.send, radios.a, STREAM, *BURST), radios.sender(radios.b)
+    radios.run(120.0, 0.2, *senders)
     limit = radios.state(radios.a, 0).envelope_limit
+    for _ in range(20):  # losses make a sender doubt the limit, until a test is answered
+        if limit.limit < c.DEFAULT_ENVELOPE_LIMIT:
+            radios.run(0.4, 0.2, *senders)
     assert (limit.limit, limit.dropped) == (c.DEFAULT_ENVELOPE_LIMIT, 0)
     tests = [sent for sent in radios.envelopes(radios.a, 3.0) if len(sent.datagram) == c.DEFAULT_ENVELOPE_LIMIT]
     assert len(tests) < 60 * len(delays_s)

@@ -186,4 +186,5 @@ def close(peer: Peer, now: float, *, sends: bool = True) -> list[Output]:
     peer.initiator.cancel()
     peer.is_up = False
     peer.timers.stop_all()
+    peer.early = None
     return out
