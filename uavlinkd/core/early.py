@@ -13,7 +13,7 @@ from uavlinkd.core.paths import PathSet
 from uavlinkd.core.session import Session
 
 
-class Envelope(NamedTuple):
+class EarlyEnvelope(NamedTuple):
     """An envelope with frames that arrived."""
 
     order: int
@@ -39,15 +39,15 @@ class EarlyFrames:
         self.highest = -1
         """The highest order of the envelopes whose frames do not wait."""
         self._paths = paths
-        self._newest: Envelope | None = None  # along the sender's best path
-        self._waiting: list[Envelope] = []  # in the order in which they were sealed
+        self._newest: EarlyEnvelope | None = None  # along the sender's best path
+        self._waiting: list[EarlyEnvelope] = []  # in the order in which they were sealed
 
     @property
     def due_at(self) -> float:
         """When to call :meth:`release`; infinity while no frames wait."""
         return self._waiting[0].due_at if self._waiting else c.NEVER
 
-    def arrive(self, arrived: Envelope, now: float) -> list[Output]:
+    def arrive(self, arrived: EarlyEnvelope, now: float) -> list[Output]:
         """What is delivered when an envelope arrives."""
         waiting = self._waiting
         due_at = self._due_at(arrived.path, now)
@@ -72,13 +72,13 @@ class EarlyFrames:
             out += self._pass(self._waiting.pop(0))
         return out
 
-    def _pass(self, envelope: Envelope) -> Sequence[Output]:
+    def _pass(self, envelope: EarlyEnvelope) -> Sequence[Output]:
         self.highest = max(self.highest, envelope.order)
         if envelope.is_along_best and (self._newest is None or envelope.order > self._newest.order):
             self._newest = envelope
         return envelope.frames
 
-    def _is_next(self, envelope: Envelope) -> bool:
+    def _is_next(self, envelope: EarlyEnvelope) -> bool:
         """Whether no envelope before this one is missing."""
         base = envelope.session.order_base
         missing = range(self.highest + 1 - base, envelope.order - base)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from uavlinkd.core import constants as c
 from uavlinkd.core import freshness, probing, wire
 from uavlinkd.core.drops import Drop, DropReason
-from uavlinkd.core.early import Envelope
+from uavlinkd.core.early import EarlyEnvelope
 from uavlinkd.core.establish import adopt, receive_close
 from uavlinkd.core.outputs import Deliver, Output, RecordReceived
 from uavlinkd.core.path import Path
@@ -119,7 +119,7 @@ def receive_envelope(
         if early is not None:
             out += [output for output in delivered if not isinstance(output, Deliver)]
             frames = [output for output in delivered if isinstance(output, Deliver)]
-            envelope = Envelope(session.order_base + counter, session, state, frames, is_along_best)
+            envelope = EarlyEnvelope(session.order_base + counter, session, state, frames, is_along_best)
             delivered = early.arrive(envelope, now)
             if early.due_at < peer.timers.deadlines[Timer.FRESHNESS]:
                 peer.timers.set(Timer.FRESHNESS, early.due_at)
