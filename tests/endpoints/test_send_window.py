@@ -36,7 +36,7 @@ def test_first_window_is_fixed() -> None:
 
 
 def test_window_is_rate_times_round_trip() -> None:
-    """It follows the best rate and the least round trip of the last seconds, and has a least size."""
+    """It follows the best rate and the least round trip of the last seconds. Late Pongs shrink it to a least size."""
     window = SendWindow()
     now = run(window, 100_000, 0.1, 0.0, 5.0)
     expected = SEGMENT_BYTES + EXCESS * 100_000 * 0.1
@@ -44,7 +44,10 @@ def test_window_is_rate_times_round_trip() -> None:
     now = run(window, 100_000, 0.5, now, 30.0)  # another route
     expected = SEGMENT_BYTES + EXCESS * 100_000 * 0.5
     assert 0.7 * expected < window.bytes < 1.4 * expected
-    now = run(window, 1000, 0.1, now, 60.0)
+    large = window.bytes
+    now = run(window, 1000, 0.5, now, 60.0)
+    assert window.bytes == large  # little was sent: that says nothing about the network
+    now = run(window, 1000, 1.0, now, 9.0)
     assert window.bytes == LEAST_BYTES
     assert window.is_open
 

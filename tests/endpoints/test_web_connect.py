@@ -9,7 +9,6 @@ from contextlib import closing, suppress
 from pathlib import Path
 
 import pytest
-from websockets.uri import parse_uri
 
 from tests.endpoints.web_streams import Loopback
 from tests.waiting import until
@@ -81,9 +80,12 @@ async def proxy(monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[HttpProxy]:
     await made.close()
 
 
+def connector_to(loopback: Loopback, host: str = "127.0.0.1") -> Connector:
+    return Connector(host, loopback.port, f"wss://{host}:{loopback.port}/uavlink", loopback.stall)
+
+
 async def open_to(loopback: Loopback) -> socket.socket:
-    uri = parse_uri(f"wss://127.0.0.1:{loopback.port}/uavlink")
-    return await Connector("127.0.0.1", loopback.port, uri).open()
+    return await connector_to(loopback).open()
 
 
 async def carries_a_datagram(loopback: Loopback) -> None:
@@ -191,7 +193,7 @@ async def test_no_address_answers(secure: Loopback, monkeypatch: pytest.MonkeyPa
     with socket.socket() as closed:
         closed.bind(("127.0.0.1", 0))
         with pytest.raises(ConnectionRefusedError):
-            await Connector("127.0.0.1", closed.getsockname()[1], parse_uri("wss://127.0.0.1/")).open()
+            await Connector("127.0.0.1", closed.getsockname()[1], "wss://127.0.0.1/", secure.stall).open()
 
     async def resolved(address: Address, threads: Threads | None) -> Resolved:
         return []
@@ -213,8 +215,7 @@ async def test_address_that_was_silent_is_tried_again(secure: Loopback, monkeypa
 
     monkeypatch.setattr(web_connect, "connect_tcp", connect_tcp)
     monkeypatch.setattr(web_connect, "STAGGER_S", 0.01)
-    connector = Connector("127.0.0.1", secure.port, parse_uri(f"wss://127.0.0.1:{secure.port}/uavlink"))
-    (await connector.open(0.02)).close()
+    (await connector_to(secure).open(0.02)).close()
     assert len(begun) == 4
     assert begun[3] - begun[0] >= 0.06
 
@@ -231,7 +232,7 @@ async def test_name_server_that_is_silent(secure: Loopback, monkeypatch: pytest.
 
     monkeypatch.setattr(web_connect, "resolve", resolved)
     monkeypatch.setattr(web_connect, "NAME_S", 0.01)
-    connector = Connector("relay.example", secure.port, parse_uri("wss://relay.example/uavlink"))
+    connector = connector_to(secure, "relay.example")
     for _ in range(3):
         (await connector.open()).close()
     assert len(queries) == 2

@@ -51,6 +51,9 @@ class Owner:
     def on_datagrams(self, datagrams: list[bytes], now: float, epoch: int) -> None:
         self.batches.append(datagrams)
 
+    def on_room(self) -> None:
+        """Tests look for it."""
+
     def on_lost(self, reason: str) -> None:
         self.reasons.append(reason)
 

@@ -34,6 +34,9 @@ from uavlinkd.link.facts import ICMP_S
 from uavlinkd.link.own_problems import PROBLEMS, own_codes
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.traffic_problems import SECURITY_S, has_no_client, is_contested
+from uavlinkd.mavlink.egress.budgeted import EgressSettings
+from uavlinkd.mavlink.egress.lanes import EgressDrop
+from uavlinkd.mavlink.egress.peer_egress import PeerEgress
 from uavlinkd.mavlink.frames import SplitCounters, split_payload
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import Refusal
@@ -83,6 +86,7 @@ class Daemon(Scene):
             relay=None,
             fleet=None,
             recorder=None,
+            guard=SimpleNamespace(faults=Counter(), last_at=0.0),
             local=SimpleNamespace(endpoints=self.local),
             switch=SimpleNamespace(router=self.router),
         )
@@ -555,3 +559,28 @@ def test_a_daemon_reports_its_own_problems_only(daemon: Daemon) -> None:
     assert {int(code): name for code, name in re.findall(r"\| (\d+) \| `(\w+)`", text)} == {
         code: problem.name for code, problem in PROBLEMS.items()
     }
+
+
+def test_frames_that_were_dropped_here_are_named() -> None:
+    """They waited for a budget or a connection by TLS. Newer states that replace older ones are no problem."""
+    daemon = Daemon()
+    egress = PeerEgress(EgressSettings(), NOW)
+    daemon.set_up(role="all", system_ids="all").output.egress = egress
+    egress.totals[EgressDrop.THINNED] = 1000
+    daemon.cross(sent=[heartbeat()])
+    assert daemon.findings() == {}
+    egress.totals[EgressDrop.OVERFLOW] = 1748
+    daemon.cross(sent=[heartbeat()])
+    assert "1,748 frames to it waited here" in daemon.findings()["frames_unsent"].text
+    assert "frames_unsent" not in daemon.findings(daemon.now + 11)
+
+
+def test_datagrams_without_room_are_named() -> None:
+    """A few are not: a burst of any sender fills a queue for a moment."""
+    daemon = Daemon()
+    daemon.set_up(role="all", system_ids="all")
+    for _ in range(4):
+        daemon.evidence.add_error("ENOBUFS", STRANGER, daemon.now)
+    assert daemon.findings() == {}
+    daemon.evidence.add_error("ENOBUFS", STRANGER, daemon.now)
+    assert "198.51.100.7:5790" in daemon.findings()["network_full"].text

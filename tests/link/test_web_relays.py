@@ -14,7 +14,7 @@ from tests.link.test_drop_summary import Recorder
 from tests.waiting import until
 from uavlinkd.config.model import PeerAddress
 from uavlinkd.core.path import Path
-from uavlinkd.endpoints import web_connect, web_stream
+from uavlinkd.endpoints import web_connect
 from uavlinkd.link import web_relays as module
 from uavlinkd.link.web_relays import WebRelay
 from uavlinkd.system.addresses import Address
@@ -32,13 +32,15 @@ class Stream:
     made: list[Stream]
     ends = ""
 
-    def __init__(self, _sock: object, _protocol: object, _tls: object, handler: Any, *_: object) -> None:
+    def __init__(self, *_: object) -> None:
         self.lost = ""
-        self._handler = handler
+        self.dropped = 0
+        self.handler: Any = None
+        self.opened = asyncio.get_running_loop().create_future()
         self.made.append(self)
 
     def start(self, _: float) -> None:
-        self._handler.on_open()
+        self.opened.set_result("")
         if self.ends:
             self.lose(self.ends)
 
@@ -48,7 +50,8 @@ class Stream:
     def lose(self, reason: str) -> None:
         if not self.lost:
             self.lost = reason
-            self._handler.on_lost(reason)
+            if self.handler is not None:
+                self.handler.on_lost(reason)
 
 
 @pytest.fixture
@@ -60,7 +63,7 @@ def streams(monkeypatch: pytest.MonkeyPatch) -> list[Stream]:
 
     monkeypatch.setattr(Stream, "made", [], raising=False)
     monkeypatch.setattr(web_connect.Connector, "open", opened)
-    monkeypatch.setattr(web_stream, "WebStream", Stream)
+    monkeypatch.setattr(web_connect, "WebStream", Stream)
     return Stream.made
 
 

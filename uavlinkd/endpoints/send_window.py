@@ -20,6 +20,8 @@ EXCESS: Final = 2.0  # the window in products of rate and round trip
 RATE_S: Final = 3.0  # the best rate of at least this long counts
 ROUND_TRIP_S: Final = 10.0  # the least round trip of at least this long counts: routes change
 MEASURED_S: Final = 0.2  # a rate is measured over this time, or two round trips
+LATE: Final = 1.5  # a Pong is late after so many times the least round trip,
+LATE_S: Final = 0.02  # and so much: bytes wait on the way. Only then the window shrinks, not because little was sent
 PONG_S: Final = 10.0
 """A Ping without its Pong for so long: the other end is gone, or an attacker holds the connection."""
 
@@ -84,7 +86,9 @@ class SendWindow:
         began_at, began = arrivals[0]
         if now - began_at >= MEASURED_S:
             rate = self._rates.note((count - began) / (now - began_at), now)
-            self.bytes = max(LEAST_BYTES, SEGMENT_BYTES + EXCESS * rate * least_s)
+            wanted = max(LEAST_BYTES, SEGMENT_BYTES + EXCESS * rate * least_s)
+            if wanted > self.bytes or round_trip_s > LATE * least_s + LATE_S:
+                self.bytes = wanted
         return True
 
     def is_stuck(self, now: float) -> bool:

@@ -15,11 +15,14 @@ from websockets.exceptions import InvalidProxy
 from websockets.http11 import Response
 from websockets.proxy import Proxy, get_proxy, parse_proxy, prepare_connect_request
 from websockets.streams import StreamReader
-from websockets.uri import WebSocketURI
+from websockets.uri import WebSocketURI, parse_uri
 
 from uavlinkd.endpoints.sockets import connect_tcp
+from uavlinkd.endpoints.tls_channel import client_tls
+from uavlinkd.endpoints.web_stream import WebStream, client_protocol
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.resolver import Query, Resolved, resolve
+from uavlinkd.system.stall import StallWatch
 from uavlinkd.system.tasks import Threads
 
 CONNECT_S: Final = 5.0  # for the name, all addresses and the proxy: at most 20 attempts at the same time
@@ -35,14 +38,22 @@ class WebConnectError(OSError):
 
 
 class Connector:
-    """Connects to ``host``, or to a proxy that connects to the host of ``uri``. ``threads``: of the resolver."""
+    """Connects to a relay at ``host``, or to a proxy that connects to it. ``threads``: of the resolver."""
 
-    def __init__(self, host: str, port: int, uri: WebSocketURI, threads: Threads | None = None) -> None:
+    def __init__(self, host: str, port: int, url: str, stall: StallWatch, threads: Threads | None = None) -> None:
         self._address = Address(host, port)
-        self._uri = uri
+        self._url = url
+        self._uri = parse_uri(url)
+        self._stall = stall
         self._threads = threads
         self._known: Resolved = []
         self._query: Query | None = None
+
+    @property
+    def proxy(self) -> str:
+        """The host and port of the proxy; empty without one. Raises WebConnectError if it cannot be used."""
+        proxy = _proxy_for(self._uri)
+        return "" if proxy is None else str(Address(proxy.host, proxy.port))
 
     async def open(self, again_s: float = AGAIN_S) -> socket.socket:
         """A connected socket. ``again_s``: between attempts to one address.
@@ -53,6 +64,19 @@ class Connector:
             proxy = _proxy_for(self._uri)
             resolved = await self._resolve(self._address if proxy is None else Address(proxy.host, proxy.port))
             return await _connect(resolved[:MAX_ADDRESSES], again_s, proxy, self._uri)
+
+    async def upgrade(self, sock: socket.socket, within_s: float) -> WebStream:
+        """An open stream on a connected socket. Raises ConnectionError: the reason why there is none."""
+        tls = client_tls(self._address.host)
+        stream = WebStream(sock, client_protocol(self._uri), tls, None, self._stall, self._url)
+        try:
+            stream.start(within_s)
+            if reason := await stream.opened or stream.lost:
+                raise ConnectionError(reason)
+        except BaseException:
+            stream.lose("closed")
+            raise
+        return stream
 
     async def _resolve(self, address: Address) -> Resolved:
         """The addresses of a name; those of before while no name server answers."""
@@ -66,12 +90,6 @@ class Connector:
         self._query = None
         if not query.cancelled():
             self._known = query.result() or self._known
-
-
-def proxy_of(uri: WebSocketURI) -> str:
-    """The host and port of the proxy for a URL; empty without one. Raises WebConnectError if it cannot be used."""
-    proxy = _proxy_for(uri)
-    return "" if proxy is None else str(Address(proxy.host, proxy.port))
 
 
 def _proxy_for(uri: WebSocketURI) -> Proxy | None:

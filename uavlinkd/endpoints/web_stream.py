@@ -59,6 +59,9 @@ class StreamHandler(Protocol):
     def on_datagrams(self, datagrams: list[bytes], now: float, epoch: int) -> None:
         """All datagrams of one read, with its monotonic time and epoch."""
 
+    def on_room(self) -> None:
+        """What was sent has left, and more would leave at once."""
+
     def on_lost(self, reason: str) -> None:
         """The connection ended. Called once."""
 
@@ -87,18 +90,23 @@ class WebStream:
         sock: socket.socket,
         protocol: ClientProtocol | ServerProtocol,
         tls: TlsFactory | None,
-        handler: StreamHandler,
+        handler: StreamHandler | None,
         stall: StallWatch,
         name: str,
         opened_in: int | None = None,
     ) -> None:
-        """``name``: of the sender in ``stall.dropped``. ``opened_in``: as of a Backlog."""
+        """``handler``: None at a member until it uses the stream. ``name``: of the sender in ``stall.dropped``.
+
+        ``opened_in``: as of a Backlog.
+        """
         self.request: Request | None = None  # which opened it, at a relay
         self.is_open = False  # whether datagrams may be sent
         self.lost = ""  # the reason, once it is lost
+        self.opened: asyncio.Future[str] = asyncio.get_running_loop().create_future()  # empty, or why it failed
         self.dropped = 0  # datagrams that waited too long
+        self._reported = 0  # of them
         self._protocol = protocol
-        self._handler = handler
+        self.handler = handler
         self._stall = stall
         self._name = name
         self._loop = asyncio.get_running_loop()
@@ -144,7 +152,10 @@ class WebStream:
                 handle.cancel()
         self._queue.clear()
         self._queued_bytes = 0
-        self._handler.on_lost(reason)
+        if not self.opened.done():
+            self.opened.set_result(reason)
+        if self.handler is not None:
+            self.handler.on_lost(reason)
 
     def finish(self) -> None:
         """Send what waits, as far as there is room, and close the connection."""
@@ -157,7 +168,8 @@ class WebStream:
     def send(self, datagram: bytes) -> None:
         """Queue a datagram. It leaves at the end of the loop's turn, with others, as far as there is room.
 
-        Raises OSError: ENOTCONN if the stream is not open, EMSGSIZE if the datagram is too long.
+        Raises OSError: ENOTCONN if the stream is not open, EMSGSIZE if the datagram is too long, ENOBUFS if others
+        that waited too long were dropped since the last call.
         """
         if not self.is_open:
             raise OSError(errno.ENOTCONN, "the stream is not open")
@@ -168,6 +180,9 @@ class WebStream:
         self._queued_bytes += len(datagram) + _MESSAGE_HEADER
         self._drop_old(now)
         self._flush_soon()
+        if self.dropped != self._reported:
+            self._reported = self.dropped
+            raise OSError(errno.ENOBUFS, "older datagrams were dropped")
 
     def room(self, now: float) -> float:
         """How many bytes leave at once if they are sent now."""
@@ -200,6 +215,8 @@ class WebStream:
         self._drop_old(now)
         while (self._pong or (self._queue and window.is_open)) and channel.has_room():
             channel.write(self._gather(now))
+        if self.handler is not None and not self._queue and window.is_open and channel.has_room():
+            self.handler.on_room()
 
     def _gather(self, now: float) -> bytes:
         """The content of the next record."""
@@ -244,7 +261,7 @@ class WebStream:
         protocol = self._protocol
         protocol.receive_data(data)
         datagrams: list[bytes] = []
-        pings = small = 0
+        pings = pongs = small = 0
         fault = ""
         for event in protocol.events_received():
             if isinstance(event, Request):
@@ -254,6 +271,7 @@ class WebStream:
             elif event.opcode is Opcode.PING:
                 pings += 1
             elif event.opcode is Opcode.PONG:
+                pongs += 1
                 small += not self._window.note_pong(bytes(event.data), now)
             elif not (fault := _fault_of(event)):
                 datagrams.append(bytes(event.data))
@@ -271,7 +289,7 @@ class WebStream:
         elif self.is_open:
             if pings:
                 self._pong = protocol.data_to_send()[-1]  # while it is open, the library writes only Pongs
-            if self._pong or self._queue:
+            if pings or pongs:
                 self._flush_soon()
 
     def on_end(self) -> None:
@@ -295,14 +313,16 @@ class WebStream:
             self._opening.cancel()
         if not self.lost:
             self.is_open = True
-            self._handler.on_open()
+            self.opened.set_result("")
+            if self.handler is not None:
+                self.handler.on_open()
         return ""
 
     def _deliver(self, datagrams: list[bytes], now: float, epoch: int) -> None:
         if epoch == STALE:
             self._stall.dropped[self._name] += len(datagrams)
-        else:
-            self._handler.on_datagrams(datagrams, now, epoch)
+        elif self.handler is not None:
+            self.handler.on_datagrams(datagrams, now, epoch)
 
     def _accept(self, request: Request) -> str:
         """Prepare the response. Returns a fault, if any."""

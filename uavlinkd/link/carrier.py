@@ -340,6 +340,12 @@ class FrameCarrier:
 
     # Time.
 
+    def send_waiting(self) -> None:
+        """A connection takes frames again, perhaps those of any peer."""
+        now = monotonic()
+        for link in self._waiting.pop(NEVER):
+            link.send_waiting(now)
+
     def settle(self) -> None:
         """The core or a link may have an earlier deadline than the timer."""
         if self._node.next_deadline() < self._timer_at or self._waiting.next_at < self._timer_at:

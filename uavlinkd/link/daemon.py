@@ -102,6 +102,7 @@ class Daemon:
         if config.recording is not None:
             parts.recorder = Recorder(config.recording, self.log)
         self.carrier.peers.start()
+        parts.peer_sockets.web.on_room = self.carrier.send_waiting
         parts.peer_sockets.start(self.carrier.receive, self.carrier.arm)
         parts.local.start()
         self._write_warnings()

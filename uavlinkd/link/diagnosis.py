@@ -13,6 +13,7 @@ from typing import Final
 from uavlinkd.config.keys import encode_key
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.sessions import Twin
+from uavlinkd.link import facts
 from uavlinkd.link import traffic_problems as traffic
 from uavlinkd.link.down_problems import down_problems, is_deaf, relay_warnings, silence, versions
 from uavlinkd.link.evidence import ELSEWHERE, EVIDENCE_S
@@ -82,6 +83,14 @@ def daemon_problems(moment: Moment) -> Iterator[Found]:
             "fault_inside",
             f"the daemon caught faults of its own: {places}",
             "send what `uavlinkd report` writes, and the log, to the developers; frames pass meanwhile",
+        )
+    full = evidence.seen_anywhere("ENOBUFS", now)
+    if full is not None and full.count >= traffic.LOSSES:
+        yield warning(
+            "network_full",
+            f"{full.count:,} times there was no room for datagrams, the last time to {facts.at(full)}: more is sent"
+            " than the network, or the connection by TLS, carries",
+            "lower the message rates of the clients, or end a log download",
         )
     paused = daemon.history.paused
     if paused is not None and now - paused[0] <= EVIDENCE_S:

@@ -18,6 +18,7 @@ from uavlinkd.core.peer import Peer
 from uavlinkd.endpoints.ports import Endpoint
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.relay_link import RelayLink
+from uavlinkd.mavlink.egress.lanes import EgressDrop
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import Gate, Refusal
 
@@ -286,6 +287,7 @@ class PartHistory:
         self.outgoing = GateHistory()
         self.failures = RecentGrowth[str]()
         self.garbage = RecentGrowth[str]()
+        self.unsent = RecentGrowth[EgressDrop]()
         self.silent_since = now
         """When the last frame was received."""
         self.mixed = (float("-inf"),) * 3
@@ -336,6 +338,8 @@ class History:
             if key in before or link.counters.frames or link.frames_sent or link.policy.outgoing.totals:
                 part = self._parts[key] = before.get(key) or PartHistory(now)
                 part.update(link.counters.frames, link.frames_sent, link.policy, now)
+                if link.output.egress is not None:
+                    part.unsent.update(link.output.egress.totals, now)
         for endpoint, policy in endpoints:
             part = self._parts["endpoint", endpoint.name] = before.get(("endpoint", endpoint.name)) or PartHistory(
                 now

@@ -20,6 +20,7 @@ from uavlinkd.link.evidence import EVIDENCE_S, GateHistory
 from uavlinkd.link.facts import EndpointFacts, Found, PartFacts, PeerFacts, fault, listed, security, warning
 from uavlinkd.link.own_problems import codes_there, problems_there
 from uavlinkd.mavlink.dialect import GROUPS, IDS, SYSTEM_ID, command_name, name_of
+from uavlinkd.mavlink.egress.lanes import EgressDrop
 from uavlinkd.mavlink.policy.gate import ANY_OTHER, REFUSALS, Gate, Refusal
 from uavlinkd.mavlink.policy.roles import ROLES
 from uavlinkd.ops.findings import Finding
@@ -126,6 +127,7 @@ def up_problems(peer: PeerFacts) -> Iterator[Found]:
             "fly by other means until answers return; look for a bad radio or a firewall in the direction to it",
         )
     yield from _losses(peer)
+    yield from _unsent(peer)
     exchanged = list(_roles_exchanged(peer, is_blocked=bool(peer.history.blocked(peer.now))))
     yield from (one for one in _refused(peer) if not exchanged or one.cause != "all_refused")
     yield from exchanged
@@ -154,6 +156,19 @@ def _losses(peer: PeerFacts) -> Iterator[Found]:
                 f" shorter ones: up to {state.envelope_limit.limit:,} bytes",
                 "nothing is lost by that; if the path should carry more, look for a tunnel with a small MTU",
             )
+
+
+def _unsent(peer: PeerFacts) -> Iterator[Found]:
+    """Frames that waited here and were dropped. That newer states replace older ones is no problem."""
+    dropped = peer.history.unsent.within(REFUSED_S, peer.now)
+    if count := sum(dropped.get(reason, 0) for reason in (EgressDrop.OVERFLOW, EgressDrop.STALE)):
+        yield warning(
+            "frames_unsent",
+            f"{count:,} frames to it waited here for room on its network, and were dropped: clients here send more"
+            " than the network, the connection by TLS or budget_bits_s carries",
+            "lower the message rates of the clients here, end a log download, or raise a budget below what the"
+            " network carries",
+        )
 
 
 def _about_systems(part: PartFacts, systems: Mapping[int, int], which: str) -> tuple[str, str]:

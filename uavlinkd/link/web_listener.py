@@ -96,6 +96,9 @@ class _Connection:
     def on_datagrams(self, datagrams: list[bytes], now: float, epoch: int) -> None:
         self._listener.on_datagrams(self, datagrams, now, epoch)
 
+    def on_room(self) -> None:
+        """What waits for a member is in the stream."""
+
     def on_lost(self, reason: str) -> None:
         self._listener.on_lost(self, reason)
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import errno
-import socket
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from math import inf
@@ -20,6 +19,7 @@ from structlog.typing import FilteringBoundLogger
 from uavlinkd.config.model import PeerAddress
 from uavlinkd.core.node import Node
 from uavlinkd.core.path import Path, SocketAddress
+from uavlinkd.core.path_state import PathState
 from uavlinkd.core.peer import Peer
 from uavlinkd.endpoints.ports import failure_name
 from uavlinkd.link.conditions import LineLimits
@@ -31,7 +31,6 @@ from uavlinkd.system.stall import StallWatch
 from uavlinkd.system.tasks import keep_running
 
 if TYPE_CHECKING:
-    from uavlinkd.endpoints.web_connect import Connector
     from uavlinkd.endpoints.web_stream import WebStream
 
 WEB_NETWORK: Final = "TLS"
@@ -59,8 +58,8 @@ members that restarted may need longer: after each connection that brought nothi
 UDP_WORKS: Final = "udp_works"
 PROBE_S: Final = 3.0
 """The command that asks for a probe waits for 5 s."""
-WAIT_S: Final = 0.01
-"""Frames look so often whether a connection takes them again."""
+WAIT_S: Final = 0.1
+"""Frames look so often whether a connection takes them again, or does not answer, besides when it reports room."""
 _RNG: Final = SystemRandom()
 
 
@@ -96,30 +95,6 @@ class WebBudget(NetworkBudget):
         """Nothing is charged."""
 
 
-class _Connection:
-    """The handler of one connection, and its stream. ``owner``: once that uses it."""
-
-    stream: WebStream
-
-    def __init__(self) -> None:
-        self.opened = asyncio.get_running_loop().create_future()
-        """Its result is why there is no connection; empty if there is one."""
-        self.owner: WebRelay | None = None
-
-    def on_open(self) -> None:
-        self.opened.set_result("")
-
-    def on_datagrams(self, datagrams: list[bytes], now: float, epoch: int) -> None:
-        if self.owner is not None:
-            self.owner.receive(datagrams, now, epoch)
-
-    def on_lost(self, reason: str) -> None:
-        if not self.opened.done():
-            self.opened.set_result(reason)
-        elif self.owner is not None:
-            self.owner.lost(reason)
-
-
 class WebRelay:
     """One URL of a relay. ``number``: that of its socket."""
 
@@ -130,23 +105,26 @@ class WebRelay:
         node: Node,
         stall: StallWatch,
         log: FilteringBoundLogger,
+        on_room: Callable[[], None] = lambda: None,
     ) -> None:
+        from uavlinkd.endpoints.web_connect import Connector  # noqa: PLC0415  only if configured
+
         self.written = written
         self.number = number
         self.path = Path(number, (str(written), 0))
         self.budget = WebBudget(self._room)
+        self._connector = Connector(written.address.host, written.address.port, self.path.host, stall)
         self._error = ""
         self._node = node
-        self._stall = stall
         self._log = log
         self._limits = LineLimits()
+        self._on_room = on_room
         self._receive: Receive = lambda *_: None
         self._on_change: Callable[[], None] = lambda: None
         self._stream: WebStream | None = None
         self._ended = asyncio.Event()
         self._peer: Peer | None = None
         self._task: asyncio.Task[None] | None = None
-        self._connector: Connector | None = None
         self._is_leaving = False  # the connection only receives
         self._udp_silent_at = 0.0  # it is silent from then on, if it does not work before
         self._began_at = -inf  # the last attempt
@@ -195,49 +173,15 @@ class WebRelay:
 
     async def probe(self) -> dict[str, str]:
         """Connect once more. ``error``: why that is not possible; ``proxy``: the one of the environment."""
-        from websockets.uri import parse_uri  # noqa: PLC0415
-
-        from uavlinkd.endpoints.web_connect import proxy_of  # noqa: PLC0415
-
         proxy = error = ""
         try:
-            proxy = proxy_of(parse_uri(self.path.host))
+            proxy = self._connector.proxy
             async with asyncio.timeout(PROBE_S):
-                sock = await self._connect(RETRY_S[0])
-                (await self._upgrade(sock, PROBE_S)).stream.lose("probed")
+                sock = await self._connector.open(RETRY_S[0])
+                (await self._connector.upgrade(sock, PROBE_S)).lose("probed")
         except OSError as failure:  # TimeoutError too
             error = _name(failure)
         return {"error": error, "proxy": proxy}
-
-    async def _connect(self, again_s: float) -> socket.socket:
-        # Imported only if configured: a daemon on UDP starts faster and stays smaller.
-        from websockets.uri import parse_uri  # noqa: PLC0415
-
-        from uavlinkd.endpoints.web_connect import Connector  # noqa: PLC0415
-
-        if self._connector is None:
-            address = self.written.address
-            self._connector = Connector(address.host, address.port, parse_uri(self.path.host))
-        return await self._connector.open(again_s)
-
-    async def _upgrade(self, sock: socket.socket, within_s: float) -> _Connection:
-        """TLS and HTTP."""
-        from websockets.uri import parse_uri  # noqa: PLC0415
-
-        from uavlinkd.endpoints.tls_channel import client_tls  # noqa: PLC0415
-        from uavlinkd.endpoints.web_stream import WebStream, client_protocol  # noqa: PLC0415
-
-        connection, tls = _Connection(), client_tls(self.written.address.host)
-        protocol = client_protocol(parse_uri(self.path.host))
-        stream = connection.stream = WebStream(sock, protocol, tls, connection, self._stall, self.path.host)
-        try:
-            stream.start(within_s)
-            if reason := await connection.opened or stream.lost:
-                raise ConnectionError(reason)
-        except BaseException:
-            stream.lose("closed")
-            raise
-        return connection
 
     async def _keep(self) -> None:
         """Make connections. One that became silent stays beside the attempts: it may recover before they succeed."""
@@ -245,10 +189,10 @@ class WebRelay:
             await self._until_wanted()
             self._began_at, self._spread = monotonic(), _RNG.uniform(1.0 - SPREAD, 1.0)
             try:
-                sock = await self._connect(self._wait_s)
+                sock = await self._connector.open(self._wait_s)
                 patience_s = min(PATIENCE_S[0] * 2.0**self._unanswered, PATIENCE_S[1])
                 self._unanswered = min(self._unanswered + 1, 32)
-                connection = await self._upgrade(sock, patience_s)
+                stream = await self._connector.upgrade(sock, patience_s)
             except OSError as error:
                 before, self._error = self._error, _name(error)
                 if self._error != before and (omitted := self._take_line()) is not None:
@@ -256,10 +200,10 @@ class WebRelay:
                     self._log.warning("relay_not_connected", address=url, reason=self._error, **omitted)
             else:
                 if self._works:
-                    connection.stream.lose("not_needed")
+                    stream.lose("not_needed")
                 else:
                     self._answer_by = monotonic() + patience_s
-                    self._open(connection)
+                    self._use(stream)
 
     @property
     def _wait_s(self) -> float:
@@ -298,26 +242,33 @@ class WebRelay:
         """Wait so long, or until the connection ends."""
         self._ended.clear()
         with suppress(TimeoutError):
-            async with asyncio.timeout(seconds):
-                await self._ended.wait()
+            await asyncio.wait_for(self._ended.wait(), seconds)
 
     @property
     def _works(self) -> bool:
-        assert self._peer is not None, "started"
-        states = self._peer.paths.states
-        return self._peer.is_up and any(state.works and state.path == self.path for state in states)
+        return any(state.path == self.path for state in self._working)
 
     @property
     def _udp_works(self) -> bool:
-        assert self._peer is not None, "started"
-        states = self._peer.paths.states
-        return self._peer.is_up and any(state.path.is_udp and state.works and not state.is_silent for state in states)
+        return any(state.path.is_udp and not state.is_silent for state in self._working)
 
-    def _open(self, connection: _Connection) -> None:
+    @property
+    def _working(self) -> list[PathState]:
+        """The paths along which the relay answers."""
+        assert self._peer is not None, "started"
+        return [state for state in self._peer.paths.states if state.works] if self._peer.is_up else []
+
+    def _use(self, stream: WebStream) -> None:
         if self._stream is not None:
             self._stream.lose("silent")
-        connection.owner = self
-        self._stream, self._is_leaving, self._error = connection.stream, False, ""
+        self._stream, stream.handler = stream, self
+        self.on_open()
+
+    # As the handler of the stream.
+
+    def on_open(self) -> None:
+        """It is used."""
+        self._is_leaving, self._error = False, ""
         self._node.set_socket_state(self.number, monotonic(), is_up=True)
         if (omitted := self._take_line()) is not None:
             self._log.info("relay_connected", address=self.path.host, **omitted)
@@ -329,14 +280,16 @@ class WebRelay:
             self._limits.omit("web", self.path.host)
         return omitted
 
-    # Of the connection.
-
-    def receive(self, datagrams: list[bytes], now: float, epoch: int) -> None:
+    def on_datagrams(self, datagrams: list[bytes], now: float, epoch: int) -> None:
         """Messages came in one read."""
         address = self.path.address
         self._receive(self.number, [(datagram, address) for datagram in datagrams], now, epoch, 0.0)
 
-    def lost(self, reason: str) -> None:
+    def on_room(self) -> None:
+        """Frames that wait may leave."""
+        self._on_room()
+
+    def on_lost(self, reason: str) -> None:
         """It ended."""
         self._stream = None
         self._ended.set()
@@ -360,7 +313,9 @@ class WebRelays:
     ) -> None:
         self._relays: dict[PeerAddress, WebRelay] = {}
         self._add = add
-        self._shell = node, stall, log
+        self._shell = node, stall, log, lambda: self.on_room()  # noqa: PLW0108  it is set later
+        self.on_room: Callable[[], None] = lambda: None
+        """Called when a connection takes frames again."""
         self._receive: Receive = lambda *_: None
         self._on_change: Callable[[], None] = lambda: None
 

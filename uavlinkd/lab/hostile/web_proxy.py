@@ -17,7 +17,7 @@ from time import monotonic
 from types import MappingProxyType
 from typing import ClassVar, Final
 
-from websockets.uri import WebSocketURI, parse_uri
+from websockets.uri import parse_uri
 
 from uavlinkd.core.relay_records import RELAYED
 from uavlinkd.endpoints.sockets import udp_socket
@@ -95,6 +95,9 @@ class _End:
             with suppress(OSError):  # the man in the middle has stopped
                 self.udp.sendto(datagram[skipped:], (HOST, self.ports[path]))
 
+    def on_room(self) -> None:
+        """Each datagram is sent at once."""
+
     def on_lost(self, _reason: str) -> None:
         self.stream = None
         self.other.lose()
@@ -123,15 +126,16 @@ class WebProxy:
         self.to_relay.close()
 
     async def _accept(self, tls: TlsFactory) -> None:
-        uri: WebSocketURI = parse_uri(f"wss://{HOST}:{self._relay_port}/uavlink")
+        url = f"wss://{HOST}:{self._relay_port}/uavlink"
         while True:
             sock, _ = await asyncio.get_running_loop().sock_accept(self._listener)
             try:
-                relay = await Connector(HOST, self._relay_port, uri).open()
+                relay = await Connector(HOST, self._relay_port, url, self._stall).open()
             except OSError:  # it does not listen
                 sock.close()
                 continue
-            far = WebStream(relay, client_protocol(uri), client_tls(HOST), self.to_relay, self._stall, "relay")
+            protocol = client_protocol(parse_uri(url))
+            far = WebStream(relay, protocol, client_tls(HOST), self.to_relay, self._stall, "relay")
             self.to_relay.use(far, relay)
             near = WebStream(sock, server_protocol(), tls, self.to_member, self._stall, "member")
             self.to_member.use(near, sock)

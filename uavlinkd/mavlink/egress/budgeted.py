@@ -44,7 +44,7 @@ URGENT_SHARING: Final = 4
 SHARING_OF_AGE: Final = 0.5
 """Other frames wait at most this part of ``max_age_s`` for their envelope to fill."""
 MIN_LANE_BYTES: Final = 8 * 1024
-MAX_LANE_BYTES: Final = 80 * 1024
+MAX_LANE_BYTES: Final = 256 * 1024
 """Bounds of each of the three lanes. Between them, a lane holds as much as the budget carries in ``max_age_s``."""
 MAX_FLOWS: Final = 4096  # flows that are remembered while none of their frames waits
 _SLACK_BYTES: Final = 0.5  # a deadline computed in floating point must not come a hair early, over and over
