@@ -34,6 +34,18 @@ async def test_pairs_without_udp_are_linked_by_tls() -> None:
         assert (outcome.lost, outcome.sent > 0) == (0, True), pair.title
 
 
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "fault", ["the network drops all for 3 s", "the interface is down for 3 s", "the relay is absent for 1.4 s"]
+)
+async def test_silence_is_little_longer_than_the_outage(fault: str) -> None:
+    """A pilot's failsafe trips after 5 s."""
+    watch = Stopwatch()
+    outcome = await latency.fail(fault, latency.Line())
+    print(outcome)
+    assert outcome.gap_s < outcome.away_s + 1.0 + watch.contended_s
+
+
 @pytest.mark.parametrize("fault", ["UDP goes and returns", "the connection is reset"])
 async def test_no_command_is_lost(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the states only those of the time in which the member did not know that its path had failed."""
