@@ -139,6 +139,12 @@ class _History:
                     self._befall(one)
         end = network.now
         network.run(WITHIN_S)
+        if not self.outcome.acts["restart"]:  # a restart forgets its counts
+            for sender, receiver in ((self.vehicle, self.station), (self.station, self.vehicle)):
+                overtaken = network.sequence(sender, receiver).overtaken
+                assert overtaken <= receiver.peer(sender).traffic.out_of_order, (
+                    "frames were overtaken, and not counted"
+                )
         for flow in (flow for flow in network.flows.values() if flow.cls is Class.CRITICAL):
             for number, sent_at in enumerate(flow.sent_at):
                 if begin <= sent_at < end:

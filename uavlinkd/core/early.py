@@ -72,8 +72,13 @@ class EarlyFrames:
             out += self._pass(self._waiting.pop(0))
         return out
 
+    def note(self, order: int) -> bool:
+        """Note an envelope whose frames do not wait. Returns whether one that was sealed later came before it."""
+        is_overtaken, self.highest = order < self.highest, max(self.highest, order)
+        return is_overtaken
+
     def _pass(self, envelope: EarlyEnvelope) -> Sequence[Output]:
-        self.highest = max(self.highest, envelope.order)
+        self.note(envelope.order)
         if envelope.is_along_best and (self._newest is None or envelope.order > self._newest.order):
             self._newest = envelope
         return envelope.frames

@@ -90,6 +90,8 @@ def receive_answer(peer: Peer, echo: wire.Echo, now: float) -> list[Output]:
         session.unverified_reports.clear()
         new, late = session.held.release(echo.fresh)
         out += [Deliver(peer, payload, session.order_of(counter)) for counter, payload in new]
+        if peer.early is not None:
+            peer.traffic.out_of_order += sum(peer.early.note(session.order_base + counter) for counter, _ in new)
         out += peer.drop(DropReason.DELAYED, late)
     return out
 

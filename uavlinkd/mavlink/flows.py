@@ -54,14 +54,9 @@ class NewestStates:
 
         ``order``: that of the envelope, as in :attr:`uavlinkd.core.outputs.Deliver.order`.
         """
-        kept: list[Frame] | None = None  # no list is made while all frames are kept, as nearly always
-        for position, frame in enumerate(frames):
-            if not frame.header.kind.is_state or self._is_newest(flow_key(frame), order):
-                if kept is not None:
-                    kept.append(frame)
-            elif kept is None:
-                kept = frames[:position]
-        return frames if kept is None else kept
+        return [
+            frame for frame in frames if not frame.header.kind.is_state or self._is_newest(flow_key(frame), order)
+        ]
 
     def _is_newest(self, flow: FlowKey, order: int) -> bool:
         last = self._orders.pop(flow, order)

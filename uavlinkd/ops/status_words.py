@@ -208,10 +208,8 @@ def peer_drops(peer: Status) -> list[Count]:
 def overtaken(peer: Status) -> str:
     """How many envelopes with frames arrived after later ones; empty if none did."""
     count, received = peer[LinkProblem.ENVELOPES_OUT_OF_ORDER], peer["envelopes_received"]
-    if not count:
-        return ""
-    share = 100 * count / max(count, received)
-    return f"{count:,} of {received:,} envelopes, {share:.2g} % (repair, a change or the death of a path)"
+    text = f"{count:,} of {received:,} envelopes, {100 * count / max(1, count, received):.2g} %"
+    return f"{text} (repair, a change or the death of a path)" if count else ""
 
 
 def endpoint_drops(endpoint: Status) -> list[Count]:
