@@ -13,6 +13,7 @@ from tests.daemon.members import CertifiedFleet, is_up
 from tests.daemon.process import DaemonProcess
 from tests.daemon.tls import listen_for_tls
 from tests.daemon.udp import Client, Sockaddr
+from tests.signed_frames import Autopilot, Station
 from uavlinkd.config.keys import generate_private_key, public_key_text
 from uavlinkd.core.certificates import MemberRole
 from uavlinkd.lab.sim.loopback_ports import free_port
@@ -77,6 +78,20 @@ async def test_both_by_tls_because_udp_is_silent(stage: Stage) -> None:
     assert await scene.connections() == 2
     connected = scene.drone.events("relay_connected")
     assert [line["address"] for line in connected] == [scene.url]
+
+
+@pytest.mark.parametrize("is_by_tls", [False, True], ids=["udp", "tls"])
+async def test_signed_frames_arrive_in_the_order_of_their_sender(stage: Stage, *, is_by_tls: bool) -> None:
+    """Through the relay, with bursts of frames of all classes: no gap in their numbers, no signature is rejected."""
+    scene = Scene(stage)
+    address = scene.url if is_by_tls else scene.relay.address
+    await scene.start([address], [address])
+    autopilot, client = Autopilot(), await stage.client()
+    for _ in range(50):
+        client.send(b"".join(frame.raw for frame in autopilot.burst()), scene.into)
+        await scene.pilot.until(lambda: len(scene.pilot.received) >= sum(len(frame.raw) for frame in autopilot.sent))
+    station = Station([bytes(scene.pilot.received)])
+    assert (station.packet_loss(), station.rejected) == (0, 0)
 
 
 async def test_udp_comes_first(stage: Stage) -> None:
