@@ -64,6 +64,8 @@ class DaemonProcess:
         """The command that starts the daemon, such as ``ip netns exec NAME``. It execs the daemon: one process."""
         self.code = ""
         """Python that runs the daemon, if it is not the package as it is."""
+        self.is_planted = False
+        """Whether a test plants exceptions in it: then it logs their tracebacks."""
         self.environ: dict[str, str] = {}
         """Additional variables of its environment, for every start."""
         self._process: asyncio.subprocess.Process | None = None

@@ -13,7 +13,7 @@ from uavlinkd.mavlink.frames import SplitCounters, split_datagram
 from uavlinkd.system import guard as module
 from uavlinkd.system.guard import EXIT_STATUS, MOST_FAULTS, WITHIN_S, FaultGuard, report, run
 
-PLACE = "mavlink.frames.split_datagram"
+PLACE = "mavlink.frames.find_frames"
 
 
 class Scene:

@@ -23,7 +23,6 @@ WITHIN_S: Final = 60.0
 EXIT_STATUS: Final = 70
 """Of a process that its guard ended: EX_SOFTWARE in sysexits.h(3head)."""
 _OURS: Final = "uavlinkd."
-_HERE: Final = "system.guard."
 
 LoopHandler = Callable[[asyncio.AbstractEventLoop, dict[str, Any]], object]
 
@@ -46,10 +45,10 @@ def run(function: Callable[..., object], *arguments: Any, most: float = MOST_FAU
 
 
 def place_of(error: BaseException) -> str:
-    """The outermost function of this package that an exception left or reached; empty if there is none."""
+    """The innermost function of this package in which an exception was raised; empty if there is none."""
     codes = [(str(frame.f_globals.get("__name__")), frame.f_code) for frame, _ in walk_tb(error.__traceback__)]
     ours = [f"{module.removeprefix(_OURS)}.{code.co_qualname}" for module, code in codes if module.startswith(_OURS)]
-    return next((place for place in ours if not place.startswith(_HERE)), "".join(ours[:1]))
+    return ours[-1] if ours else ""
 
 
 class FaultGuard:
