@@ -29,7 +29,7 @@ from uavlinkd.core.sessions import Twin
 from uavlinkd.core.settings import PeerSettings
 from uavlinkd.endpoints.url import parse_url
 from uavlinkd.link import diagnosis, down_problems
-from uavlinkd.link.evidence import EVIDENCE_S, OWN_FRAMES_S, History
+from uavlinkd.link.evidence import EVIDENCE_S, OWN_FRAMES_S, REPORTED, History
 from uavlinkd.link.facts import ICMP_S
 from uavlinkd.link.own_problems import PROBLEMS, own_codes
 from uavlinkd.link.peer_link import PeerLink
@@ -226,6 +226,17 @@ def test_evidence_from_before_the_link_went_down_does_not_count(daemon: Daemon) 
     daemon.set_up(role="all", system_ids="all")
     daemon.link.expected_since = 0.0
     assert daemon.findings() == {}, "the link is up"
+
+
+def test_a_peer_that_was_stopped_closed_the_link(daemon: Daemon) -> None:
+    """One fault, without advice about firewalls, until something new comes from the peer."""
+    daemon.link.on_down(NOW, is_closed=True)
+    daemon.evidence.add_error(f"{REPORTED}ECONNREFUSED", THERE, NOW + 12.0)
+    (finding,) = daemon.findings(NOW + 12.4).values()
+    assert (finding.cause, finding.text.partition(":")[0]) == ("closed_by_peer", "closed by the peer, 12 s ago")
+    daemon.link.peer.received_at = NOW + 1.0
+    daemon.evidence.add_error(f"{REPORTED}ECONNREFUSED", THERE, NOW + 12.0)
+    assert set(daemon.findings(NOW + 12.4)) == {"no_listener"}
 
 
 def test_other_version_names_the_older_side(daemon: Daemon) -> None:

@@ -30,7 +30,7 @@ from uavlinkd.link.facts import (
     warning,
 )
 from uavlinkd.link.relay_link import RelayLink
-from uavlinkd.ops.findings import IS_REACHABLE
+from uavlinkd.ops.findings import IS_REACHABLE, titled
 from uavlinkd.ops.log import shown
 from uavlinkd.system.error_meanings import CONNECTED, meaning_of, web_problem
 
@@ -78,7 +78,7 @@ def _relays(peer: PeerFacts) -> Iterator[_RelayProblem]:
     for relay in relays:
         if not relay.peer.is_up and any(peer.moment.seen_at(relay, error) for error in may_fail):
             yield "not_sent", relay
-        elif not link.is_overdue(peer.now):
+        elif not link.is_overdue(peer.now) or (link.is_closed and relay.state_for(link) == "waiting"):
             continue
         elif relay.state_for(link) == "waiting":
             yield "not_bound", relay
@@ -135,8 +135,8 @@ def _at_relays(peer: PeerFacts, relays: Sequence[_RelayProblem]) -> Iterator[Fou
     for name in (relay.config.name for problem, relay in relays if problem == "not_bound"):
         yield fault(
             "not_bound",
-            f"{peer.name} is not bound at the relay {name}: it is off, cannot reach the relay (UDP blocked there), is"
-            " not a member, does not use it, or keys differ",
+            f"{peer.name} is not bound at the {titled('relay', name)}: it is off, cannot reach the relay (UDP blocked"
+            " there), is not a member, does not use it, or keys differ",
             f"start {peer.name}; `uavlinkd status` there and at the relay names the cause"
             if is_certified
             else f"start {peer.name}; compare both public_key with `uavlinkd pubkey`; write a [[relay]] for {name}"
@@ -171,7 +171,7 @@ def silent_relays(
         relays = [relay for relay in relays if relay not in by_udp]
     for relay in relays:
         name, hosts = relay.config.name, hosts_of(relay)
-        text = f"the relay {name} does not answer at {listed(map(str, relay.config.addresses))}: "
+        text = f"the {titled('relay', name)} does not answer at {listed(map(str, relay.config.addresses))}: "
         remedy = (
             f"{_ASK_THERE.format(name)}; else open its firewall. `uavlinkd pubkey` there must print the public_key of"
             f" the [[relay]] here, and this daemon must be {admitted}"
@@ -223,8 +223,9 @@ def relay_warnings(moment: Moment) -> Iterator[Found]:
             if answering := moment.answering.get(path.host, ""):
                 yield warning(
                     "relay_port_silent",
-                    f"no answer from {shown(path.address)}, an address of the relay {relay.config.name}: that host"
-                    f" answers ({answering}), so a firewall drops UDP to this port only, or no process listens there",
+                    f"no answer from {shown(path.address)}, an address of the"
+                    f" {titled('relay', relay.config.name)}: that host answers ({answering}), so a firewall drops UDP"
+                    " to this port only, or no process listens there",
                     "let UDP to this port through the firewalls here and there, or compare `listen` of the relay with"
                     " the addresses of the [[relay]] here",
                 )
@@ -257,7 +258,9 @@ def _hints(peer: PeerFacts) -> Iterator[Found]:
 
 
 def _icmp(peer: PeerFacts) -> Iterator[Found]:
-    """What the network reports. It comes last: it may be from before the peer started."""
+    """What the network reports. It comes last: it may be from before the peer started. A close explains it too."""
+    if peer.link.is_closed:
+        return
     if (sighting := peer.seen(f"{REPORTED}ECONNREFUSED")) is not None:
         yield fault(
             "no_listener",
@@ -308,7 +311,7 @@ def _handshakes(peer: PeerFacts, relays: Sequence[_RelayProblem]) -> Iterator[Fo
         if (
             sighting := peer.daemon.evidence.seen_at(DropReason.BAD_HANDSHAKE, ("relay", name), peer.now)
         ) is not None:
-            senders.append(f"the relay {name} at {at(sighting)}")
+            senders.append(f"the {titled('relay', name)} at {at(sighting)}")
     for sender in senders:
         yield fault(
             "wrong_psk",
@@ -332,7 +335,17 @@ def silence(peer: PeerFacts) -> Iterator[Found]:
     if not peer.link.is_overdue(peer.now):
         return
     by_name = peer.daemon.relays.by_name
-    if config.addresses and all(written.is_serial for written in config.addresses):
+    refused = ""
+    if config.settings.is_certified:
+        refused = ", or it has a bulletin that revokes this daemon (`uavlinkd fleet list` shows whether)"
+    if peer.link.is_closed:
+        yield fault(
+            "closed_by_peer",
+            f"closed by the peer, {peer.now - peer.link.closed_at:.0f} s ago: its daemon was stopped, or its file no"
+            " longer has this daemon",
+            f"none if that is meant; else start uavlinkd at {peer.name}",
+        )
+    elif config.addresses and all(written.is_serial for written in config.addresses):
         yield fault(
             "no_answer",
             f"no answer along {peer.addresses}: it is off or out of range, or keys or modem settings differ",
@@ -340,10 +353,10 @@ def silence(peer: PeerFacts) -> Iterator[Found]:
         )
     elif peer.link.peer.received_at is not None:
         through = [name for name, relay in by_name.items() if relay.state_for(peer.link) == "bound"]
-        via = f" through the relay {through[0]}, which answers" if through else ""
+        via = f" through the {titled('relay', through[0])}, which answers" if through else ""
         yield fault(
             "no_answer",
-            f"nothing arrives from it any more{via}: it is off, or the direction from it to here is blocked",
+            f"nothing arrives from it any more{via}: it is off, or the direction from it to here is blocked{refused}",
             f"{ask}; if its link is up there, look for a bad radio or a firewall in the direction from it to here",
         )
     elif config.addresses:
@@ -353,7 +366,7 @@ def silence(peer: PeerFacts) -> Iterator[Found]:
         yield fault(
             "no_answer",
             f"no answer from {peer.addresses}: it is off, a firewall drops UDP {where}, or addresses, keys or"
-            " protocol versions differ",
+            f" protocol versions differ{refused}",
             f"{ask}; else open its firewall",
         )
     elif config.relays:

@@ -42,6 +42,9 @@ PROBLEMS: Final = {
     ),
     9: ReportedProblem("daemon_paused", "its process was paused", frozenset({"daemon_paused"})),
     10: ReportedProblem("recording_stopped", "it does not record", frozenset({"recording_stopped"})),
+    11: ReportedProblem(
+        "key_twice", "two machines use one private key", frozenset({"key_on_two_machines", "own_key_elsewhere"})
+    ),
 }
 """By code, the most important first. README.md of the core has the same table."""
 _STOPS_FRAMES: Final = frozenset({1, CUT_OFF})

@@ -97,6 +97,8 @@ class PeerLink:
         """Frames for it that its policy let pass."""
         self.expected_since = now
         """When the daemon began to expect it, at first or again."""
+        self.closed_at = -NEVER
+        """When its last close arrived."""
         self.relayed: Sequence[Path] = ()
         """The paths to it through relays."""
         self.rates = Rates(now)
@@ -242,9 +244,14 @@ class PeerLink:
     def on_down(self, now: float, *, is_closed: bool) -> None:
         """The peer is lost, or has closed the link: drop what waits, which would be old when it is back."""
         if is_closed:  # perhaps to start again at once
-            self.expected_since = now
+            self.expected_since = self.closed_at = now
         self.output.clear(now)
         self._set_deadline(now)
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether nothing new came from the peer after its close."""
+        return not self.peer.is_up and self.closed_at >= (self.peer.received_at or 0.0)
 
     def is_overdue(self, now: float) -> bool:
         """Whether to report that the peer is silent."""

@@ -11,6 +11,11 @@ IS_REACHABLE: Final = "`nc -zvw3 {} 22` shows whether the host is reachable by T
 """A remedy beside a silent relay, of ``status`` and ``netcheck``."""
 
 
+def titled(kind: str, name: str) -> str:
+    """A name behind its kind, unless it says that already: ``relay vps``, ``relay1``."""
+    return name if name.startswith(kind) else f"{kind} {name}"
+
+
 class Severity(IntEnum):
     """How much a finding matters. The smallest is shown first."""
 
