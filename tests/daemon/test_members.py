@@ -10,6 +10,7 @@ from tests.daemon.frames import frame
 from tests.daemon.harness import Stage
 from tests.daemon.members import CertifiedFleet, Swarm, is_up, start_swarm
 from uavlinkd.core.certificates import MemberRole
+from uavlinkd.system.base64_text import to_base64
 
 
 async def test_members_meet_at_a_relay(stage: Stage) -> None:
@@ -19,10 +20,14 @@ async def test_members_meet_at_a_relay(stage: Stage) -> None:
     fleet.join(relay, MemberRole.RELAY)
     fleet.join(ground, MemberRole.OPERATOR, 255, relay)
     fleet.join(vehicle, MemberRole.VEHICLE, 1, relay)
+    fleet.join(late := stage.daemon("v2"), MemberRole.VEHICLE, 2)
     into, screen = vehicle.add_endpoint("autopilot"), await stage.client()
     ground.add_endpoint("screen", f"udpout:{screen}")
     await stage.start(relay, ground, vehicle, linked=False)
     await ground.until(lambda status: is_up(status, "v1"))
+    await ground.ask(fleet.renew(late))
+    status = await ground.status()
+    assert (set(status["fleet"]["absent"]), status["frames_pass"]) == ({"v2"}, True), "no one waits for it"
     autopilot = await stage.client()
     autopilot.send(frame(1), into)
     await screen.until(lambda: screen.received == frame(1))
@@ -34,9 +39,12 @@ async def test_members_meet_at_a_relay(stage: Stage) -> None:
     assert "v1" not in (await ground.status())["peers"]
     await relay.until(lambda status: "v1" not in status["relay"]["members"])
     await relay.until(lambda status: status["drops"].get("certificate_revoked", 0) > 0)
+    assert (await vehicle.until(lambda status: status["fleet"]["is_revoked"]))["fleet"]["number"] == 2
+    assert to_base64(fleet.certificates["ground"][1]) in (stage.folder / "v1" / "v1.fleet-state").read_text()
     await asyncio.gather(ground.kill(), relay.stop())
     await ground.start()
-    assert (await ground.ready())["fleet"]["number"] == 2, "the bulletin is on its disk"
+    known = (await ground.ready())["fleet"]
+    assert (known["number"], set(known["absent"])) == (2, {"v2"}), "both are on its disk"
 
 
 @pytest.fixture

@@ -6,6 +6,8 @@ import os
 import pty
 import select
 import sys
+import termios
+import time
 from pathlib import Path
 
 import pytest
@@ -103,13 +105,13 @@ def test_key_without_a_passphrase_is_named(file: Path, capsys: pytest.CaptureFix
 
 
 def test_passphrase_typed_twice_on_a_terminal(tmp_path: Path) -> None:
-    """The terminal does not show it. Only there, the paper copy is printed."""
+    """The terminal does not show it, also if it is typed before the prompt. Only there, the paper copy is printed."""
     for answers, reason in (
         ((PASSPHRASE, "another"), "the two passphrases differ"),
         (("",), "the passphrase is empty"),
         ((PASSPHRASE, PASSPHRASE), "Its paper copy"),
     ):
-        said = on_terminal(tmp_path, answers)
+        said = on_terminal(tmp_path, answers, early=PASSPHRASE if answers[-1] == PASSPHRASE else "")
         assert reason in said
         assert PASSPHRASE not in said
     groups = [line for line in said.splitlines() if len(line) == 34 and set(map(len, line.split())) == {4}]
@@ -122,13 +124,17 @@ def test_passphrase_typed_twice_on_a_terminal(tmp_path: Path) -> None:
     assert read_manifest(tmp_path / "fleet").member("v7").ids == "1"
 
 
-def on_terminal(folder: Path, answers: tuple[str, ...]) -> str:
-    """What `fleet init` writes on a terminal of its own."""
+def on_terminal(folder: Path, answers: tuple[str, ...], early: str) -> str:
+    """What `fleet init` writes on a terminal of its own. ``early``: typed as soon as this is not shown."""
     pid, terminal = pty.fork()
     if pid == 0:
         os.chdir(folder)
         os.execv(sys.executable, [sys.executable, "-m", "uavlinkd", *INIT])
     said, asked = b"", 0
+    while termios.tcgetattr(terminal)[3] & termios.ECHO:
+        time.sleep(0.01)
+    if early:
+        os.write(terminal, early.encode() + b"\n")
     while select.select([terminal], [], [], PATIENCE_S)[0]:
         try:
             data = os.read(terminal, 4096)

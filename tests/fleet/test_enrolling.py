@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
@@ -258,6 +259,8 @@ def test_members_are_listed(place: Path, say: Say) -> None:
     assert rows[0][2:] == ["bulletin", "2"]
     assert [row[:4] for row in rows[2:]] == [["relay", "relay", "-", "1"], ["v7", "vehicle", "70-79", "2"]]
     assert rows[3][-1] == "revoked"
+    facts = json.loads(say("fleet list --json"))
+    assert (facts["bulletin"], [one["is_revoked"] for one in facts["members"]]) == (2, [False, True])
     assert "v7 is revoked" in say("fleet sign v7")
     assert 'has no "v8"' in say("fleet sign v8")
 

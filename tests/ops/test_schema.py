@@ -27,7 +27,7 @@ MAPS = (
         "networks",
         "relay.members",
     ),
-    *("fleet.held", "fleet.bulletins", "fleet.events"),
+    *("fleet.absent", "fleet.held", "fleet.bulletins", "fleet.events"),
 )
 """Objects whose keys are names of the configuration or addresses."""
 COUNTS: Mapping[str, int] = {
@@ -140,7 +140,9 @@ async def observed() -> dict[str, str]:
         fleet.revoked = [77]
         fleet.join(station, MemberRole.OPERATOR, 255)
         fleet.join(vehicle, MemberRole.VEHICLE, 1, station)
+        fleet.join(absent := stage.daemon("absent"), MemberRole.OPERATOR, 254)
         await stage.start(vehicle, linked=False)
+        await vehicle.ask(fleet.renew(absent))
         statuses.append(await vehicle.status())
         await station.start()
         statuses.append(await vehicle.until(lambda status: status["fleet"]["bulletins"] == {"station": 1}))

@@ -115,6 +115,7 @@ FLEET = {
     "serial": 3,
     "number": 5,
     "bulletins": {"ground": 5, "v2": 4, "v3": None},
+    "absent": {"v9": "eZPBKM+9Oztdms1v2yiR+byync+zZsR87etuOX4heHE="},
 }
 USED = {
     "state": "up",
@@ -149,7 +150,8 @@ BY_TLS = {**USED, "paths": [{"network": "TLS"}]}
             {},
             "1 of 1 peers up, frames stop, as reported by d0, d1, d2, d3, d4, d5, d6, d7 and 1 more",
         ),
-        ({"fleet": FLEET}, {}, "fleet k7qd2m4x: v1, vehicle, serial 3; bulletin 5, but v2 has 4 "),
+        ({"fleet": FLEET}, {}, "1 of 2 peers up fleet k7qd2m4x: vehicle v1, serial 3; bulletin 5, but v2 has 4 "),
+        ({"fleet": FLEET}, {}, "v9 waiting never - 0/0 % 0 B/s 0 B/s drone1 up"),
         ({"relays": {"vps": USED}}, {}, "relay vps: up, 12 ms; drone1 bound, drone2 waiting"),
         ({"relays": {"vps": BY_TLS}}, {}, "relay vps: up by TLS, 12 ms; drone1 bound, drone2 waiting"),
     ],

@@ -1,7 +1,7 @@
 """The file with the newest bulletin and the newest own certificate, for the next start. README.md, "Start and state".
 
-A text: what it is, the bulletin and the certificate in base64, a line with the key and certificate of each contact,
-and a checksum of the lines before.
+A text: what it is, the bulletin and the certificate in base64, a line with the key and certificate of each contact
+and of each member of the roster, and a checksum of the lines before.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from uavlinkd.core.drops import Drop
 from uavlinkd.system.folders import sync_folder, write_new
 
 _TITLE = b"uavlinkd fleet state 1"
-_MOST_BYTES = 2048  # of the file. The longest one has 1,150.
+_MOST_BYTES = 65536  # of the file. The longest one has 260 members of 182 bytes.
 
 
 class FleetState(NamedTuple):
@@ -29,8 +29,11 @@ class FleetState(NamedTuple):
 
     bulletin: bytes
     certificate: bytes  # empty for a daemon that has none
-    contacts: tuple[tuple[bytes, bytes], ...] = ()
-    """The key and the newest certificate of each. That of the configuration may be below the least serial by now."""
+    members: tuple[tuple[bytes, bytes], ...] = ()
+    """The key and the newest certificate of each contact and of each member of the roster.
+
+    A contact's certificate in the configuration may be below the least serial by now.
+    """
 
 
 def read(path: Path, trust: Trust, contacts: Mapping[bytes, bytes] = MappingProxyType({})) -> str:
@@ -53,8 +56,9 @@ def read(path: Path, trust: Trust, contacts: Mapping[bytes, bytes] = MappingProx
     if verdict not in (BulletinVerdict.NEWER, BulletinVerdict.KNOWN):
         return f"{path} has a bulletin of another fleet, or one that contradicts the configuration ({verdict.value})"
     trust.replace_own(state.certificate)
-    for key, newest in state.contacts:
+    for key, newest in state.members:
         with suppress(Drop):
+            trust.note(key, newest)
             if key in contacts and is_same_member(parse_certificate(contacts[key]), parse_certificate(newest)):
                 trust.hold(key, newest)
     return ""
@@ -77,15 +81,15 @@ def write(path: Path, state: FleetState) -> None:
 
 
 def _encode(state: FleetState) -> bytes:
-    contacts = (b" ".join(map(b64encode, contact)) for contact in state.contacts)
-    lines = b"\n".join((_TITLE, b64encode(state.bulletin), b64encode(state.certificate), *contacts, b""))
+    members = (b" ".join(map(b64encode, member)) for member in state.members)
+    lines = b"\n".join((_TITLE, b64encode(state.bulletin), b64encode(state.certificate), *members, b""))
     return lines + sha256(lines).hex().encode() + b"\n"
 
 
 def _parse(data: bytes) -> FleetState | None:
     try:
-        _, bulletin, certificate, *contacts, _, _ = data.split(b"\n")
-        pairs = [[b64decode(part) for part in contact.split(b" ")] for contact in contacts]
+        _, bulletin, certificate, *members, _, _ = data.split(b"\n")
+        pairs = [[b64decode(part) for part in member.split(b" ")] for member in members]
         state = FleetState(b64decode(bulletin), b64decode(certificate), tuple((key, held) for key, held in pairs))
     except ValueError:
         return None

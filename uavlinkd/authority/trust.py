@@ -9,6 +9,7 @@ from collections.abc import Collection, Container, Iterable, Iterator, Mapping
 from enum import Enum
 from typing import NamedTuple
 
+from uavlinkd.authority.constants import CERTIFIED_PEERS
 from uavlinkd.core.certificates import (
     GENERATION,
     Certificate,
@@ -68,6 +69,8 @@ class Trust:
         self.bulletin, self.bulletin_bytes = parsed, bulletin
         self.own: HeldCertificate | None = None
         self.held: dict[bytes, HeldCertificate] = {}  # by static public key, without the own one
+        self.roster: dict[str, tuple[bytes, HeldCertificate]] = {}
+        """The key and certificate of each member for people to see, by name. It admits no member."""
         self._claims: dict[str | int, bytes] = {}
         """Who was held last with a name or a system id: a relay holds thousands, and must not compare all of them."""
         self.pinned = Pinned()
@@ -81,11 +84,12 @@ class Trust:
     def known(self) -> dict[str, object]:
         """The bulletin and the certificates with their keys, in base64, as `fleet restore` reads them."""
         own = {} if self.own is None else {self.own_key: self.own}
+        roster = dict(self.roster.values())
         return {
             "fleet": {"authority": to_base64(self._authority.public), "bulletin": to_base64(self.bulletin_bytes)},
             "contact": [
                 {"public_key": to_base64(key), "certificate": to_base64(held.data)}
-                for key, held in (own | self.held).items()
+                for key, held in (roster | own | self.held).items()
             ],
         }
 
@@ -144,6 +148,18 @@ class Trust:
         self.held[key] = HeldCertificate(certificate, data)
         self._claims |= dict.fromkeys(self._claims_of(certificate), key)
         return ended
+
+    def note(self, key: bytes, data: bytes) -> bool:
+        """Enter a member into the roster. Returns whether that changed it. Raises Drop as :meth:`judge`."""
+        certificate = self.judge(key, data)
+        known = [name for name, one in self.roster.items() if name == certificate.name or one[0] == key]
+        is_newer = all(self.roster[name][1].certificate.serial < certificate.serial for name in known)
+        if not is_newer or len(self.roster) - len(known) >= CERTIFIED_PEERS:
+            return False
+        for name in known:
+            del self.roster[name]
+        self.roster[certificate.name] = key, HeldCertificate(certificate, data)
+        return True
 
     def reserve(self, pinned: Pinned) -> list[bytes]:
         """Apply what the configuration reserves now. Returns the keys of held certificates that it ends."""
@@ -217,6 +233,9 @@ class Trust:
         if own.shrinks(bulletin):
             return BulletinVerdict.SHRINKS, []
         self.bulletin, self.bulletin_bytes = bulletin, data
+        self.roster = {
+            name: one for name, one in self.roster.items() if not bulletin.refuses(one[1].certificate.serial)
+        }
         ended = [key for key, held in self.held.items() if bulletin.refuses(held.certificate.serial)]
         for key in ended:
             del self.held[key]

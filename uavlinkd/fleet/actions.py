@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable, Iterable
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 from uavlinkd.authority.enrolment import LONGEST_LINE, FleetError, fingerprint_of, parse_request
 from uavlinkd.core.certificates import MemberRole
@@ -79,7 +80,8 @@ def _sign(options: argparse.Namespace) -> None:
     result, line = operations.sign(options.out, request, _identity(options), ask, replaces=replaces)
     print(line)
     member = result.fleet.member(request.name)
-    _note(f"signed {member.name}: {_role(member.role)}, system id {member.ids}, serial {member.certificate.serial}")
+    role, serial = member.role.name.lower(), member.certificate.serial
+    _note(f"signed {member.name}: {role}, system id {member.ids}, serial {serial}")
     _note(
         f"fleet {fingerprint_of(result.fleet.authority.public)}: `enroll --finish` prints the same on {member.name}"
     )
@@ -89,6 +91,7 @@ def _sign(options: argparse.Namespace) -> None:
         _note(f"serial {former[-1]} is revoked: {after}")
     for note in _to_carry(options, result):
         _note(note)
+    _introduce(options, result.fleet, request.name)
 
 
 def _identity(options: argparse.Namespace) -> Identity:
@@ -112,6 +115,8 @@ def _change(options: argparse.Namespace) -> None:
         resign = options.action == "revoke" and options.resign
         result = operations.revoke(options.out, options.name, ask, resign=resign)
         _say(f"{options.name} is revoked, by bulletin {result.fleet.bulletin.number}.")
+    if options.action == "add":
+        _introduce(options, result.fleet, options.name)
     if options.action == "remove":
         try:
             _publish_here(options, ask)
@@ -146,6 +151,15 @@ def _publish_here(options: argparse.Namespace, ask: Passphrase, *, merges: bool 
         f"The daemon has bulletin {fleet.bulletin.number}, and passes it on: members that are up have it within"
         " seconds, others when they meet one that has it. `uavlinkd status` shows which."
     )
+
+
+def _introduce(options: argparse.Namespace, fleet: Fleet, name: str) -> None:
+    """Let the daemons here show a new member before it comes."""
+    try:
+        for socket in control_sockets(options):
+            operations.introduce(fleet, socket)
+    except CommandError:
+        _note(f"`uavlinkd fleet publish` beside a station's daemon lets its status show {name} before it comes")
 
 
 def _members(options: argparse.Namespace) -> None:
@@ -251,27 +265,36 @@ def _to_carry(options: argparse.Namespace, result: Result) -> list[str]:
 
 def _list(options: argparse.Namespace) -> None:
     fleet = read_manifest(options.out)
-    _say(f"fleet {fingerprint_of(fleet.authority.public)}, bulletin {fleet.bulletin.number}")
-    last = {member.name: member for member in (*fleet.members, *fleet.current)}  # former keys are not members
-    _print_table(fleet, last.values())
+    fingerprint, number = fingerprint_of(fleet.authority.public), fleet.bulletin.number
+    last = {member.name: member for member in (*fleet.members, *fleet.current)}.values()  # former keys are no members
+    if options.json:
+        members = [_facts(fleet, member) for member in last]
+        print(json.dumps({"fleet": fingerprint, "bulletin": number, "members": members}))
+        return
+    _say(f"fleet {fingerprint}, bulletin {number}")
+    _print_table(fleet, last)
+
+
+def _facts(fleet: Fleet, member: Member) -> dict[str, Any]:
+    return {
+        "name": member.name,
+        "role": member.role.name.lower(),
+        "ids": member.ids,
+        "serial": member.certificate.serial,
+        "public_key": to_base64(member.public_key),
+        "addresses": list(map(str, member.addresses)),
+        "is_revoked": fleet.is_revoked(member),
+    }
 
 
 def _print_table(fleet: Fleet, members: Iterable[Member]) -> None:
     rows = [("name", "role", "id", "serial", "key", "addresses", "")]
-    for member in members:
-        addresses = ", ".join(map(str, member.addresses)) or "-"
-        state = "revoked" if fleet.is_revoked(member) else ""
-        key = f"{to_base64(member.public_key)[:8]}..."
-        rows.append(
-            (member.name, _role(member.role), member.ids, str(member.certificate.serial), key, addresses, state)
-        )
+    for name, role, ids, serial, key, addresses, is_revoked in (_facts(fleet, one).values() for one in members):
+        state = "revoked" if is_revoked else ""
+        rows.append((name, role, ids, str(serial), f"{key[:8]}...", ", ".join(addresses) or "-", state))
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         _say("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
-
-
-def _role(role: MemberRole) -> str:
-    return role.name.lower()
 
 
 def _say(text: str) -> None:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import nullcontext
 from pathlib import Path
 
-from uavlinkd.system.terminal import OK
+from uavlinkd.system.terminal import OK, add_json, without_echo
 
 _ROLES = ("vehicle", "operator", "observer", "relay")
+_TYPED = frozenset({"init", "add", "rotate", "revoke", "remove", "publish", "paper"})
+"""Actions that read a passphrase from the terminal, and nothing else."""
 
 
 def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -73,14 +76,14 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     for action in (new, revoke, remove, add("rotate", "make a new key for a member, and revoke the old one")):
         action.add_argument("name", metavar="NAME")
     revoke.add_argument("--resign", action="store_true", help="sign all others again, which empties the bulletin")
-    publish = add("publish", "hand the bulletin to a running daemon, which passes it on")
+    publish = add("publish", "hand the bulletin and the members to a running daemon, which passes the bulletin on")
     publish.add_argument("--merge", action="store_true", help="the fleet has a newer bulletin: sign the union")
     members = add("members", "print what a running daemon knows of its fleet, for `restore`", signs=False)
-    for action in (publish, remove, members):
+    for action in (sign, new, publish, remove, members):
         daemon = action.add_mutually_exclusive_group()
         daemon.add_argument("--config", metavar="FILE", type=Path, help="the daemon's configuration")
         daemon.add_argument("--socket", metavar="PATH", type=Path, help="the daemon's control socket")
-    add("list", "list the members, also revoked ones", signs=False)
+    add_json(add("list", "list the members, also revoked ones", signs=False))
     add("paper", "print the paper copy of authority.pem, with which each reader can sign")
     restore = add("restore", "write authority.pem from its paper copy on standard input")
     restore.add_argument("--no-passphrase", action="store_true", help="as of init")
@@ -111,7 +114,9 @@ def _add_enroll(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
 
 
 def _act(options: argparse.Namespace) -> int:
-    from uavlinkd.fleet.actions import ACTIONS  # noqa: PLC0415  # other commands start without it
+    is_typed = options.action in _TYPED and options.passphrase_file is None
+    with without_echo() if is_typed else nullcontext():
+        from uavlinkd.fleet.actions import ACTIONS  # noqa: PLC0415  # other commands start without it
 
-    ACTIONS[options.action](options)
+        ACTIONS[options.action](options)
     return OK

@@ -237,7 +237,7 @@ def backup(folder: Path, file: Path) -> None:
 
 
 def publish(folder: Path, socket: Path, ask: Passphrase, *, merges: bool = False) -> Fleet:
-    """Hand the bulletin to the daemon at a control socket, and newer certificates if all were signed again.
+    """Hand the bulletin and the certificates of all members to the daemon at a control socket.
 
     The daemon may have another bulletin of the same number, which another copy of the folder signed: then their union
     is signed and handed over. ``merges``: a newer one too.
@@ -255,18 +255,21 @@ def publish(folder: Path, socket: Path, ask: Passphrase, *, merges: bool = False
             fleet = signing.merge(before, _signer(folder, before, ask), bulletin)
             _save(changes, folder, before, fleet)
     # The certificates come first: a member that meets the bulletin with its old one would be refused.
-    certificates = [
-        f"{to_base64(member.public_key)}:{to_base64(member.signed)}"
-        for member in (fleet.current if fleet.bulletin.least > bulletin.least else ())
-    ]
-    for at in range(0, len(certificates), _AT_ONCE):
-        ask_daemon(socket, " ".join(["publish", theirs, *certificates[at : at + _AT_ONCE]]))
-    if certificates:
+    introduce(fleet, socket, theirs)
+    if fleet.bulletin.least > bulletin.least:  # all were signed again
         time.sleep(SETTLE_S)
     verdict = ask_daemon(socket, f"publish {to_base64(fleet.published)}").get("verdict")
     if verdict not in (BulletinVerdict.NEWER.value, BulletinVerdict.KNOWN.value):
         raise FleetError(f"the daemon refused bulletin {fleet.bulletin.number}: {verdict}")
     return fleet
+
+
+def introduce(fleet: Fleet, socket: Path, theirs: str | None = None) -> None:
+    """Hand the certificates of all members to a daemon, which shows them from then on. ``theirs``: its bulletin."""
+    theirs = theirs or str(ask_daemon(socket, "bulletin").get("bulletin"))
+    certificates = [f"{to_base64(one.public_key)}:{to_base64(one.signed)}" for one in fleet.current]
+    for at in range(0, len(certificates), _AT_ONCE):
+        ask_daemon(socket, " ".join(["publish", theirs, *certificates[at : at + _AT_ONCE]]))
 
 
 @contextmanager

@@ -28,7 +28,7 @@ from uavlinkd.core.limits import TokenBucket
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Output
 from uavlinkd.core.peer import Peer
-from uavlinkd.core.relay_records import CertificateRecord, FleetRecord, Who
+from uavlinkd.core.relay_records import BulletinRecord, CertificateRecord, FleetRecord, Who
 from uavlinkd.core.settings import PeerSettings
 from uavlinkd.link.evidence import Evidence
 from uavlinkd.link.fleet_disk import FleetDisk
@@ -257,7 +257,10 @@ class FleetMembers:
         """A member is here, or is introduced: make a link with it, and let it use the relay of this daemon."""
         if peer is not None:
             self._node.accept(peer)
-        if self.trust.held[key].certificate.role in self.config.policies:
+        held = self.trust.held[key]
+        if held.certificate.role in self.config.policies:
+            if self.trust.note(key, held.data):
+                self._disk.write()
             self._membership.add_member(self._config_of(key), peer)
         self._serve(key, now)
 
@@ -309,9 +312,9 @@ class FleetMembers:
             self._join(record.key, peer, now)
 
     def publish(self, signed: str, now: float) -> dict[str, object]:
-        """Take a bulletin from the operator of this machine, and newer certificates of members: KEY:CERTIFICATE.
+        """Take a bulletin from the operator of this machine, and certificates of members: KEY:CERTIFICATE.
 
-        All of it in base64, with spaces between. Returns what became of it.
+        All of it in base64, with spaces between. Members enter the roster. Returns what became of the bulletin.
         """
         try:
             first, *others = [list(map(from_base64, one.split(":"))) for one in signed.split()]
@@ -325,6 +328,7 @@ class FleetMembers:
                     self._react(Reaction(persists=True), now)
                 for ended in self.trust.hold(key, certificate) if key in self.trust.held else ():
                     self._end(ended, now)
+                self.trust.note(key, certificate)
         self.exchange.note_own_certificate(now)
         self._disk.write()
         return {"verdict": self._publish(bulletin, now).value, "number": self.trust.bulletin.number}
@@ -336,6 +340,7 @@ class FleetMembers:
 
     def _react(self, reaction: Reaction, now: float, who: str = "this machine") -> None:
         for key in reaction.ended:
+            run(self._send, key, BulletinRecord(self.trust.bulletin_bytes), now)  # an honest one learns why
             run(self._end, key, now)
         if reaction.persists:
             self._events.clear()
@@ -353,6 +358,18 @@ class FleetMembers:
     def _send(self, key: bytes, record: FleetRecord, now: float) -> None:
         if (peer := self._node.find(key)) is not None:
             self._perform(self._node.send_record(peer, None, record, now))
+
+    @property
+    def absent(self) -> dict[str, bytes]:
+        """The names and keys of members that would have a policy here, and have not come since the start."""
+        keys, fleet = {link.key for link in self._links.values()}, self.config
+        return {
+            name: key
+            for name, (key, one) in sorted(self.trust.roster.items())
+            if one.certificate.role in fleet.policies
+            and key not in keys
+            and name not in {*self._links, *fleet.denied}
+        }
 
     @property
     def problem(self) -> str:
@@ -394,9 +411,10 @@ class FleetMembers:
 
     def _state(self) -> FleetState:
         held = self.trust.held
-        contacts = tuple((one.key, held[one.key].data) for one in self.config.contacts if one.key in held)
+        contacts = {one.key: held[one.key].data for one in self.config.contacts if one.key in held}
+        roster = {key: one.data for key, one in self.trust.roster.values()}
         own = b"" if self.trust.own is None else self.trust.own.data
-        return FleetState(self.trust.bulletin_bytes, own, contacts)
+        return FleetState(self.trust.bulletin_bytes, own, tuple((roster | contacts).items()))
 
     def _on_written(self, state: FleetState) -> None:
         if state.bulletin == self.trust.bulletin_bytes:

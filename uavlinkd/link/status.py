@@ -138,7 +138,7 @@ def _age(at: float | None, now: float) -> float | None:
 
 def fleet_status(fleet: FleetMembers, links: Mapping[str, PeerLink], now: float) -> dict[str, object]:
     """What a daemon knows of its fleet. ``events``: their age in seconds. ``bulletins``: the number that each peer
-    stated.
+    stated. ``absent``: the keys of members that have not come since the start.
     """
     trust = fleet.trust
     own = None if trust.own is None else trust.own.certificate
@@ -151,6 +151,7 @@ def fleet_status(fleet: FleetMembers, links: Mapping[str, PeerLink], now: float)
         "number": trust.bulletin.number,
         "least": trust.bulletin.least,
         "revoked": list(trust.bulletin.revoked),
+        "absent": {name: encode_key(key) for name, key in fleet.absent.items()},
         "held": {held.certificate.name: held.certificate.serial for held in trust.held.values()},
         "bulletins": {name: fleet.exchange.shown(link.key) for name, link in links.items()},
         "problem": fleet.problem,

@@ -40,7 +40,7 @@ def render_status(status: Status, width: int = 80) -> RenderableType:
     if (fleet := status["fleet"]) is not None:
         parts.append(_said(words.fleet_line(fleet)))
     relay = status["relay"]
-    if relay is None or status["peers"] or status["endpoints"]:
+    if relay is None or words.peers_of(status) or status["endpoints"]:
         parts += [*_peers(status, width), _endpoints(status)]
     if relay is not None:
         parts.append(_members(relay))
@@ -107,6 +107,8 @@ def _peers(status: Status, width: int) -> list[RenderableType]:
             _rate(peer["bytes_in_s"]),
             _rate(peer["bytes_out_s"]),
         )
+        if name not in status["peers"]:
+            continue
         if (repair := peer["repair"])["is_on"]:
             problems.append(Text(f"{name} repair: on for {_age(repair['on_s'])}, {words.repair_line(repair)}"))
         if dropped := words.listed(words.peer_drops(peer)):
@@ -121,7 +123,7 @@ def _peers(status: Status, width: int) -> list[RenderableType]:
 
 
 def _by_state(status: Status) -> list[tuple[str, Status]]:
-    return sorted(status["peers"].items(), key=lambda item: (item[1]["state"] == "up", item[0]))
+    return sorted(words.peers_of(status).items(), key=lambda item: (item[1]["state"] == "up", item[0]))
 
 
 def _endpoints(status: Status) -> Table:

@@ -13,7 +13,7 @@ from uavlinkd.core.drops import DropReason, Reason
 from uavlinkd.mavlink.egress.lanes import EgressDrop
 from uavlinkd.mavlink.frames import FrameFault
 from uavlinkd.mavlink.policy.gate import Refusal
-from uavlinkd.ops.findings import LinkProblem
+from uavlinkd.ops.findings import LinkProblem, titled
 from uavlinkd.relay.forwarding import RelayReason
 from uavlinkd.system.error_meanings import meaning_of
 
@@ -46,6 +46,13 @@ _SHOWN_REASONS: Final = 3
 _SHOWN_NAMES: Final = 8
 
 
+_ABSENT: Final[Mapping[str, object]] = {
+    **{"state": "waiting", "path": None, "last_received_s": None, "round_trip_s": None, "paths": ()},
+    **dict.fromkeys(("loss_in", "loss_out", "bytes_in_s", "bytes_out_s"), 0.0),
+}
+"""The facts of a peer that has not come yet."""
+
+
 class Phrase(NamedTuple):
     """A part of the headline."""
 
@@ -65,9 +72,16 @@ class ProblemLine(NamedTuple):
     remedy: str
 
 
+def peers_of(status: Status) -> dict[str, Status]:
+    """All peers by name, with the members of the fleet that have not come since the daemon's start."""
+    absent: dict[str, str] = (status["fleet"] or {"absent": {}})["absent"]
+    peers: dict[str, Status] = status["peers"]
+    return {name: {"public_key": key, **_ABSENT} for name, key in absent.items()} | peers
+
+
 def headline(status: Status) -> Iterator[Phrase]:
     """How many are up, and what stops frames although they are."""
-    peers = status["peers"].values()
+    peers = peers_of(status).values()
     relay = status["relay"]
     counts = []
     if peers or relay is None:
@@ -115,7 +129,8 @@ def some(names: Sequence[str]) -> str:
 
 def fleet_line(fleet: Status) -> Phrase:
     """This daemon in its fleet, with the peers whose bulletin has another number."""
-    number, who = fleet["number"], f"{fleet['name']}, {fleet['role']}, serial {fleet['serial']}"
+    number = fleet["number"]
+    who = f"{titled(str(fleet['role']), str(fleet['name']))}, serial {fleet['serial']}"
     text = f"fleet {fleet['fleet']}: {who}; bulletin {number}"
     other = [f"{name} has {its}" for name, its in fleet["bulletins"].items() if its not in (None, number)]
     return Phrase(f"{text}, but {some(other)}", False) if other else Phrase(text, True)
@@ -129,7 +144,7 @@ def used_relay(name: str, relay: Status) -> Phrase:
     is_well = relay["state"] == "up" and "unanswered" not in relay["peers"].values()
     role = "" if relay["peer"] is None else f", also the peer {relay['peer']}"
     by_tls = " by TLS" if relay["state"] == "up" and relay["paths"][0]["network"] == "TLS" else ""
-    return Phrase(f"relay {name}{role}: {relay['state']}{by_tls}{measured}; {peers}", is_well)
+    return Phrase(f"{titled('relay', name)}{role}: {relay['state']}{by_tls}{measured}; {peers}", is_well)
 
 
 def other_losses(status: Status) -> Iterator[str]:

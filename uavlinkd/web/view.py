@@ -7,6 +7,7 @@ from typing import Any, Final
 
 from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.ops import status_words as words
+from uavlinkd.ops.findings import titled
 from uavlinkd.ops.netcheck import addresses
 from uavlinkd.ops.status_words import Status
 
@@ -33,22 +34,22 @@ def paths_of(status: Status) -> Iterator[tuple[PathKey, tuple[float | None, floa
 
 def view(status: Status, past: Sequence[Mapping[str, Any]], peer: str) -> dict[str, Any]:
     """The whole page, or that of one peer. ``past``: the problems of the log."""
-    lines = words.problems(status["findings"])
-    states = dict(_states(status, lines))
+    lines, peers = words.problems(status["findings"]), words.peers_of(status)
+    states = dict(_states(peers, lines))
     names = [peer] if peer else list(states) if len(states) <= MOST_CARDS else []
     facts: dict[str, Any] = {
         "daemon": status["name"],
         "headline": [part._asdict() for part in words.headline(status)],
         "problems": [line._asdict() for line in lines if not peer or not line.peers or peer in line.peers],
         "past": [line for line in past if not peer or line["name"] == peer],
-        "cards": [card(name, status["peers"][name], states[name]) for name in names if name in states],
+        "cards": [card(name, peers[name], states[name]) for name in names if name in states],
         "count": len(states),
     }
     if peer:
         return facts
     relay, fleet = status["relay"], status["fleet"]
     return facts | {
-        "rows": [] if names else [row(name, status["peers"][name], word) for name, word in states.items()],
+        "rows": [] if names else [row(name, peers[name], word) for name, word in states.items()],
         "members": [] if relay is None else [_member(*item) for item in relay["members"].items()],
         "endpoints": [_endpoint(*item) for item in status["endpoints"].items()],
         "networks": [_network(*item) for item in status["networks"].items()],
@@ -60,14 +61,14 @@ def view(status: Status, past: Sequence[Mapping[str, Any]], peer: str) -> dict[s
     }
 
 
-def _states(status: Status, lines: Sequence[words.ProblemLine]) -> Iterator[tuple[str, str]]:
+def _states(peers: dict[str, Status], lines: Sequence[words.ProblemLine]) -> Iterator[tuple[str, str]]:
     """The word for each peer, the broken ones first."""
     worst: dict[str, str] = {}
     for line in lines:  # the most severe first
         for name in line.peers:
             worst.setdefault(name, line.severity)
     found = {}
-    for name, peer in status["peers"].items():
+    for name, peer in peers.items():
         severity = worst.get(name)
         if peer["state"] == "up" or severity == "security":
             found[name] = _WORDS[severity] if severity else "up"
@@ -124,7 +125,7 @@ def _path(path: Status, address: str, *, is_up: bool) -> dict[str, Any]:
         "number": path["number"],
         "network": path["network"] or "",
         "address": address,
-        "way": "direct" if path["relay"] is None else f"relay {path['relay']}",
+        "way": "direct" if path["relay"] is None else titled("relay", path["relay"]),
         "condition": words.condition(path) if is_up else "unknown",
         "state": words.path_state(path) if is_up else "no link",
         "carries": words.carried(path),
