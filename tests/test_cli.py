@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import shutil
 import subprocess
 import sys
@@ -120,6 +121,24 @@ def test_a_wrong_command_line_gives_status_2(arguments: list[str]) -> None:
     assert status == WRONG
 
 
+@pytest.mark.parametrize(("words", "meant"), [("stauts", "status"), ("fleet lst", "list"), ("peer lits", "list")])
+def test_a_misspelt_command_is_named(words: str, meant: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """As in a file."""
+    with pytest.raises(SystemExit) as ended:
+        main(words.split())
+    assert ended.value.code == WRONG
+    assert f"there is no '{words.rpartition(' ')[2]}': did you mean '{meant}'?" in capsys.readouterr().err
+
+
+def test_help_is_a_command(capsys: pytest.CaptureFixture[str]) -> None:
+    """Of all commands, or of one."""
+    for words, option in (["help"], "--version"), (["help", "fleet", "sign"], "--replace"):
+        with pytest.raises(SystemExit) as ended:
+            main(words)
+        assert ended.value.code == OK
+        assert option in capsys.readouterr().out
+
+
 def test_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
     """``--version`` prints it and that of the protocol, which must be equal at both ends, with status 0."""
     with pytest.raises(SystemExit) as ended:
@@ -167,6 +186,12 @@ def test_check_reads_a_services_keys_from_their_folder(tmp_path: Path, capsys: p
     assert main(["check", "--config", str(path), "--keys", str(tmp_path / "absent")]) == WRONG
     assert "--keys" in capsys.readouterr().err
     assert main(["check", "--config", str(path), "--keys", str(tmp_path / "keys")]) == OK
+    assert capsys.readouterr().out.startswith("warning: "), "before the tables"
+    assert main(["check", "--config", str(path), "--json"]) == WRONG
+    assert "drone0.key" in json.loads(capsys.readouterr().out)["errors"][0]
+    assert main(["check", "--config", str(path), "--keys", str(tmp_path / "keys"), "--json"]) == OK
+    facts = json.loads(capsys.readouterr().out)
+    assert (facts["errors"], len(facts["warnings"])) == ([], 1)
 
 
 def test_status_needs_only_the_control_socket_of_a_configuration(

@@ -6,18 +6,21 @@ Exit status 0: success. 1: failure; the reason is on standard error. 2: the comm
 from __future__ import annotations
 
 import argparse
+import json
 import os
+import re
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from difflib import get_close_matches
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from uavlinkd import __version__
 from uavlinkd.core.constants import PROTOCOL_NAME
 from uavlinkd.fleet.commands import add_parser as add_fleet
 from uavlinkd.ops.commands import add_parsers as add_daemon_commands
-from uavlinkd.system.terminal import FAILED, OK, CommandError, UsageError, printable
+from uavlinkd.system.terminal import FAILED, OK, WRONG, CommandError, UsageError, add_json, printable
 from uavlinkd.web.commands import add_parser as add_web
 
 _LINE_LIMIT = 4096
@@ -117,10 +120,18 @@ class _Parser(argparse.ArgumentParser):
             self._fill = None
         return super().parse_known_args(args, namespace)
 
+    def error(self, message: str) -> NoReturn:
+        """End the process. A command that is misspelt is named as it is spelt."""
+        if match := re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message):
+            written, words = match.groups()
+            if likely := get_close_matches(written, re.findall(r"[\w-]+", words), 1):
+                message = f"{message[: match.start()]}there is no {written!r}: did you mean {likely[0]!r}?"
+        super().error(message)
+
 
 def make_parser() -> argparse.ArgumentParser:
     """The parser of ``uavlinkd``. The commands of the laboratory have no arguments before ``fill_by_lab``."""
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="uavlinkd",
         description="Carry MAVLink between drones over an authenticated link. An attacker on the network cannot "
         "forge, alter, replay or redirect a frame.",
@@ -150,6 +161,7 @@ def make_parser() -> argparse.ArgumentParser:
     check.add_argument(
         "--elsewhere", action="store_true", help="the file is for another machine: do not look at this one"
     )
+    add_json(check)
 
     keygen = add("keygen", _keygen, "make a private key and print its public key")
     keygen.add_argument(
@@ -161,6 +173,9 @@ def make_parser() -> argparse.ArgumentParser:
 
     psk = add("psk", _psk, "make a pre-shared key for one pair of peers")
     psk.add_argument("--out", metavar="FILE", type=Path, help="write it to FILE (mode 0600) instead of stdout")
+
+    help_ = add("help", _help, "show the commands, or the options of one")
+    help_.add_argument("words", metavar="COMMAND", nargs="*")
 
     for name, text in OF_THE_LABORATORY.items():
         commands.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.", fill=fill_by_lab)
@@ -174,6 +189,11 @@ def fill_by_lab(parser: argparse.ArgumentParser) -> None:
     from uavlinkd.lab.commands import add_arguments
 
     add_arguments(parser)
+
+
+def _help(options: argparse.Namespace) -> int:
+    make_parser().parse_args([*options.words, "--help"])
+    return OK
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -215,15 +235,26 @@ def _run(options: argparse.Namespace) -> int:
 def _check(options: argparse.Namespace) -> int:
     from uavlinkd.config.keys import CREDENTIALS
     from uavlinkd.config.load import load_config
+    from uavlinkd.config.model import ConfigError
     from uavlinkd.ops.surroundings import look_around
     from uavlinkd.ops.topology import print_topology
 
     if options.keys is not None and not (options.keys.is_dir() and os.access(options.keys, os.R_OK | os.X_OK)):
         raise UsageError(f"--keys: {options.keys} is not a readable folder")
     environ = os.environ if options.keys is None else {CREDENTIALS: str(options.keys.absolute())}
-    config = load_config(options.config, environ)
+    try:
+        config = load_config(options.config, environ)
+    except ConfigError as error:
+        if not options.json:
+            raise
+        print(json.dumps({"errors": list(map(str, error.problems))}))
+        return WRONG
     here = None if options.elsewhere else look_around(config)
-    print_topology(config, here)
+    if options.json:
+        errors, lacks = ([], []) if here is None else (here.errors, here.lacks)
+        print(json.dumps({"errors": errors, "warnings": config.warnings, "this_machine": lacks}))
+    else:
+        print_topology(config, here)
     return FAILED if here is not None and here.errors else OK
 
 

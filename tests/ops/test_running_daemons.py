@@ -53,7 +53,9 @@ def status(name: str, state: str = "up") -> dict[str, Any]:
     return status_of({"drone1": peer(state, public_key="A=")}, name=name)
 
 
-@pytest.mark.parametrize("command", ["status", "status --json", "peer list", "netcheck", "reload", "ping d"])
+@pytest.mark.parametrize(
+    "command", ["status", "status --json", "peer list", "netcheck --json", "reload", "ping d --count 1 --json"]
+)
 @pytest.mark.parametrize("answer", [{}, {"frames_pass": 1, "peers": 7}, {"relays": [], "problems": 5, "paths": "x"}])
 def test_answer_of_another_form_ends_a_command_with_a_sentence(
     daemons: Daemons, capsys: pytest.CaptureFixture[str], command: str, answer: dict[str, Any]
@@ -95,6 +97,9 @@ def test_several_daemons_are_shown_one_after_another(daemons: Daemons, capsys: p
     assert [json.loads(line)["name"] for line in capsys.readouterr().out.splitlines()] == names
     assert main(["peer", "list"]) == OK
     lines = capsys.readouterr().out.splitlines()
+    assert main(["peer", "list", "--json"]) == OK
+    peers = [json.loads(line)["peers"] for line in capsys.readouterr().out.splitlines()]
+    assert peers[1:] == [{"drone1": {"public_key": "A=", "state": state}} for state in ("up", "waiting")]
     assert [line for line in lines if line.endswith(":")] == [f"{name}:" for name in names]
 
 

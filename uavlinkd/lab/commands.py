@@ -41,7 +41,9 @@ def _add_demo(demo: argparse.ArgumentParser) -> None:
     demo.add_argument("--seconds", type=float, metavar="N", help="of traffic (default: 15, or 3 for each attack)")
     attacked = demo.add_mutually_exclusive_group()
     attacked.add_argument(
-        "--web", action="store_true", help="until Ctrl-C, show a daemon's page in a browser, with buttons that attack"
+        "--web",
+        action="store_true",
+        help="until q or Ctrl-C, show a daemon's page in a browser, with buttons that attack",
     )
     attacked.add_argument(
         "--attack",

@@ -15,7 +15,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
 
-from uavlinkd.system.terminal import FAILED, OK, CommandError, UsageError, printable
+from uavlinkd.system.terminal import FAILED, OK, CommandError, UsageError, add_json, printable
 
 RUNTIME_FOLDER: Final = Path("/run/uavlinkd")  # where the systemd units put the control sockets
 SOCKET_NAME: Final = "control.sock"
@@ -28,10 +28,11 @@ def add_parsers(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     )
     form = status.add_mutually_exclusive_group()
     form.add_argument("--watch", action="store_true", help="refresh each second until interrupted")
-    form.add_argument("--json", action="store_true", help="print everything as JSON, one line per daemon")
+    add_json(form)
     for_daemon(commands, "reload", _reload, "make a daemon read its configuration again")
     peer = for_daemon(commands, "peer", _peer_list, "list a daemon's peers and their keys")
     peer.add_argument("action", choices=["list"])
+    add_json(peer)
     ping = for_daemon(
         commands, "ping", _ping, "ask along each path to a peer, and show which answer and carry frames"
     )
@@ -39,7 +40,9 @@ def add_parsers(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     ping.add_argument(
         "--count", metavar="N", type=int, default=5, help="questions, one a second (default: %(default)s)"
     )
-    for_daemon(commands, "netcheck", _netcheck, "show whether UDP gets out, how relays see this machine, and its NAT")
+    add_json(ping)
+    text = "show whether UDP gets out, how relays see this machine, and its NAT"
+    add_json(for_daemon(commands, "netcheck", _netcheck, text))
     report = for_daemon(
         commands, "report", _report, "write one file for a support request, without keys and addresses"
     )
@@ -214,14 +217,17 @@ def _ping(options: argparse.Namespace) -> int:
     if options.count < 1:
         raise UsageError("--count must be 1 or more")
     with _of_this_version():
-        return OK if ping(lambda: ask(socket, f"ping {options.peer}"), options.count) else FAILED
+        answered = ping(lambda: ask(socket, f"ping {options.peer}"), options.count, as_json=options.json)
+        return OK if answered else FAILED
 
 
 def _netcheck(options: argparse.Namespace) -> int:
     from uavlinkd.ops.netcheck import folded, report
 
     def show(answer: dict[str, Any]) -> int:
-        for line in report(answer):
+        if options.json:
+            print(json.dumps(answer))
+        for line in () if options.json else report(answer):
             print(folded(printable(line)))
         return OK if any(relay["state"] == "up" for relay in answer["relays"].values()) else FAILED
 
@@ -247,10 +253,17 @@ def _peer_list(options: argparse.Namespace) -> int:
     from rich.console import Console
 
     from uavlinkd.ops.status_screen import render_peers
+    from uavlinkd.ops.status_words import peers_of
 
     console, sockets = Console(), control_sockets(options)
 
     def show(status: dict[str, Any]) -> int:
+        if options.json:
+            peers = {
+                name: {key: peer[key] for key in ("public_key", "state")} for name, peer in peers_of(status).items()
+            }
+            print(json.dumps({"name": status["name"], "peers": peers}))
+            return OK
         if len(sockets) > 1:
             console.print(f"{status['name']}:", style="bold", markup=False, highlight=False)
         console.print(render_peers(status))

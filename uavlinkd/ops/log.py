@@ -41,8 +41,8 @@ def order_fields(_: object, __: str, event: EventDict) -> EventDict:
 
 
 def order_for_terminal(_: object, __: str, event: EventDict) -> EventDict:
-    """Sort the fields, omit empty ones, and put ``text`` and ``remedy`` last, as a processor of structlog."""
-    fields = [*sorted(event.keys() - set(_SENTENCES)), *(field for field in _SENTENCES if field in event)]
+    """Put ``text`` and ``remedy`` first, sort the others, and omit empty ones, as a processor of structlog."""
+    fields = [*(field for field in _SENTENCES if field in event), *sorted(event.keys() - set(_SENTENCES))]
     return {field: event[field] for field in fields if event[field] != ""}
 
 

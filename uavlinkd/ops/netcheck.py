@@ -6,6 +6,7 @@ another port; what they cannot show is reported as unknown.
 
 from __future__ import annotations
 
+import json
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -23,7 +24,7 @@ INTERVAL_S: Final = 1.0  # between the questions of `ping`
 Answer = Mapping[str, Any]
 
 
-def ping(ask: Callable[[], Answer], count: int) -> bool:
+def ping(ask: Callable[[], Answer], count: int, *, as_json: bool = False) -> bool:
     """Ask along every path ``count`` times, a second apart, and print a line for each answer that came or did not.
 
     ``ask`` sends the questions, and returns the paths as they were before. Returns whether the last question was
@@ -38,6 +39,9 @@ def ping(ask: Callable[[], Answer], count: int) -> bool:
         times = [path["answered_s"] for path in paths]
         answers = [time_s is not None and time_s < 1.5 * INTERVAL_S for time_s in times]
         answered = any(answers)
+        if as_json:
+            print(json.dumps({"number": number, "paths": paths}), flush=True)
+            continue
         for path, address, is_answered in zip(paths, addresses(paths), answers, strict=True):
             no_answer = "not connected" if path["reason"] == "closed" else "no answer"
             facts = [

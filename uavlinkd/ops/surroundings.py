@@ -62,7 +62,8 @@ class Surroundings(NamedTuple):
 def look_around(config: Config) -> Surroundings:
     answers = _look_up_names(config)
     networks = look_at_networks(config, answers)
-    others = _serial(config), _addresses(config), _names(config, answers), _control_socket(config)
+    here = _own_addresses(config, answers), _names(config, answers)
+    others = _serial(config), _addresses(config), *here, _control_socket(config)
     errors = [*_broadcasts(config, answers), *networks.errors]
     return networks._replace(lacks=[*chain(*others), *networks.lacks], errors=errors)
 
@@ -126,6 +127,16 @@ def _names(config: Config, answers: Answers) -> Iterator[str]:
                 f"{section}: {address.host} has no address here now: see `getent hosts {address.host}`, or"
                 f' write an IP address, such as "10.13.0.2:{address.port}"'
             )
+
+
+def _own_addresses(config: Config, answers: Answers) -> Iterator[str]:
+    """Peers, relays and clients whose address is this daemon's."""
+    ports = {address.port for address in config.listen}
+    for section, address in _named(config):
+        if address.port in ports and any(
+            look(None, host).hosts for host in answers.get(address.host, [address.host])
+        ):
+            yield f"{section}: {address} is an address of this daemon itself: write that of the other machine"
 
 
 def _broadcasts(config: Config, answers: Answers) -> Iterator[str]:

@@ -33,7 +33,7 @@ def print_topology(config: Config, here: Surroundings | None = None, console: Co
     """Print the topology: with colours on a terminal, as plain text elsewhere. ``here``: what this machine has.
 
     Users compare and copy keys and URLs, so none is broken: a table may be wider than the terminal. In a pipe, each
-    row, error and warning is one line, for ``grep``; only policies are folded.
+    row, error and warning is one line, for ``grep``; only policies are folded. What is wrong comes first.
     """
     if console is None:
         console = Console()
@@ -41,7 +41,7 @@ def print_topology(config: Config, here: Surroundings | None = None, console: Co
     columns, is_plain = console.width, not console.is_terminal
     printer = Console(no_color=True, force_terminal=False) if is_plain else console
     wide = printer.options.update(width=_MOST_COLUMNS)
-    for parts, folds in ((facts, False), (policies, True), ([verdict], False)):
+    for parts, folds in (([verdict], False), (facts, False), (policies, True)):
         for part in parts:
             needed = Measurement.get(printer, wide, part)
             printer.width = columns if folds else max(columns, needed.maximum if is_plain else needed.minimum)
@@ -226,13 +226,13 @@ def _verdict(warnings: Sequence[str], here: Surroundings | None) -> RenderableTy
     lines += [("warning:", warning) for warning in warnings]
     lines += [("this machine:", lack) for lack in (here.lacks if here else ())]
     if not lines:
-        return Text("\nNo warnings.", style="green")
+        return Text("No warnings.\n", style="green")
     table = Table.grid(padding=(0, 1))
     table.add_column(no_wrap=True)
     table.add_column(overflow="fold")
     for label, line in lines:
         table.add_row(Text(label, style="bold red" if label == "error:" else "bold yellow"), Text(line))
-    return Padding(table, (1, 0, 0, 0), expand=False)
+    return Padding(table, (0, 0, 1, 0), expand=False)
 
 
 # Policies, for a review.

@@ -42,7 +42,7 @@ async def page(*arguments: str, folder: Path) -> AsyncIterator[tuple[asyncio.sub
     async with demo("--web", *arguments, folder=folder) as process:
         assert process.stdout is not None
         line = (await asyncio.wait_for(process.stdout.readline(), ENDED_S)).decode()
-        url = line.removeprefix("the page is at ").removesuffix(" until Ctrl-C\n")
+        url = line.removeprefix("the page is at ").removesuffix(" until q or Ctrl-C\n")
         assert urlsplit(url).hostname == "127.0.0.1", line
         yield process, url
 

@@ -44,7 +44,7 @@ async def serve(demo: Demo, done_at: float) -> None:
     attacks = _Attacks(demo)
     control_socket = demo.stage.drones[NAMES[0]].socket
     with Page(control_socket, Address(HOST, 0), more=attacks.routes()) as page:
-        print(f"the page is at {page.url} until Ctrl-C", flush=True)
+        print(f"the page is at {page.url} until q or Ctrl-C", flush=True)
         if os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
             Thread(target=_open_browser, args=[page.url], daemon=True).start()  # it may last as long as the browser
         async with asyncio.TaskGroup() as tasks:
@@ -67,7 +67,7 @@ class _Attacks:
         self._wanted: str | None = None
 
     async def run(self, done_at: float) -> None:
-        while monotonic() < done_at:
+        while monotonic() < done_at and not self._demo.is_ended:
             await self._demo.until(done_at, lambda: self._wanted is not None)
             if self._wanted is not None:
                 await self._demo.attack(self._choice[self._wanted][1], ATTACK_S)
