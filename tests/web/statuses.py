@@ -29,6 +29,7 @@ def overview(names: Iterable[str] = ("drone1",), **facts: object) -> Status:
         "networks": {},
         "endpoints": {},
         "drops": {},
+        "faults": {},
         "stale": {},
         "unrouted": {},
         "send_failures": {},

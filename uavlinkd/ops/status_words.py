@@ -47,7 +47,11 @@ _SHOWN_NAMES: Final = 8
 
 
 _ABSENT: Final[Mapping[str, object]] = {
-    **{"state": "waiting", "path": None, "last_received_s": None, "round_trip_s": None, "paths": ()},
+    "state": "waiting",
+    "path": None,
+    "last_received_s": None,
+    "round_trip_s": None,
+    "paths": (),
     **dict.fromkeys(("loss_in", "loss_out", "bytes_in_s", "bytes_out_s"), 0.0),
 }
 """The facts of a peer that has not come yet."""
