@@ -51,8 +51,7 @@ class EarlyFrames:
         """What is delivered when an envelope arrives."""
         waiting = self._waiting
         due_at = self._due_at(arrived.path, now)
-        is_after = bool(waiting) and arrived.order > waiting[0].order
-        if due_at > now and (is_after or not (waiting or self._is_next(arrived))):
+        if due_at > now and (arrived.order > waiting[0].order if waiting else not self._is_next(arrived)):
             waiting.append(arrived._replace(due_at=due_at))
             waiting.sort(key=itemgetter(0))
             return [] if len(waiting) < c.EARLY_ENVELOPES else self.release(c.NEVER)

@@ -95,14 +95,13 @@ def receive_envelope(
             out += probing.update(peer, now)
     if not payload:
         return out
-    is_along_best = False
-    if payload[0] < wire.FRAMES_FROM:
+    is_along_best = payload[0] < wire.FRAMES_FROM  # if frames follow: a probe is in front of them
+    if is_along_best:
         arrived = Arrived(peer, session, counter, state, now, is_new, is_superseded)
         controlled, payload = _receive_control(arrived, payload)
         out += controlled
         if not payload:
             return out
-        is_along_best = True  # a probe in front of frames
     early = peer.early
     traffic.out_of_order += (
         counter < session.window.highest if early is None else session.order_base + counter < early.highest
