@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.admitting import AdmittingNode
 from tests.authority.signing import AUTHORITY, CERTIFICATE, FLEET, SIGNER, published, signed
 from tests.core.harness import (
     AT_A,
@@ -45,6 +46,7 @@ from uavlinkd.core.crypto import AuthorityKey, Secret
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import PeerAdmitted, PeerExpired, PeerUp, RecordReceived
+from uavlinkd.core.peer import Peer
 from uavlinkd.core.relay_records import BulletinRecord, CertificateRecord, Have, Who, parse_record
 from uavlinkd.core.settings import PeerSettings
 
@@ -213,7 +215,7 @@ class Fleet:
         node_a = Node(Secret(KEY_A._private.private_bytes_raw()), seeded(1), 0.0)
         node_a.set_certificate(b"?" * 100)
         node_a.add_peer(PeerSettings("bravo", KEY_B.public, None, link, is_certified=True), 0.0)
-        node_b = Node(Secret(KEY_B._private.private_bytes_raw()), seeded(2), 0.0, admit=self.admit)
+        node_b = AdmittingNode(Secret(KEY_B._private.private_bytes_raw()), seeded(2), 0.0, admit=self.admit)
         self.settings = PeerSettings("alpha", KEY_A.public, None, link, is_certified=True)
         self.a, self.b = Side(node_a, AT_A, "bravo", AT_B), Side(node_b, AT_B, "alpha", AT_A)
         node_a.set_certificate(signed(CERTIFICATE, KEY_A.public))
@@ -239,14 +241,16 @@ def test_peer_by_certificate() -> None:
     initiation = fleet.initiation(0.0)
     assert len(initiation) == LONG
     response = only(datagrams(fleet.b.receive(initiation, 0.0)))
-    assert fleet.b.peer.provisional_until == c.UNCONFIRMED_LIFETIME_S
-    assert not fleet.b.peer.is_up
+    peer = fleet.b.node.find(KEY_A.public)
+    assert peer is not None
+    assert peer.provisional_until == c.UNCONFIRMED_LIFETIME_S
+    assert not peer.is_up
     assert fleet.b.node.facts.peers == 0
-    assert fleet.b.node.find(KEY_A.public) is fleet.b.peer
+    assert not fleet.b.node.peers
     confirmed = exchange(fleet.b, fleet.a, fleet.a.receive(response, 0.1), 0.1)
     events = [type(out) for out in confirmed if isinstance(out, PeerAdmitted | PeerUp)]
     assert events == [PeerAdmitted, PeerUp]
-    fleet.b.node.accept(fleet.b.peer)
+    assert fleet.b.peer is peer
     assert fleet.b.node.facts.peers == 1
     fleet.b.timeout(20.0)
     assert fleet.b.node.peers["alpha"].is_up
@@ -278,10 +282,6 @@ def test_refused_certificate(reason: DropReason) -> None:
     initiation = fleet.initiation(0.0)
     assert reasons(fleet.b.receive(initiation, 0.0)) == [reason]
     assert not fleet.b.node.peers
-    other = fleet.b.node.add_peer(PeerSettings("alpha", KEY_C.public), 0.0)
-    fleet.refused = None
-    assert reasons(fleet.b.receive(fleet.initiation(1.0), 1.0)) == [DropReason.MEMBER_CONFLICT]
-    fleet.b.node.remove_peer(other, 1.0)
     plain = Node(Secret(KEY_B._private.private_bytes_raw()), seeded(3), 0.0)
     assert reasons(plain.receive(initiation, AT_A, 0.0)) == [DropReason.UNKNOWN_PEER]
 
@@ -293,8 +293,29 @@ def test_pinned_peer_does_not_need_its_certificate() -> None:
     fleet.refused = DropReason.CERTIFICATE_REVOKED
     fleet.b.node.set_certificate(b"?" * 100)
     assert fleet.b.peer.initiator.certificate == b""
-    assert datagrams(fleet.b.receive(fleet.initiation(0.0), 0.0), wire.RESPONSE)
+    response = only(datagrams(fleet.b.receive(fleet.initiation(0.0), 0.0), wire.RESPONSE))
+    assert not of(exchange(fleet.b, fleet.a, fleet.a.receive(response, 0.1), 0.1), PeerAdmitted)
     assert fleet.shown == []
+
+
+def test_a_member_with_a_new_key_takes_the_name_when_it_is_there() -> None:
+    """A replayed initiation of it changes nothing for the peer that has the name."""
+    fleet = Fleet()
+    assert isinstance(fleet.b.node, AdmittingNode)
+    fleet.b.node.accepts = False
+    former = fleet.b.node.add_peer(PeerSettings("alpha", KEY_C.public, is_certified=True), 0.0)
+    response = only(datagrams(fleet.b.receive(fleet.initiation(0.0), 0.0)))
+    assert fleet.b.peer is former
+    (confirmation,) = datagrams(fleet.a.receive(response, 0.1))
+    (admitted,) = of(fleet.b.receive(confirmation, 0.1), PeerAdmitted)
+    assert admitted.certificate == signed(CERTIFICATE, KEY_A.public)
+    assert isinstance(admitted.peer, Peer)
+    with pytest.raises(ValueError, match="is there already"):
+        fleet.b.node.accept(admitted.peer)
+    assert fleet.b.node.is_provisional(admitted.peer)
+    fleet.b.node.remove_peer(former, 0.1, closes=False)
+    fleet.b.node.accept(admitted.peer)
+    assert fleet.b.peer is admitted.peer
 
 
 def test_certificate_is_shown_again_without_answers() -> None:

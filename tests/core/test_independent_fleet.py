@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
 
+from tests.admitting import AdmittingNode
 from tests.core import fleet_vectors, independent_fleet
 from tests.core.independent import MLKEM768, X25519, Initiator, Parameters, Responder
 from uavlinkd.core import constants as c
@@ -26,7 +27,6 @@ from uavlinkd.core.certificates import (
 )
 from uavlinkd.core.cookie import MacKeys
 from uavlinkd.core.crypto import AuthorityKey, KeyPair, Secret
-from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import PeerAdmitted, PeerUp, RecordReceived, Transmit
 from uavlinkd.core.path import Path
 from uavlinkd.core.relay_records import BulletinRecord, CertificateRecord, Have, Record, Who, parse_record
@@ -106,13 +106,16 @@ def test_independent_initiator_shows_its_certificate(suite: int) -> None:
         assert (shown_key, shown) == (key, certificate)
         return PeerSettings("v", key, None, link, is_certified=True)
 
-    node = Node(Secret(NODE_KEY), random.Random(7).randbytes, 0.0, admit=admit)
+    node = AdmittingNode(Secret(NODE_KEY), random.Random(7).randbytes, 0.0, admit=admit)
     initiator = Initiator(static, node.public_key, suite=suite, parameters=Parameters(features=FEATURES))
     (response,) = node.receive(initiator.initiation(certificate=certificate), HERE, 1.0)
     assert isinstance(response, Transmit)
     session = initiator.read_response(response.datagram)
     events = [type(output) for output in node.receive(session.seal(b""), HERE, 1.0)]
     assert PeerAdmitted in events
+    peer = node.find(key)
+    assert peer is not None
+    node.accept(peer)
     assert PeerUp in events
     bulletin = bytes.fromhex(VECTORS["bulletins"][-1]["bytes"])
     sent = session.seal_record(independent_fleet.bulletin_record(bulletin))

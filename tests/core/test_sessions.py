@@ -33,7 +33,7 @@ def session(index: int, generation: int = 1, *, initiator: bool = True) -> Sessi
 def unconfirmed(index: int, *, is_expected: bool = False) -> Unconfirmed:
     """A session that waits for its first envelope."""
     waiting = session(index, initiator=False)
-    return Unconfirmed(waiting, bytes(16), 147, bytes(60), [PATH], is_expected, bytes(16), 10.0)
+    return Unconfirmed(waiting, bytes(16), 147, bytes(60), [PATH], is_expected, bytes(16), 10.0, b"")
 
 
 @pytest.fixture

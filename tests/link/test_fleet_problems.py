@@ -65,7 +65,7 @@ class Member(Daemon):
     def shows(self, key: bytes, signed: str) -> None:
         """An initiation shows this certificate, from an unknown address."""
         with pytest.raises(Drop) as drop:
-            self.fleet.admit(key, b64decode(signed), self.now)
+            self.fleet.judge(key, b64decode(signed), self.now)
         refused = Dropped(drop.value.reason, None, NetPath(0, STRANGER), 1, drop.value.detail)
         self.evidence.add_dropped(refused, self.now)
 
@@ -99,7 +99,7 @@ async def test_unknown_key_is_not_of_the_member_at_its_address(tmp_path: Path) -
     member, tablet = Member(tmp_path, news=bulletin(2, 9)), bytes([9]) * 32
     member.link.config = replace(member.link.config, settings=replace(member.link.config.settings, is_certified=True))
     member.shows(C, certificate(name="v9", ids=(9, 9), key=KEY["c"], serial=9))
-    member.fleet.admit(D, b64decode(certificate(name="v8", ids=(8, 8), key=KEY["d"], serial=8)), member.now + 99)
+    member.fleet.trust.hold(D, b64decode(certificate(name="v8", ids=(8, 8), key=KEY["d"], serial=8)))
     member.dropped(DropReason.UNKNOWN_PEER, STRANGER, C)
     assert set(member.findings()) == {"certificate_revoked"}
     member.now, member.link.peer.is_up = NOW + 1, False
@@ -118,11 +118,11 @@ async def test_first_second_of_a_start(tmp_path: Path) -> None:
     member = Member(tmp_path, more='operator = "pinned"', contacts=contact(), relay=SimpleNamespace())
     now, vehicle = monotonic(), b64decode(certificate(name="v9", ids=(9, 9), key=KEY["c"], serial=9))
     with pytest.raises(Drop) as drop:
-        member.fleet.admit(C, vehicle, now)
+        member.fleet.judge(C, vehicle, now)
     assert drop.value.reason is DropReason.BULLETIN_AWAITED
     operator = certificate(MemberRole.OPERATOR, "tablet", (250, 250), key=KEY["d"], serial=12)
-    assert member.fleet.admit(D, b64decode(operator), now).name.endswith("tablet")
-    assert member.fleet.admit(C, vehicle, now + CONTACTS_FIRST_S).name == "v9"
+    assert member.fleet.judge(D, b64decode(operator), now).name.endswith("tablet")
+    assert member.fleet.judge(C, vehicle, now + CONTACTS_FIRST_S).name == "v9"
 
 
 async def test_own_key_with_a_certificate_elsewhere(tmp_path: Path) -> None:

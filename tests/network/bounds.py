@@ -39,7 +39,7 @@ LIMITS: dict[str, int] = {
 
 def measure(node: Node) -> Sizes:
     """The size of every table."""
-    peers = node.peers.values()
+    peers = node._handshakes.peers.values()
     sessions = [session for peer in peers for session in peer.sessions.confirmed]
     histories = [part for session in sessions for part in (session._received_history, session._sent_history)]
     waiting = [waiting for peer in peers for waiting in peer.sessions.unconfirmed.values()]
@@ -88,14 +88,16 @@ def check(node: Node) -> Sizes:
     sizes = measure(node)
     for table, size in sizes.items():
         assert size <= LIMITS[table], f"{table}: {size} are more than {LIMITS[table]}"
-    peers = node.peers.values()
+    peers = node._handshakes.peers.values()
     owners = node._indices.owners
     held = sum(len(p.initiator.pending) + len(p.sessions.unconfirmed) + len(p.sessions.confirmed) for p in peers)
     assert len(owners) == held, f"{len(owners)} indices are owned, {held} by a peer"
-    assert all(node.peers.get(peer.name) is peer for peer, _ in owners.values()), "a removed peer owns an index"
+    assert all(node.find(peer.settings.public_key) is peer for peer, _ in owners.values()), (
+        "a removed peer owns an index"
+    )
     assert not owners.keys() & node._indices._quarantine.keys(), "an index in quarantine is in use"
     assert len(node._handshakes.remembered) == sum(len(peer.remembered) for peer in peers)
-    assert len(node._handshakes.peers) == len(node.peers)
+    assert len(node._handshakes.peers) == len(node.peers) + len(node._provisional)
     assert all(node.peers.get(peer.name) is peer for peer in node._by_address.values())
     proven = [state.path.place for peer in peers for state in peer.paths.states if state.is_known]
     assert node._last_seen == Counter(proven), f"{node._last_seen} are known, {proven} are proven"

@@ -86,7 +86,6 @@ class CertifiedDrone(Drone):
     def _admit(self, key: bytes, data: bytes, now: float) -> PeerSettings:
         del now
         certificate = self.trust.judge(key, data)
-        assert not self.trust.hold(key, data)
         return PeerSettings(certificate.name, key, None, _LINK, is_certified=True)
 
     def on_event(self, event: o.Event) -> None:
@@ -94,10 +93,11 @@ class CertifiedDrone(Drone):
         assert isinstance(peer, Peer)
         key, now = peer.settings.public_key, self.local_now
         match event:
-            case o.PeerAdmitted():
+            case o.PeerAdmitted(certificate=data):
+                assert not self.trust.hold(key, data)
+                assert self.node is not None
+                self.node.accept(peer)
                 self._know(self._world.drones[peer.name])
-            case o.PeerExpired():
-                self.trust.held.pop(key, None)
             case o.SessionEstablished() | o.PeerUp() if peer.session_with(c.FEATURE_FLEET, now) is not None:
                 self.exchange.on_handshake(key, now)
             case o.PeerLost() | o.PeerClosed():

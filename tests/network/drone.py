@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from random import Random
 from typing import TYPE_CHECKING
 
+from tests.admitting import Admit, AdmittingNode
 from tests.network.air import Address, Endpoint, Hop
 from tests.network.bounds import Sizes, check
 from tests.network.nat import Nat
@@ -21,7 +22,7 @@ from uavlinkd.core.path_measures import limit_at
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.refusals import Refused
 from uavlinkd.core.session import Session
-from uavlinkd.core.settings import Admit, Link, PeerSettings
+from uavlinkd.core.settings import Link, PeerSettings
 
 if TYPE_CHECKING:
     from tests.network.network import Network
@@ -228,7 +229,7 @@ class Drone:
             self.clock = clock - self._world.now
         now = self.local_now
         entropy = Random(self._world.rng.randbytes(16))
-        self.node = Node(
+        self.node = AdmittingNode(
             Secret(self.private_key), entropy.randbytes, now, screen=self._world.screen, admit=self.on_certificate
         )
         self.node.set_metered(self.metered_sockets, self.local_now)

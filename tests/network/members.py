@@ -98,7 +98,7 @@ class Relay(Drone):
 
     def _admit(self, key: bytes, certificate: bytes, now: float) -> PeerSettings:
         assert self.trust is not None
-        self.trust.hold(key, certificate)
+        self.trust.judge(key, certificate)
         return PeerSettings(self.members[key], key, None, LINK, is_certified=True)
 
     def has_asked(self, name: str, other: str) -> bool:
@@ -156,6 +156,9 @@ class Relay(Drone):
             assert self.trust is not None
             assert isinstance(event.peer, Peer)
             settings = event.peer.settings
+            self.trust.hold(settings.public_key, event.certificate)
+            assert self.node is not None
+            self.node.accept(event.peer)
             member, held = MemberSettings(settings, MOST_PEERS, _LIMITS), self.trust.held[settings.public_key]
             self.service.admit(event.peer, member, held, self.local_now, is_own=True)
         self.service.on_event(event, self.local_now)

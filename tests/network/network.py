@@ -20,7 +20,7 @@ from tests.network.flow import FRAME_BYTES, Flow, FlowKey, Sequence, class_in, e
 from tests.network.serial_line import SIK, SerialLine
 from uavlinkd.core import wire
 from uavlinkd.core.constants import PROBLEMS_PER_REPORT, REFUSALS_KEPT
-from uavlinkd.core.outputs import Deliver, Dropped, Output, RecordReceived, Transmit
+from uavlinkd.core.outputs import CertificateShown, Deliver, Dropped, Output, RecordReceived, Transmit
 from uavlinkd.core.path import SERIAL_HOST, Path
 from uavlinkd.core.refusals import Refused
 from uavlinkd.core.settings import Class, Link, Screen, hold_all
@@ -372,6 +372,8 @@ class Network:
                     drone.drops[reason] += number
                 case RecordReceived():
                     drone.on_record(output)
+                case CertificateShown():
+                    raise AssertionError("a drone's node decides at once")
                 case event:
                     assert event.peer.name not in drone.removed, event
                     drone.on_event(event)

@@ -21,7 +21,7 @@ from structlog.testing import LogCapture
 from tests.network.network import Drone, Network
 from tests.policies import TRUSTED
 from uavlinkd.config.model import PeerConfig
-from uavlinkd.core.outputs import Deliver, Dropped, Output, RecordReceived, Transmit
+from uavlinkd.core.outputs import CertificateShown, Deliver, Dropped, Output, RecordReceived, Transmit
 from uavlinkd.lab.mitm.radio import RadioSettings
 from uavlinkd.link.conditions import HOUR_S, LineLimits
 from uavlinkd.link.drop_summary import DropSummary
@@ -63,7 +63,7 @@ class LoggedDaemon:
         for output in outputs:
             if isinstance(output, Dropped):
                 self.drops.add_dropped(output, now)
-            elif not isinstance(output, Transmit | Deliver | RecordReceived):
+            elif not isinstance(output, Transmit | Deliver | RecordReceived | CertificateShown):
                 self.events.write(output, now)
 
     def tick(self, now: float) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable
 
+from tests.admitting import AdmittingNode
 from tests.authority.signing import AUTHORITY, FLEET, published, signed
 from tests.core.harness import of, quiet, seeded
 from uavlinkd.authority.constants import INTRODUCED_AFTER_S
@@ -111,7 +112,7 @@ class CertifiedRelay:
 
     def start(self) -> None:
         """Start, or start again without any memory."""
-        self.node = Node(Secret(PRIVATE), seeded(9), self.now, admit=self._admit)
+        self.node = AdmittingNode(Secret(PRIVATE), seeded(9), self.now, admit=self._admit)
         self.trust = Trust(AUTHORITY, self.node.public_key, b"", BULLETIN)
         shell = RelayShell(
             seeded(8),
@@ -144,7 +145,6 @@ class CertifiedRelay:
 
     def _admit(self, key: bytes, certificate: bytes, now: float) -> PeerSettings:
         judged = self.trust.judge(key, certificate)
-        self.trust.hold(key, certificate)
         return PeerSettings(judged.name, key, None, LINK, is_certified=True)
 
     def _perform(self, outputs: list[Output]) -> None:
@@ -154,6 +154,8 @@ class CertifiedRelay:
             elif isinstance(output, PeerAdmitted):
                 assert isinstance(output.peer, Peer)
                 settings = output.peer.settings
+                self.trust.hold(settings.public_key, output.certificate)
+                self.node.accept(output.peer)
                 held = self.trust.held[settings.public_key]
                 self.service.admit(output.peer, self.settings(settings), held, self.now, is_own=True)
             elif isinstance(output, RecordReceived):

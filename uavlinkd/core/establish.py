@@ -102,7 +102,9 @@ def answer(peer: Peer, received: Received, initiation: bytes, path: Path, now: f
     is_expected, expires_at = peer.paths.find(path) is not None, now + c.UNCONFIRMED_LIFETIME_S
     macs = mac1_of(initiation), mac1_of(datagram)
     twin = peer.sessions.twin(received.parameters.generation)
-    waiting = Unconfirmed(session, macs[0], len(initiation), response, [path], is_expected, macs[1], expires_at, twin)
+    facts = session, macs[0], len(initiation), response, [path], is_expected, macs[1], expires_at
+    certificate = received.certificate if peer.settings.is_certified else b""
+    waiting = Unconfirmed(*facts, certificate, twin)
     peer.sessions.wait(waiting)
     peer.indices.owners[index] = peer, session
     peer.set_expiry()
@@ -127,13 +129,14 @@ def _transmit_answer(peer: Peer, datagram: bytes, waiting: Unconfirmed, path: Pa
 # Both sides.
 
 
-def adopt(peer: Peer, session: Session, path: Path, now: float) -> list[Output]:
-    """A session is confirmed, by a datagram along this path. If it has the highest rank, traffic goes on it now."""
+def adopt(peer: Peer, session: Session, path: Path, now: float, certificate: bytes = b"") -> list[Output]:
+    """A session is confirmed, by a datagram along this path. If it has the highest rank, traffic goes on it now.
+
+    ``certificate``: that its initiation showed.
+    """
     is_rekey = peer.sessions.current is not None
-    admitted: list[Output] = []
-    if peer.provisional_until != c.NEVER:
-        peer.provisional_until = c.NEVER
-        admitted.append(PeerAdmitted(peer))
+    admitted: list[Output] = [PeerAdmitted(peer, certificate)] if certificate else []
+    peer.provisional_until = c.NEVER
     peer.indices.owners[session.local_index] = peer, session
     out = admitted + freshness.end(peer, peer.sessions.confirm(session, now))
     peer.initiator.cancel()

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 
 from uavlinkd.core import constants as c
 from uavlinkd.core import establish, probing, wire
@@ -19,18 +18,18 @@ from uavlinkd.core.cookie import CookieJar, MacKeys
 from uavlinkd.core.crypto import Entropy, KeyPair, Secret
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.initiator import Pending
-from uavlinkd.core.outputs import Deliver, Dropped, Output, PeerExpired
+from uavlinkd.core.outputs import CertificateShown, Deliver, Dropped, Output, PeerExpired
 from uavlinkd.core.path import Path, SocketAddress, SocketFacts
 from uavlinkd.core.peer import Peer, Shared
 from uavlinkd.core.probing import ask_candidates
 from uavlinkd.core.receive import receive_envelope
-from uavlinkd.core.receive_handshake import HandshakeReceiver
+from uavlinkd.core.receive_handshake import HandshakeReceiver, ShownInitiation
 from uavlinkd.core.refusals import Refused
 from uavlinkd.core.relay_records import FleetRecord, Record
 from uavlinkd.core.send import ask_for_echo, seal, send_frames
 from uavlinkd.core.session import Session
 from uavlinkd.core.sessions import Indices
-from uavlinkd.core.settings import Admit, Class, PeerSettings, Screen, hold_all
+from uavlinkd.core.settings import Class, PeerSettings, Screen, hold_all
 from uavlinkd.core.timeouts import handle_timeout
 from uavlinkd.core.timers import Schedule, Timer
 
@@ -41,8 +40,8 @@ PEERS_AT_ONCE = 8
 class Node:
     """All peers of one identity.
 
-    Without ``screen`` all frames must be new. Without ``admit`` no certificate is valid. ``most_admitted``: peers by
-    certificate.
+    Without ``screen`` all frames must be new. ``takes_certificates``: the shell decides on :class:`CertificateShown`.
+    ``most_admitted``: peers by certificate.
     """
 
     def __init__(
@@ -52,7 +51,7 @@ class Node:
         now: float,
         *,
         screen: Screen = hold_all,
-        admit: Admit | None = None,
+        takes_certificates: bool = False,
         most_admitted: int = 0,
     ) -> None:
         self._screen = screen
@@ -68,10 +67,9 @@ class Node:
         self._handshakes = HandshakeReceiver(identity, cookies, self._indices, admission, self.facts, self._schedule)
         self._certificate = b""
         self._provisional: set[Peer] = set()
-        if admit is not None:
-            self._handshakes.admit = partial(self._admit, admit)
+        self._handshakes.takes_certificates = takes_certificates
         self.peers: dict[str, Peer] = {}
-        """By name."""
+        """By name, without provisional ones: another peer may have the name until they prove themselves."""
         self.drops: Counter[DropReason] = Counter()
         """Datagrams that name no peer; those that name one are counted there."""
 
@@ -87,36 +85,52 @@ class Node:
 
         Raises ValueError: the name or the key is there already, or the key is ours.
         """
-        handshakes = self._handshakes
-        if settings.name in self.peers or settings.public_key in handshakes.peers:
+        if settings.name in self.peers or settings.public_key in self._handshakes.peers:
             raise ValueError(f"peer {settings.name} is there already")
         if settings.public_key == self.public_key:
             raise ValueError(f"peer {settings.name} has this daemon's own key")
-        shared = Shared(self._indices, self._entropy, self._screen, self._last_seen, self.facts)
-        peer = Peer(settings, handshakes.identity, shared, now)
-        self.peers[settings.name] = handshakes.peers[settings.public_key] = peer
+        peer = self.peers[settings.name] = self._made(settings, now)
         self._count_peers()
+        return peer
+
+    def _made(self, settings: PeerSettings, now: float) -> Peer:
+        shared = Shared(self._indices, self._entropy, self._screen, self._last_seen, self.facts)
+        peer = self._handshakes.peers[settings.public_key] = Peer(settings, self._handshakes.identity, shared, now)
         if settings.is_certified:
             peer.initiator.certificate = self._certificate
         return peer
 
-    def _admit(self, admit: Admit, public_key: bytes, certificate: bytes, now: float) -> Peer:
-        """The peer with this key that showed a certificate. A new one is provisional."""
-        settings = admit(public_key, certificate, now)
-        peer = self._handshakes.peers.get(public_key)
+    def admit(self, shown: CertificateShown, settings: PeerSettings, now: float) -> list[Output]:
+        """The certificate is valid: answer the initiation. A new peer is provisional: it ends without an envelope."""
+        assert isinstance(shown.initiation, ShownInitiation)
+        peer = self._handshakes.peers.get(shown.key)
         if peer is None:
-            if settings.name in self.peers:
-                raise Drop(DropReason.MEMBER_CONFLICT, settings.name)
-            peer = self.add_peer(settings, now)
+            peer = self._made(settings, now)
             self._provisional.add(peer)
-            self._count_peers()
             peer.provisional_until = now + c.UNCONFIRMED_LIFETIME_S
             peer.set_expiry()
             self._schedule.update(peer)
-        return peer
+        try:
+            return self._handshakes.answer(peer, shown.initiation, now)
+        except Drop as drop:
+            return [self.refuse_certificate(shown, drop)]
+
+    def refuse_certificate(self, shown: CertificateShown, drop: Drop) -> Dropped:
+        """The certificate is refused for this reason: count the initiation."""
+        assert isinstance(shown.initiation, ShownInitiation)
+        return self._count(shown.initiation.message.datagram, drop, shown.path)
+
+    def is_provisional(self, peer: Peer) -> bool:
+        """Whether a peer has not been accepted yet."""
+        return peer in self._provisional
 
     def accept(self, peer: Peer) -> None:
-        """A provisional peer proved itself, or the shell knows it from elsewhere: it stays."""
+        """A provisional peer proved itself, or the shell knows it from elsewhere: it stays.
+
+        Raises ValueError if another peer has its name: remove that one first.
+        """
+        if self.peers.setdefault(peer.name, peer) is not peer:
+            raise ValueError(f"peer {peer.name} is there already")
         peer.provisional_until = c.NEVER
         peer.set_expiry()
         self._provisional.discard(peer)
@@ -124,7 +138,7 @@ class Node:
 
     def _count_peers(self) -> None:
         # Without those that a replayed initiation can make: they must not slow down others.
-        self.facts.peers = len(self.peers) - len(self._provisional)
+        self.facts.peers = len(self.peers)
         self._handshakes.admission.set_peers(self.facts.peers)
 
     def set_certificate(self, certificate: bytes) -> None:
@@ -139,7 +153,8 @@ class Node:
 
         ``closes``: it gets a close.
         """
-        del self.peers[peer.name]
+        if self.peers.get(peer.name) is peer:
+            del self.peers[peer.name]
         self._provisional.discard(peer)
         self._count_peers()
         self._handshakes.forget(peer)

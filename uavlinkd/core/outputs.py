@@ -60,10 +60,29 @@ class Dropped(NamedTuple):
     detail: Detail = ""
 
 
+class CertificateShown(NamedTuple):
+    """An initiation with this authentic static key shows a certificate: the shell decides. Nothing has changed yet.
+
+    It is answered by :meth:`uavlinkd.core.node.Node.admit` or
+    :meth:`~uavlinkd.core.node.Node.refuse_certificate`. It may be a replay: other peers are concerned only when
+    :class:`PeerAdmitted` follows.
+    """
+
+    key: bytes
+    certificate: bytes
+    path: Path
+    initiation: object
+    """What the node needs to answer it."""
+
+
 class PeerAdmitted(NamedTuple):
-    """A peer that showed a certificate proved that it is there. Before that the shell does not know it."""
+    """The first envelope of a session came whose initiation showed this certificate: the peer is there with it.
+
+    A new peer is provisional until :meth:`uavlinkd.core.node.Node.accept`.
+    """
 
     peer: LinkedPeer
+    certificate: bytes
 
 
 class PeerExpired(NamedTuple):
@@ -138,4 +157,4 @@ class PathSuspected(NamedTuple):
 
 PathEvent = PathChanged | PathStateChanged | PathSuspected
 Event = PeerAdmitted | PeerExpired | PeerUp | PeerLost | PeerClosed | SessionEstablished | PathEvent
-Output = Transmit | Deliver | RecordReceived | Dropped | Event
+Output = Transmit | Deliver | RecordReceived | Dropped | CertificateShown | Event

@@ -60,7 +60,7 @@ def receive_envelope(
     traffic.bytes_received += size
     if session.local_index in sessions.unconfirmed:
         waiting = sessions.unconfirmed[session.local_index]
-        out += adopt(peer, session, path, now)
+        out += adopt(peer, session, path, now, waiting.certificate)
         if session is sessions.current:
             out += probing.ask_everywhere(peer, session, now, waiting)
         state = peer.paths.find(path)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Hashable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from uavlinkd.core import constants as c
 from uavlinkd.core import establish, handshake, wire
@@ -12,7 +13,7 @@ from uavlinkd.core.cookie import CookieJar, mac1_of, version_of
 from uavlinkd.core.crypto import KeyPair, equal
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.initiator import Pending
-from uavlinkd.core.outputs import Output
+from uavlinkd.core.outputs import CertificateShown, Output
 from uavlinkd.core.path import Path, SocketFacts
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.session import Session
@@ -33,6 +34,13 @@ class Remembered:
     read_at: float
     late_copies: int = 0
     """How often it came again while no session waited for its confirmation."""
+
+
+class ShownInitiation(NamedTuple):
+    """An authentic initiation that waits for its answer."""
+
+    received: handshake.Received
+    message: Message
 
 
 class HandshakeReceiver:
@@ -57,8 +65,7 @@ class HandshakeReceiver:
         """By their public key."""
         self.remembered: dict[bytes, Remembered] = {}
         """By the ephemeral of the initiation."""
-        self.admit: Callable[[bytes, bytes, float], Peer] | None = None
-        """Returns the peer with this static key that showed this certificate. Raises Drop."""
+        self.takes_certificates = False
         self._indices = indices
         self._facts = facts
         self._schedule = schedule
@@ -122,13 +129,20 @@ class HandshakeReceiver:
         self.admission.admit(message, now, is_response=False)
         received = handshake.receive_initiation(self.identity, initiation)
         peer = self.peers.get(received.public_key)
-        if received.certificate and self.admit is not None and (peer is None or peer.settings.is_certified):
-            peer = self.admit(received.public_key, received.certificate, now)
+        if received.certificate and self.takes_certificates and (peer is None or peer.settings.is_certified):
+            shown = ShownInitiation(received, message)
+            return [CertificateShown(received.public_key, received.certificate, path, shown)]
         if peer is None:
             raise Drop(DropReason.UNKNOWN_PEER, received.public_key)
+        return self.answer(peer, ShownInitiation(received, message), now)
+
+    def answer(self, peer: Peer, initiation: ShownInitiation, now: float) -> list[Output]:
+        """Answer an authentic initiation of this peer. Raises Drop: along another peer's network."""
+        received, message = initiation
+        path = message.path
         # Before it is remembered: otherwise a line could use up what this peer sends along its own network.
         self._facts.check_network(peer, path)
-        self.remember(peer, initiation.ephemeral, mac1_of(datagram), now)
+        self.remember(peer, received.initiation.ephemeral, mac1_of(message.datagram), now)
         try:
             out = self._answer(peer, received, message, now)
         except CookieRequired as drop:

@@ -99,6 +99,8 @@ class Unconfirmed:
     mac1: bytes
     """Of the response; a cookie reply refers to it."""
     expires_at: float
+    certificate: bytes
+    """That the initiation of a peer by certificate shows; empty in the short form."""
     twin: Twin | None = None
     """What the initiation shows, once the session is confirmed: before that it may be an old recording."""
     cookied: set[Path] = field(default_factory=set)

@@ -87,8 +87,3 @@ class PeerSettings:
     """Whether this side makes sessions too. A relay leaves that to its members."""
     is_certified: bool = False
     """Whether it is a peer by its certificate, and not by the configuration."""
-
-
-Admit = Callable[[bytes, bytes, float], PeerSettings]
-"""Decides on a certificate that an initiation with this authentic static key shows at this moment, and returns the
-settings of its peer. Raises :class:`.drops.Drop`."""

@@ -277,6 +277,9 @@ class FrameCarrier:
                     self._parts.evidence.add_dropped(output, now)
                 elif isinstance(output, o.RecordReceived):
                     self._on_record(output)
+                elif isinstance(output, o.CertificateShown):
+                    assert self._parts.fleet is not None, "only a member takes certificates"
+                    self.perform(self._parts.fleet.answer(output, self._read_at))
                 else:
                     self._on_event(output)
             except Exception as error:

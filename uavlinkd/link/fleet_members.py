@@ -187,18 +187,29 @@ class FleetMembers:
 
     # Members.
 
-    def admit(self, key: bytes, data: bytes, now: float) -> PeerSettings:
-        """An initiation shows this certificate. Returns the settings of its peer. Raises Drop: why it is refused."""
+    def answer(self, shown: o.CertificateShown, now: float) -> list[o.Output]:
+        """Decide on a certificate that an initiation shows, perhaps a replayed one. Nothing else changes."""
         try:
-            certificate = self._hold(key, data, now, needs_policy=self._relay is None)
+            settings = self.judge(shown.key, shown.certificate, now)
+        except Drop as drop:
+            return [self._node.refuse_certificate(shown, drop)]
+        return self._node.admit(shown, settings, now)
+
+    def judge(self, key: bytes, data: bytes, now: float) -> PeerSettings:
+        """The settings of a peer that shows this certificate. Raises Drop: why it is refused. Changes nothing."""
+        try:
+            certificate = self._judge(key, data, now, needs_policy=self._relay is None)
         except Drop as drop:
             raise Drop(drop.reason, drop.detail or key) from None
         if certificate.role in self.config.policies:
-            return self._config_of(key).settings
+            return member_peer(self.config, key, certificate).settings
         return relay_member(self.config, key, certificate).peer
 
-    def _hold(self, key: bytes, data: bytes, now: float, *, needs_policy: bool) -> Certificate:
-        """Hold a certificate that is valid and wanted, and not too early or one too many. Raises Drop."""
+    def _judge(self, key: bytes, data: bytes, now: float, *, needs_policy: bool) -> Certificate:
+        """The certificate that counts for a key, if it is valid and wanted, not too early and not one too many.
+
+        Changes nothing. Raises Drop.
+        """
         certificate = self.trust.judge(key, data)
         has_policy = certificate.role in self.config.policies
         if needs_policy and not has_policy:
@@ -207,26 +218,28 @@ class FleetMembers:
         is_early = has_policy and now < self._settled_at and not self._is_contact(key)
         if is_early or not self._has_required:
             raise Drop(DropReason.BULLETIN_AWAITED)
-        if key not in self.trust.held:
-            self._make_room(now)
+        if key not in self.trust.held and len(self.trust.held) >= self._most_members and self._longest_down() is None:
+            raise Drop(DropReason.TOO_MANY_MEMBERS)
+        return certificate
+
+    def _hold(self, key: bytes, data: bytes, now: float, *, needs_policy: bool) -> None:
+        """Hold a certificate of a member that is there. Raises Drop."""
+        certificate = self._judge(key, data, now, needs_policy=needs_policy)
+        if key not in self.trust.held and len(self.trust.held) >= self._most_members:
+            peer = self._longest_down()
+            assert peer is not None, "there was one a moment ago"
+            self.trust.held.pop(peer.settings.public_key, None)
+            self._end(peer.settings.public_key, now)
         for ended in self.trust.keep(key, certificate, data):
             self._end(ended, now)
-        return certificate
 
     @property
     def _has_required(self) -> bool:
         return self.trust.bulletin.number >= self.config.required_bulletin
 
-    def _make_room(self, now: float) -> None:
-        """Give up the member that is down for longest, if there are as many as may be."""
-        if len(self.trust.held) < self._most_members:
-            return
-        contacts = {contact.key for contact in self.config.contacts}
-        if (peer := longest_down(self._node.peers.values(), contacts)) is None:
-            raise Drop(DropReason.TOO_MANY_MEMBERS)
-        key = peer.settings.public_key
-        self.trust.held.pop(key, None)
-        self._end(key, now)
+    def _longest_down(self) -> Peer | None:
+        """The member that is down for longest: it makes room for another one."""
+        return longest_down(self._node.peers.values(), {contact.key for contact in self.config.contacts})
 
     def on_event(self, event: o.Event, now: float) -> None:
         """An event of any peer. Call it before other parts act on it: they may not know the peer yet."""
@@ -235,9 +248,7 @@ class FleetMembers:
         key = peer.settings.public_key
         match event:
             case o.PeerAdmitted():
-                self._join(key, peer, now)
-            case o.PeerExpired():
-                self.trust.held.pop(key, None)
+                self._admit(key, peer, event.certificate, now)
             case o.SessionEstablished() | o.PeerUp() if peer.session_with(c.FEATURE_FLEET, now) is not None:
                 self._serve(key, now)  # a contact comes without an admission
                 self.exchange.on_handshake(key, now)
@@ -246,6 +257,17 @@ class FleetMembers:
             case o.PeerLost() | o.PeerClosed():
                 self.exchange.on_down(key)
                 self._questions.end(key)
+
+    def _admit(self, key: bytes, peer: Peer, data: bytes, now: float) -> None:
+        """A member is there with this certificate: now it counts, and whoever had its name or ids before ends."""
+        try:
+            self._hold(key, data, now, needs_policy=self._relay is None)
+        except Drop as drop:  # since its initiation was answered, a bulletin or another member came
+            self._evidence.add_dropped(o.Dropped(drop.reason, peer, None, 1, drop.detail), now)
+            self._end(key, now)
+            return
+        if self._node.is_provisional(peer):
+            self._join(key, peer, now)
 
     def _wait_s(self, key: bytes) -> float:
         """How long to wait for what a peer answers to a bulletin, at least."""
@@ -307,7 +329,7 @@ class FleetMembers:
             raise Drop(DropReason.BAD_CERTIFICATE)
         self._hold(record.key, record.certificate, now, needs_policy=True)
         peer = self._node.find(record.key)
-        if peer is None or peer.provisional_until != c.NEVER:
+        if peer is None or self._node.is_provisional(peer):
             self._questions.found(sender)
             self._join(record.key, peer, now)
 

@@ -11,7 +11,6 @@ from uavlinkd.config.members import most_members
 from uavlinkd.config.model import Config
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import LinkedPeer, Output
-from uavlinkd.core.settings import PeerSettings
 from uavlinkd.endpoints.ports import LocalPort
 from uavlinkd.link.conditions import LineLimits
 from uavlinkd.link.drop_summary import DropSummary
@@ -44,9 +43,13 @@ class DaemonParts:
         """The one in force."""
         self.log = log
         self.started_at = now
-        admit = None if config.fleet is None else self._admit
         self.node = node = Node(
-            config.private_key, os.urandom, now, screen=screen, admit=admit, most_admitted=most_members(config)
+            config.private_key,
+            os.urandom,
+            now,
+            screen=screen,
+            takes_certificates=config.fleet is not None,
+            most_admitted=most_members(config),
         )
         self.fleet: FleetMembers | None = None
         """Who is a member by certificate; None without a fleet."""
@@ -84,10 +87,6 @@ class DaemonParts:
             )
             self.relay = RelayService(node, config.relay_server.limits, shell)
             sockets.pause_s = 0.0
-
-    def _admit(self, key: bytes, certificate: bytes, now: float) -> PeerSettings:
-        assert self.fleet is not None, "it is there before the sockets are read"
-        return self.fleet.admit(key, certificate, now)
 
     def _on_pause(self, pause_s: float) -> None:
         self.history.paused = monotonic(), pause_s

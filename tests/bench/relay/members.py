@@ -122,7 +122,7 @@ class Member:
                 self.hosts.send(self.host, output.datagram, self.relay)
             elif isinstance(output, o.RecordReceived):
                 self._receive_record(output, now)
-            elif not isinstance(output, o.Deliver | o.Dropped):
+            elif not isinstance(output, o.Deliver | o.Dropped | o.CertificateShown):
                 self.link.on_event(output, now)
                 if isinstance(output, o.SessionEstablished) and peer.session_with(c.FEATURE_FLEET, now) is not None:
                     self.exchange.on_handshake(peer.settings.public_key, now)

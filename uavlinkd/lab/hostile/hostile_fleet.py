@@ -14,6 +14,7 @@ from uavlinkd.core import constants as c
 from uavlinkd.core import outputs as o
 from uavlinkd.core.crypto import AuthorityKey, Entropy
 from uavlinkd.core.drops import Drop
+from uavlinkd.core.node import Node
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.relay_records import CertificateRecord, FleetRecord
 from uavlinkd.core.settings import Link, PeerSettings
@@ -62,14 +63,15 @@ class HostileFleet:
         held = (CertificateRecord(key, one.data) for key, one in self.trust.held.items())
         return [*self._membership.recorded, *held]
 
-    def admit(self, key: bytes, data: bytes, now: float) -> PeerSettings:
-        """As a relay: the settings of a member that shows this certificate. Raises Drop."""
-        del now
-        certificate = self.trust.judge(key, data)
-        self.trust.hold(key, data)
-        self._on_member({certificate.name: key})
+    def answer(self, shown: o.CertificateShown, node: Node, now: float) -> list[o.Output]:
+        """As a relay."""
+        try:
+            certificate = self.trust.judge(shown.key, shown.certificate)
+        except Drop as drop:
+            return [node.refuse_certificate(shown, drop)]
         link = self._membership.link
-        return PeerSettings(certificate.name, key, None, link, initiates=False, is_certified=True)
+        settings = PeerSettings(certificate.name, shown.key, None, link, initiates=False, is_certified=True)
+        return node.admit(shown, settings, now)
 
     def on_event(self, event: o.Event, service: RelayService, now: float) -> None:
         """Call it before the relay acts on the event."""
@@ -77,11 +79,11 @@ class HostileFleet:
             return
         key = peer.settings.public_key
         match event:
-            case o.PeerAdmitted():
+            case o.PeerAdmitted(certificate=data):
+                self.trust.hold(key, data)
+                self._on_member({peer.name: key})
                 member = MemberSettings(peer.settings, self._membership.most_peers, self._membership.limits)
                 service.admit(peer, member, self.trust.held[key], now, is_own=True)
-            case o.PeerExpired():
-                self.trust.held.pop(key, None)
             case o.SessionEstablished() | o.PeerUp() if peer.session_with(c.FEATURE_FLEET, now) is not None:
                 self._exchange.on_handshake(key, now)
             case o.PeerLost() | o.PeerClosed():

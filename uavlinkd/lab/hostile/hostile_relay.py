@@ -19,7 +19,7 @@ from typing import Final
 from uavlinkd.config.model import RelayServer
 from uavlinkd.core.crypto import Secret, x25519_public_key
 from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import Event, Output, RecordReceived, Transmit
+from uavlinkd.core.outputs import CertificateShown, Event, Output, PeerAdmitted, RecordReceived, Transmit
 from uavlinkd.core.path import Path
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.relay_records import (
@@ -166,7 +166,7 @@ class HostileRelay(ChannelService):
         key, fleet = self.settings.private_key, self.settings.fleet
         own_key = x25519_public_key(key.reveal())
         self._fleet = None if fleet is None else HostileFleet(fleet, own_key, os.urandom, self._add_members)
-        self._node = _LyingNode(key, os.urandom, now, admit=None if self._fleet is None else self._fleet.admit)
+        self._node = _LyingNode(key, os.urandom, now, takes_certificates=self._fleet is not None)
         self._node.relay = self
         shell = RelayShell(
             entropy=os.urandom,
@@ -305,8 +305,13 @@ class HostileRelay(ChannelService):
                 self._service.on_record(output, monotonic())
                 if self._fleet is not None:
                     self._fleet.on_record(output, self._service, monotonic())
+            elif isinstance(output, CertificateShown):
+                if self._fleet is not None:
+                    self._perform(self._fleet.answer(output, self._node, monotonic()))
             elif isinstance(output, Event):
                 if self._fleet is not None:
+                    if isinstance(output, PeerAdmitted) and isinstance(output.peer, Peer):
+                        self._node.accept(output.peer)
                     self._fleet.on_event(output, self._service, monotonic())
                 self._service.on_event(output, monotonic())
 
