@@ -9,6 +9,7 @@ from contextlib import asynccontextmanager, suppress
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from tests.daemon.frames import frames_in
 from tests.daemon.harness import Stage
 from tests.namespaces import Namespace, connect, need_namespaces, udp_socket_in
 from tests.samples import pack
@@ -59,9 +60,7 @@ class Path:
                 self._sender.connect(into)
                 self._receiver.connect(out)
                 await stage.start(self.vehicle, self.station)
-                self._receiver.send(_heartbeat(255))
-                self._sender.send(_heartbeat(1))
-                await until(self._hears)
+                await until(self._is_served)
                 yield
                 for daemon in (self.vehicle, self.station):
                     await daemon.stop()
@@ -100,15 +99,15 @@ class Path:
         self._number += 1
         return pack(mavlink.MAVLink_log_data_message(1, self._number, 90, [7] * 90), 1, seq=self._number % 256)
 
+    def _is_served(self) -> bool:
+        self._receiver.send(_heartbeat(255))
+        self._sender.send(_heartbeat(1))
+        return self._hears()
+
     def _hears(self) -> bool:
         with suppress(BlockingIOError):
             while True:
-                data = self._receiver.recv(2048)
-                size = len(pack(mavlink.MAVLink_log_data_message(1, 1, 90, [7] * 90), 1))
-                if data[7] == 120:
-                    self._received |= {data[at : at + size] for at in range(0, len(data), size)}
-                else:
-                    self._received.add(data)
+                self._received.update(frames_in(self._receiver.recv(2048)))
         return bool(self._received)
 
 
