@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import pytest_asyncio
 
-from tests.compose.cluster import Conversation, check_frames, run, until
+from tests.compose.cluster import SYSTEM_IDS, Conversation, check_frames, run, until
 from tests.compose.containers import USER, Containers, health, opened
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
@@ -37,10 +37,13 @@ async def test_frames_reach_all_others_once(cluster: Containers) -> None:
 
 
 async def test_containers_are_healthy_confined_and_unprivileged(cluster: Containers) -> None:
-    """The health check passes on live links; the daemon is not root, and its root file system is read-only."""
-
+    """A station without a client too. The daemon is not root, and writes nothing but its state."""
+    for name in SYSTEM_IDS:
+        container = await cluster.container(name)
+        await until(lambda container=container: health(container) == "healthy", f"{name} is healthy")  # type: ignore[misc]
+        assert f"{name}.fleet-state" in await run("docker", "exec", container, "ls", "/var/lib/uavlinkd")
     drone = await cluster.container("drone1")
-    await until(lambda: health(drone) == "healthy", "drone1 is healthy")
+    assert "fleet_state_degraded" not in await cluster.compose("logs", "--no-color")
     assert (await run("docker", "exec", drone, "id", "-u")).strip() == str(USER)
     for path in ("/x", "/tmp/x", "/etc/uavlinkd/x", "/opt/uavlinkd/x"):
         assert "Read-only file system" in await run("docker", "exec", drone, "touch", path, check=False)

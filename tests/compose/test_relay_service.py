@@ -59,7 +59,7 @@ class RelayService:
         for member in self.members:
             member.close()
         print(await run(*self._compose, "logs", "--no-color", environ=self._environ, check=False))
-        await run(*self._compose, "down", "--timeout", "1", environ=self._environ)
+        await run(*self._compose, "down", "--volumes", "--timeout", "1", environ=self._environ)
 
     async def container(self) -> str:
         return (await run(*self._compose, "ps", "-q", environ=self._environ)).strip()

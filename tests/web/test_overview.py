@@ -10,6 +10,7 @@ from tests.daemon.harness import Stage
 from tests.waiting import PATIENCE_S, Stopwatch
 from tests.web.statuses import few_facts, overview
 from uavlinkd.ops.control import MAX_REQUEST_BYTES
+from uavlinkd.web.view import view
 
 __all__ = ["stage"]
 
@@ -29,7 +30,7 @@ async def test_an_overview_has_the_details_of_the_named_peers_alone(stage: Stage
         request, stopwatch = " ".join(["overview", *named]), Stopwatch()
         while stopwatch.elapsed_s < PATIENCE_S:  # a datagram may come between the two answers
             some, status = await hub.ask(request), await hub.status()
-            assert some.keys() == status.keys() - {"process"}
+            assert some.keys() == status.keys() - {"process", "is_stuck"}
             for name, peer in some["peers"].items():
                 whole = status["peers"][name]
                 if name in named:
@@ -69,3 +70,13 @@ async def test_requests_of_the_page_are_what_they_are_and_no_more(stage: Stage) 
         assert "unknown request" in (await one.ask(request))["error"]
     names = " ".join(["x" * 63] * (MAX_REQUEST_BYTES // 64))
     assert "longer than" in (await one.ask(f"overview {names}"))["error"]
+
+
+def test_a_member_that_never_came_is_on_the_page() -> None:
+    """As a card, or as a row among many; the headline counts it."""
+    fleet = {"fleet": "k7qd2m4x", "name": "gs", "role": "operator", "serial": 1, "number": 1, "bulletins": {}}
+    fleet["absent"] = {"v9": "eZPBKM+9Oztdms1v2yiR+byync+zZsR87etuOX4heHE="}
+    facts = view(overview(fleet=fleet), [], "")
+    assert facts["headline"][0]["text"] == "1 of 2 peers up"
+    assert [(card["name"], card["word"]) for card in facts["cards"]] == [("v9", "waiting"), ("drone1", "up")]
+    assert view(overview("abcdef", fleet=fleet), [], "")["rows"][0][:3] == ["v9", "waiting", None]

@@ -157,7 +157,7 @@ class Daemon:
         parts = self.parts
         match request.partition(" "):
             case ("status", "", ""):
-                return daemon_status(parts, monotonic())
+                return daemon_status(parts, monotonic()) | {"is_stuck": self._is_stuck}
             case ("overview", _, names):
                 return overview(parts, monotonic(), names.split())
             case ("problems", "", ""):

@@ -12,6 +12,7 @@ from typing import Final
 
 from uavlinkd.config.keys import encode_key
 from uavlinkd.core.drops import DropReason
+from uavlinkd.core.path import RELAY_HOST
 from uavlinkd.core.sessions import Twin
 from uavlinkd.link import facts
 from uavlinkd.link import traffic_problems as traffic
@@ -43,6 +44,7 @@ def daemon_problems(moment: Moment) -> Iterator[Found]:
             "if a card was copied, run `uavlinkd keygen` on one machine; else the key may be stolen: replace it",
         )
     if names := [name for name, peer in daemon.node.peers.items() if traffic.has_twin(peer, Twin.OURS, now)]:
+        names = [name.removeprefix(RELAY_HOST) for name in names]
         yield traffic.two_machines(f"this daemon's private key: {listed(names)} states a session with another one")
     fault_if_down = fault if moment.down else warning
     if absent := daemon.peer_sockets.absent_addresses():

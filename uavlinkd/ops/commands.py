@@ -29,6 +29,7 @@ def add_parsers(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     form = status.add_mutually_exclusive_group()
     form.add_argument("--watch", action="store_true", help="refresh each second until interrupted")
     add_json(form)
+    form.add_argument("--health", action="store_true", help="print nothing; exit status 0 if the daemon itself works")
     for_daemon(commands, "reload", _reload, "make a daemon read its configuration again")
     peer = for_daemon(commands, "peer", _peer_list, "list a daemon's peers and their keys")
     peer.add_argument("action", choices=["list"])
@@ -76,11 +77,11 @@ def control_sockets(options: argparse.Namespace) -> list[Path]:
 
     Raises CommandError if no service runs, or the configuration names no socket or cannot be read.
     """
-    from uavlinkd.config.load import load_control_socket
-
     if options.socket is not None:
         return [options.socket]
     if options.config is not None:
+        from uavlinkd.config.load import load_control_socket
+
         if (path := load_control_socket(options.config)) is None:
             raise CommandError(f'{options.config} names no control_socket: add control_socket = "NAME.sock"')
         return [path]
@@ -148,6 +149,8 @@ def _of_this_version() -> Iterator[None]:
 
 
 def _status(options: argparse.Namespace) -> int:
+    if options.health:  # orchestrators ask often: it imports little
+        return _for_each(control_sockets(options), "status", lambda status: FAILED if status["is_stuck"] else OK)
     from rich.console import Console
 
     from uavlinkd.ops.status_screen import render_status

@@ -11,11 +11,12 @@ import os
 from collections import Counter, deque
 from collections.abc import Callable
 from traceback import walk_tb
-from typing import Any, Final
-
-from structlog.typing import FilteringBoundLogger
+from typing import TYPE_CHECKING, Any, Final
 
 from uavlinkd.system.clock import monotonic
+
+if TYPE_CHECKING:  # commands that ask a daemon import this module too
+    from structlog.typing import FilteringBoundLogger
 
 MOST_FAULTS: Final = 5
 WITHIN_S: Final = 60.0
