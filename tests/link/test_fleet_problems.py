@@ -25,7 +25,8 @@ from uavlinkd.core.outputs import Dropped, RecordReceived
 from uavlinkd.core.path import SERIAL_HOST
 from uavlinkd.core.path import Path as NetPath
 from uavlinkd.core.relay_records import BulletinRecord, CertificateRecord, FleetRecord, Have
-from uavlinkd.link.fleet_members import EVENT_S, FleetMembers, FleetShell
+from uavlinkd.link.fleet_members import EVENT_S, FleetMembers
+from uavlinkd.link.fleet_shell import FleetShell
 from uavlinkd.ops.findings import Severity, Subject
 
 C, D = (b64decode(KEY[name]) for name in ("c", "d"))

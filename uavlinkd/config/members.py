@@ -8,12 +8,14 @@ from types import MappingProxyType
 from typing import Final
 
 from uavlinkd.authority.constants import CERTIFIED_PEERS
+from uavlinkd.authority.trust import Pinned
 from uavlinkd.config.model import Config, FleetConfig, PeerConfig, PolicyData
 from uavlinkd.config.relay_rules import MOST_MEMBERS
 from uavlinkd.core import constants as c
 from uavlinkd.core.certificates import Certificate, MemberRole
 from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.mavlink.policy.roles import ROLES
+from uavlinkd.mavlink.policy.settings import read_settings
 from uavlinkd.relay.forwarding import MemberSettings
 
 _VEHICLE: Final[PolicyData] = {"role": "vehicle"}
@@ -57,6 +59,25 @@ def member_peer(fleet: FleetConfig, key: bytes, certificate: Certificate) -> Pee
         egress=fleet.egress,
         relays=tuple(name for name in fleet.relays if not (contact and contact.relays and name == contact.name)),
     )
+
+
+def reserved(config: Config, fleet: FleetConfig) -> Pinned:
+    """What the configuration reserves for its own peers, relays and members."""
+    pinned = [peer for peer in config.peers if not peer.settings.is_certified]
+    members = () if config.relay_server is None else config.relay_server.members
+    own = {*(peer.settings for peer in pinned), *(relay.settings for relay in config.relays)}
+    all_reserved = {one for one in own if not one.is_certified} | {member.peer for member in members}
+    return Pinned(
+        keys={one.public_key for one in all_reserved},
+        names={one.name for one in all_reserved},
+        system_ids={number: peer.name for peer in pinned for number in _systems_of(peer)},
+        denied=fleet.denied,
+    )
+
+
+def _systems_of(peer: PeerConfig) -> frozenset[int]:
+    """The system ids that a peer of the configuration has alone: none if it may have any."""
+    return read_settings(peer.policy, is_local=False).systems or frozenset()
 
 
 def relay_member(fleet: FleetConfig, key: bytes, certificate: Certificate) -> MemberSettings:

@@ -7,17 +7,15 @@ configuration changes, or when the daemon holds too many.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Final
 
 from uavlinkd.authority import state_file
 from uavlinkd.authority.constants import CERTIFICATES, CONTACTS_FIRST_S
 from uavlinkd.authority.exchange import BulletinExchange, Reaction
 from uavlinkd.authority.state_file import FleetState
-from uavlinkd.authority.trust import BulletinVerdict, Pinned, Trust, longest_down
-from uavlinkd.config.members import member_peer, most_members, relay_member
+from uavlinkd.authority.trust import BulletinVerdict, Trust, longest_down
+from uavlinkd.config.members import member_peer, most_members, relay_member, reserved
 from uavlinkd.config.model import Config, FleetConfig, PeerConfig
 from uavlinkd.core import constants as c
 from uavlinkd.core import outputs as o
@@ -25,50 +23,18 @@ from uavlinkd.core.certificates import Certificate, parse_certificate, role_bits
 from uavlinkd.core.crypto import is_usable_public_key
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.limits import TokenBucket
-from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import Output
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.relay_records import BulletinRecord, CertificateRecord, FleetRecord, Who
 from uavlinkd.core.settings import PeerSettings
-from uavlinkd.link.evidence import Evidence
 from uavlinkd.link.fleet_disk import FleetDisk
+from uavlinkd.link.fleet_shell import FleetShell
 from uavlinkd.link.member_questions import MemberQuestions
-from uavlinkd.link.peer_link import PeerLink
-from uavlinkd.link.relays import Relays
-from uavlinkd.mavlink.policy.settings import read_settings
-from uavlinkd.relay.service import RelayService
 from uavlinkd.system.base64_text import from_base64
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.guard import run
 
 EVENT_S: Final = 600.0
 """An event of bulletins is shown for so long, or until a newer bulletin counts."""
-
-
-class Membership(Protocol):
-    """What the daemon does about its peers."""
-
-    def add_member(self, config: PeerConfig, peer: Peer | None) -> None:
-        """Carry frames to a member. ``peer``: it is in the core already."""
-
-    def remove_peer(self, name: str, *, closes: bool) -> None:
-        """End the link at once. ``closes``: with a close."""
-
-    def change_peer(self, config: PeerConfig) -> None:
-        """Apply another policy."""
-
-
-@dataclass(frozen=True, slots=True)
-class FleetShell:
-    """The parts of a daemon that its fleet concerns. ``perform`` executes outputs of the core."""
-
-    node: Node
-    links: Mapping[str, PeerLink]
-    relays: Relays
-    relay: RelayService | None
-    evidence: Evidence
-    membership: Membership
-    perform: Callable[[list[Output]], None]
 
 
 class FleetMembers:
@@ -96,7 +62,7 @@ class FleetMembers:
         self._limits: dict[bytes, TokenBucket] = {}  # of certificates, by key of the sender
         self._settled_at = monotonic() + CONTACTS_FIRST_S if fleet.contacts else -c.NEVER
         self._disk = FleetDisk(fleet.state_file, self._state, self._on_written)
-        self._reserve(config, fleet)
+        self.trust.reserve(reserved(config, fleet))
         self._hold_contacts(monotonic())
         self._show_certificate()
         self._disk.write()  # the configuration may have a newer bulletin
@@ -138,7 +104,7 @@ class FleetMembers:
             self.exchange.note_own_certificate(now)
         self._show_certificate()
         met = [key for key in new - old if key in self.trust.held]  # from now on the configuration has their peers
-        for key in (*self._reserve(config, fleet), *met):
+        for key in (*self.trust.reserve(reserved(config, fleet)), *met):
             self._end(key, now)
         self._publish(fleet.bulletin, now)
         self._hold_contacts(now)
@@ -154,20 +120,6 @@ class FleetMembers:
                 self._membership.change_peer(config_now)
             if self._relay is not None and key in self._relay.members:
                 self._serve(key, now)
-
-    def _reserve(self, config: Config, fleet: FleetConfig) -> list[bytes]:
-        pinned = [peer for peer in config.peers if not peer.settings.is_certified]
-        members = () if config.relay_server is None else config.relay_server.members
-        own = {*(peer.settings for peer in pinned), *(relay.settings for relay in config.relays)}
-        reserved = {one for one in own if not one.is_certified} | {member.peer for member in members}
-        return self.trust.reserve(
-            Pinned(
-                keys={one.public_key for one in reserved},
-                names={one.name for one in reserved},
-                system_ids={number: peer.name for peer in pinned for number in _systems_of(peer)},
-                denied=fleet.denied,
-            )
-        )
 
     def _hold_contacts(self, now: float) -> None:
         for contact in self.config.contacts:
@@ -442,8 +394,3 @@ class FleetMembers:
         if state.bulletin == self.trust.bulletin_bytes:
             self.exchange.note_persisted(self.trust.bulletin.number, self.trust.digest)
         self._perform([])  # the timer may be due earlier
-
-
-def _systems_of(peer: PeerConfig) -> frozenset[int]:
-    """The system ids that a peer of the configuration has alone: none if it may have any."""
-    return read_settings(peer.policy, is_local=False).systems or frozenset()

@@ -6,7 +6,8 @@ from uavlinkd.config.changes import ConfigChanges
 from uavlinkd.config.model import Config, PeerConfig
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.settings import PeerSettings
-from uavlinkd.link.fleet_members import FleetMembers, FleetShell
+from uavlinkd.link.fleet_members import FleetMembers
+from uavlinkd.link.fleet_shell import FleetShell
 from uavlinkd.link.parts import DaemonParts
 from uavlinkd.link.peer_link import Carriage, PeerLink
 from uavlinkd.system.clock import monotonic
@@ -34,7 +35,7 @@ class Peers:
         self._add_relays()
         self._follow_members()
 
-    # Members of the fleet: see :class:`.fleet_members.Membership`.
+    # Members of the fleet: see :class:`.fleet_shell.Membership`.
 
     def add_member(self, config: PeerConfig, peer: Peer | None) -> None:
         """Carry frames to a member by certificate. ``peer``: it is in the core already."""
