@@ -130,6 +130,14 @@ def test_a_misspelt_command_is_named(words: str, meant: str, capsys: pytest.Capt
     assert f"there is no '{words.rpartition(' ')[2]}': did you mean '{meant}'?" in capsys.readouterr().err
 
 
+def test_a_removed_command_has_its_replacement(capsys: pytest.CaptureFixture[str]) -> None:
+    """Only where it was a command."""
+    for words, says in (["report", "--yes"], "`uavlinkd report` was removed: send"), (["peer", "report"], "invalid"):
+        with pytest.raises(SystemExit):
+            main(words)
+        assert says in capsys.readouterr().err
+
+
 def test_help_is_a_command(capsys: pytest.CaptureFixture[str]) -> None:
     """Of all commands, or of one."""
     for words, option in (["help"], "--version"), (["help", "fleet", "sign"], "--replace"):

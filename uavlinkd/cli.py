@@ -30,6 +30,8 @@ OF_THE_LABORATORY = {
     "evaluate": "measure uavlinkd: beside the paper's method, under attack, and with radios that fail",
 }
 """Commands of an optional package, which adds their arguments."""
+_REMOVED = {"report": "send what `uavlinkd status --json` prints, and the log of `journalctl -u uavlinkd`"}
+"""Commands of earlier versions, each with what to do in its place."""
 _NOT_A_RELAY = (
     "is not the file of a relay: that has a [[member]] for each daemon that may use it, no [[peer]] and no"
     " [[endpoint]]. A daemon that is also a relay is started with `uavlinkd run`"
@@ -121,10 +123,12 @@ class _Parser(argparse.ArgumentParser):
         return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
-        """End the process. A command that is misspelt is named as it is spelt."""
+        """End the process. The message names the right spelling of a command, or what replaces a removed one."""
         if match := re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message):
             written, words = match.groups()
-            if likely := get_close_matches(written, re.findall(r"[\w-]+", words), 1):
+            if self.prog == "uavlinkd" and written in _REMOVED:
+                message = f"`uavlinkd {written}` was removed: {_REMOVED[written]}"
+            elif likely := get_close_matches(written, re.findall(r"[\w-]+", words), 1):
                 message = f"{message[: match.start()]}there is no {written!r}: did you mean {likely[0]!r}?"
         super().error(message)
 

@@ -84,7 +84,7 @@ def daemon_problems(moment: Moment) -> Iterator[Found]:
         yield warning(
             "fault_inside",
             f"the daemon caught faults of its own: {places}",
-            "send what `uavlinkd report` writes, and the log, to the developers; frames pass meanwhile",
+            "send what `uavlinkd status --json` prints, and the log, to the developers; frames pass meanwhile",
         )
     full = evidence.seen_anywhere("ENOBUFS", now)
     if full is not None and full.count >= traffic.LOSSES:

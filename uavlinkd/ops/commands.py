@@ -1,4 +1,4 @@
-"""The commands that talk to a running daemon: ``status``, ``reload``, ``peer list``, ``ping`` and ``report``.
+"""The commands that talk to a running daemon: ``status``, ``reload``, ``peer list``, ``ping`` and ``netcheck``.
 
 Each command imports what it needs when it runs: the other commands start without it.
 """
@@ -44,11 +44,6 @@ def add_parsers(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     add_json(ping)
     text = "show whether UDP gets out, how relays see this machine, and its NAT"
     add_json(for_daemon(commands, "netcheck", _netcheck, text))
-    report = for_daemon(
-        commands, "report", _report, "write one file for a support request, without keys and addresses"
-    )
-    report.add_argument("--out", metavar="FILE", type=Path, help="where to write it (default: a name with the time)")
-    report.add_argument("--yes", action="store_true", help="write it without showing it first")
 
 
 def for_daemon(
@@ -235,21 +230,6 @@ def _netcheck(options: argparse.Namespace) -> int:
         return OK if any(relay["state"] == "up" for relay in answer["relays"].values()) else FAILED
 
     return _for_each(control_sockets(options), "netcheck", show)
-
-
-def _report(options: argparse.Namespace) -> int:
-    from uavlinkd.ops.support_report import SERVICE_FILES, write_report
-
-    configs = [options.config] if options.config is not None else []
-    if options.config is None and options.socket is None:
-        configs = sorted(SERVICE_FILES.glob("*.toml"))
-    try:
-        sockets = control_sockets(options)
-    except CommandError as error:
-        print(printable(str(error), keep="\n"), file=sys.stderr)  # a daemon that does not start is reported on too
-        sockets = []
-    write_report(options, configs, sockets)
-    return OK
 
 
 def _peer_list(options: argparse.Namespace) -> int:

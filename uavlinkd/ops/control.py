@@ -23,7 +23,7 @@ MAX_REQUEST_BYTES = 8192  # enough for the attacks of a man in the middle with a
 UNKNOWN = "unknown request"
 FAILED_INSIDE = (
     "it failed because of a fault in the daemon ({}), which its log has: restart the daemon, and send what"
-    " `uavlinkd report` writes to the developers"
+    " `uavlinkd status --json` prints, and the log (`journalctl -u uavlinkd`), to the developers"
 )
 REQUEST_TIMEOUT_S = 5.0
 """Limit for sending the request, and for reading the answer. Making the answer has no limit."""
