@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Sequence
 from types import TracebackType
 from typing import Any, Self
@@ -90,14 +88,6 @@ class TwoHosts:
     def run(self, script: str) -> None:
         """A shell script there."""
         self.hosts[0].run("sh", "-euc", script)
-
-    def check(self) -> tuple[int, str]:
-        """What ``uavlinkd check`` says there: its exit status and its output in one line."""
-        command = [*self.hosts[0].launcher, sys.executable, "-m", "uavlinkd", "check"]
-        done = subprocess.run(
-            [*command, "--config", str(self.vehicle.write_config())], capture_output=True, text=True, check=False
-        )
-        return done.returncode, " ".join((done.stdout + done.stderr).split())
 
     def plug_in(self, network: str) -> None:
         """Make a cable between the hosts, and configure the interfaces of both."""

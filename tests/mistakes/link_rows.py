@@ -34,7 +34,6 @@ LINK_ROWS = (
     Mistake(
         "18",
         scenes.unknown_name,
-        check=r"has no address here now.*getent hosts",
         signs=_both("name_not_resolved", r"getent hosts"),
     ),
     Mistake(

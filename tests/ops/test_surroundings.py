@@ -1,7 +1,4 @@
-"""What ``check`` says about this machine: it looks, and binds, opens and writes nothing of the configuration.
-
-tests/daemon/test_two_networks.py has networks with real routes.
-"""
+"""What ``check`` says about this machine: it looks, and binds, opens and writes nothing of the configuration."""
 
 from __future__ import annotations
 
@@ -15,14 +12,11 @@ import pytest
 from tests.config.files import ADDRESSES, ENDPOINT, PEER, TOP, URL, load
 from tests.needs import need
 from uavlinkd.cli import main
-from uavlinkd.config.model import Config
 from uavlinkd.endpoints.sockets import Presence
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.ops import surroundings
 
 Lacks = Callable[..., list[str]]
-Load = Callable[[str], Config]
-_LOOPBACK = '[[network]]\nname = "loopback"\ninterface = "lo"\n'
 
 
 @pytest.fixture
@@ -88,28 +82,11 @@ def test_check_refuses_broadcast_addresses_of_this_machine(
         assert f"error: {place} is a broadcast address: write the address of one machine" in says
 
 
-@pytest.fixture
-def load_network(tmp_path: Path) -> Load:
-    """Loads a file with a network and this address of the peer."""
+def test_a_network_that_is_absent(tmp_path: Path) -> None:
+    """Its interface may be plugged in later."""
     need(sys.platform == "linux", "Linux")
-    return lambda address: load(tmp_path, TOP + _LOOPBACK + PEER.replace(ADDRESSES, f'["{address}"]'))
-
-
-def test_without_the_tool_for_routes_nothing_is_said_about_them(
-    load_network: Load, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """No route is reported as missing."""
-    monkeypatch.setattr(surroundings, "_IP", None)
-    report = surroundings.look_at_networks(load_network("203.0.113.7:5790"), {})
-    assert report.lacks == ["there is no `ip` here, so routes were not checked: install iproute2"]
-    assert (report.errors, report.reaches[0].unreached) == ([], [])
-
-
-def test_name_is_reached_at_one_of_its_addresses(load_network: Load) -> None:
-    """A name that does not resolve is neither reached nor unreached: another line reports it."""
-    need(surroundings._IP is not None, "iproute2")
-    config = load_network("drone1.test:5790")
-    (reach,) = surroundings.look_at_networks(config, {"drone1.test": ["127.0.0.1"]}).reaches
-    assert (reach.reached, reach.unreached) == (["drone1 drone1.test:5790"], [])
-    (reach,) = surroundings.look_at_networks(config, {"drone1.test": []}).reaches
-    assert (reach.reached, reach.unreached) == ([], [])
+    networks = "".join(f'[[network]]\nname = "{name}"\ninterface = "{name}"\n' for name in ("lo", "absent0"))
+    config = load(tmp_path, TOP + networks + PEER.replace(ADDRESSES, '["203.0.113.7:5790"]'))
+    assert [lack for lack in surroundings.look_around(config).lacks if "network" in lack] == [
+        'network "absent0": there is no interface absent0 now: the daemon uses it as soon as it is there'
+    ]

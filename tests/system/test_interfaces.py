@@ -11,7 +11,7 @@ import pytest
 from tests.needs import need
 from uavlinkd.lab.sim.loopback_ports import has_ipv6
 from uavlinkd.system import interfaces
-from uavlinkd.system.interfaces import find_interface, interface_of, leads_to, specific_routes
+from uavlinkd.system.interfaces import find_interface, leads_to, specific_routes
 
 
 @pytest.fixture(autouse=True)
@@ -20,21 +20,19 @@ def _on_linux() -> None:
 
 
 def test_loopback_is_read_with_its_addresses() -> None:
-    """Its number, its state and its addresses; its end is not a modem's."""
+    """Its number, its state and its addresses."""
     loopback = find_interface("lo")
     assert loopback is not None
     assert loopback.ifindex == socket.if_nametoindex("lo")
-    assert (loopback.is_up, loopback.has_one_end) == (True, False)
+    assert loopback.is_up
     assert loopback.hosts[0] == "127.0.0.1"
     assert ("::1" in loopback.hosts) is has_ipv6()
-    assert interface_of("127.0.0.1") == "lo"
 
 
-def test_absent_interface_and_address() -> None:
-    """Neither is an error."""
+def test_absent_interface() -> None:
+    """It is not an error."""
     assert find_interface("absent0") is None
     assert find_interface("longer-than-any-name") is None
-    assert interface_of("192.0.2.77") is None
 
 
 def test_address_that_the_kernel_still_tests_is_not_usable(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

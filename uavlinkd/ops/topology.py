@@ -37,7 +37,7 @@ def print_topology(config: Config, here: Surroundings | None = None, console: Co
     """
     if console is None:
         console = Console()
-    facts, policies, verdict = _facts(config, here), _policies(config), _verdict(config.warnings, here)
+    facts, policies, verdict = _facts(config), _policies(config), _verdict(config.warnings, here)
     columns, is_plain = console.width, not console.is_terminal
     printer = Console(no_color=True, force_terminal=False) if is_plain else console
     wide = printer.options.update(width=_MOST_COLUMNS)
@@ -53,7 +53,7 @@ def print_topology(config: Config, here: Surroundings | None = None, console: Co
             console.file.writelines(lines if is_plain else [text])
 
 
-def _facts(config: Config, here: Surroundings | None) -> list[RenderableType]:
+def _facts(config: Config) -> list[RenderableType]:
     """The tables of what is configured, the most important first. A few peers fit on one screen.
 
     Text from the file is always a :class:`rich.text.Text`, so that it cannot act as markup.
@@ -62,7 +62,7 @@ def _facts(config: Config, here: Surroundings | None) -> list[RenderableType]:
     if config.fleet is not None:
         parts += [_heading("Fleet"), _grid(_fleet(config.fleet))]
     if config.networks:
-        parts += [_heading("Networks"), _grid(_networks(config, here), "bold")]
+        parts += [_heading("Networks"), _grid(_networks(config), "bold")]
     if config.peers:
         links = _table(("name", "address", "suites", "mode, at least", "PSK"), map(_peer, config.peers))
         keys = _table(
@@ -160,29 +160,25 @@ def _listening(config: Config) -> str:
     return f"{where} (UDP, open to the network; answers only senders that know the public key)"
 
 
-def _networks(config: Config, here: Surroundings | None) -> Iterator[tuple[str, Text]]:
-    """Each network with the peers' addresses that are used on it; on this machine, those that it reaches now."""
-    for number, network in enumerate(config.networks):
-        text = Text(network.exit)
-        if network.serial is None:
-            budget = f"{network.budget_bits_s:,} bits/s" if network.budget_bits_s else "no budget"
-            text.append(f", {'metered' if network.metered else 'not metered'}, {budget}")
-        if here is None:
-            used = [
-                f"{peer.name} {written.address}"
-                for peer in config.peers
-                for written in peer.addresses
-                if any(used_networks([network], written))
-            ]
-            text.append(f"\nused for {', '.join(used) or 'no address of a peer'}")
+def _networks(config: Config) -> Iterator[tuple[str, str]]:
+    """Each network with the addresses of peers that the daemon uses on it."""
+    for network in config.networks:
+        if network.serial is not None:
+            text = (
+                f"; the radio carries {network.air_bits_s:,} bits/s, this end sends up to {network.budget_bits_s:,};"
+                # With other settings the modem cuts and mixes datagrams.
+                " set a SiK modem to MAVLINK=0, RTSCTS=1 if these wires are connected, and ECC=0"
+            )
         else:
-            reach = here.reaches[number]
-            text.append(f"; {reach.here}")
-            if reach.reached:
-                text.append(f"\nreaches {', '.join(reach.reached)}")
-            if reach.unreached:
-                text.append(f"\ndoes not reach {', '.join(reach.unreached)}", style="bold red")
-        yield network.name, text
+            budget = f"{network.budget_bits_s:,} bits/s" if network.budget_bits_s else "no budget"
+            text = f", {'metered' if network.metered else 'not metered'}, {budget}"
+        used = [
+            f"{peer.name} {written.address}"
+            for peer in config.peers
+            for written in peer.addresses
+            if any(used_networks([network], written))
+        ]
+        yield network.name, f"{network.exit}{text}\nused for {', '.join(used) or 'no address of a peer'}"
 
 
 def _peer(peer: PeerConfig) -> tuple[str, ...]:

@@ -26,9 +26,6 @@ _SIOCGIFCONF: Final = 0x8912
 _SIOCGIFFLAGS: Final = 0x8913
 # linux/if.h
 _IFF_UP: Final = 0x1
-_IFF_LOOPBACK: Final = 0x8
-_IFF_POINTOPOINT: Final = 0x10
-_IFF_NOARP: Final = 0x80
 _NAME: Final = struct.Struct("16s")
 _REQUEST: Final = struct.Struct("16s24s" if struct.calcsize("P") == 8 else "16s16s")
 """struct ifreq: the name of an interface, and a union."""
@@ -51,7 +48,6 @@ class Interface(NamedTuple):
 
     ifindex: int  # an interface that was removed returns with another number
     is_up: bool  # an administrator or a network manager switched it on; its cable may be unplugged
-    has_one_end: bool  # everything goes to the one other end: a modem, a tunnel
     hosts: tuple[str, ...]  # its usable addresses, IPv4 first; a link-local IPv6 address has no zone here
 
 
@@ -64,19 +60,9 @@ def find_interface(name: str) -> Interface | None:
             index = socket.if_nametoindex(name)
             request = _REQUEST.pack(name.encode(), b"")
             (flags,) = struct.unpack_from("=H", fcntl.ioctl(sock, _SIOCGIFFLAGS, request), _NAME.size)
-            has_one_end = bool(flags & (_IFF_POINTOPOINT | _IFF_NOARP)) and not flags & _IFF_LOOPBACK
-            return Interface(index, bool(flags & _IFF_UP), has_one_end, (*_ipv4(sock, name), *_ipv6(index)))
+            return Interface(index, bool(flags & _IFF_UP), (*_ipv4(sock, name), *_ipv6(index)))
     except OSError:
         return None
-
-
-def interface_of(host: str) -> str | None:
-    """The name of the interface that has a numeric address, without a zone."""
-    for name in interface_names():
-        interface = find_interface(name)
-        if interface is not None and host in interface.hosts:
-            return name
-    return None
 
 
 def interface_names() -> list[str]:
