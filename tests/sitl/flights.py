@@ -16,7 +16,7 @@ from tests.sitl.tables import download_parameters
 from tests.sitl.transfers import Figures, FlightError, counted, timed
 from tests.sitl.world import Vehicle, World
 
-OUTAGES_S = (3.0, 3.0, 3.0, 6.0, 20.0)
+OUTAGES_S = (2.0, 2.5, 3.0, 6.0, 20.0)
 LEG_M = 30.0
 LEAD_M = 60.0
 FOLLOW_OFFSET_M = 10.0
@@ -53,7 +53,7 @@ async def flight(world: World, pilot: Pilot) -> Figures:
 
 
 async def outages(world: World, pilot: Pilot) -> Figures:
-    """Cut the network for 3, 6 and 20 s in the air: the failsafe trips when it should, and control returns."""
+    """Cut the network for 2 to 20 s in the air: the failsafe trips when it should, and control returns."""
     await pilot.request_streams()
     await pilot.set_parameters(pilot.kind.failsafe)
     await pilot.take_off()

@@ -139,7 +139,12 @@ async def _lose_station(world: World, pilot: Pilot, role: str) -> None:
         if monotonic() > ends_at:
             raise FlightError(f"{role}: the failsafe did not trip", {})
         await _send(world, pilot, frames)
-    station.beats = True
+    seen, station.beats = len(station.texts), True  # heard before the next silence: each trips once
+    await station.until(
+        lambda: any("Failsafe Cleared" in text for _, _, text in station.texts[seen:]),
+        FAILSAFE_S,
+        "the end of the failsafe",
+    )
 
 
 async def steady(station: Station, pilot: Pilot) -> Snapshot:
