@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from unittest.mock import patch
+
 import pytest
 
 from tests.core.harness import (
@@ -27,6 +29,7 @@ from tests.core.harness import (
 )
 from uavlinkd.core import constants as c
 from uavlinkd.core import wire
+from uavlinkd.core.cookie import MacKeys
 from uavlinkd.core.crypto import KeyPair, Secret
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.limits import TokenBucket
@@ -34,7 +37,7 @@ from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Output, SessionEstablished
 from uavlinkd.core.path import Path
 from uavlinkd.core.settings import Link, PeerSettings
-from uavlinkd.core.suites import SUITES_BY_NAME
+from uavlinkd.core.suites import SUITES_BY_NAME, X25519
 
 COSTLY = Link(suites=(SUITES_BY_NAME["ffdhe2048"],))
 UNITS = SUITES_BY_NAME["ffdhe2048"].work
@@ -242,7 +245,7 @@ def test_senders_are_distinguished() -> None:
 
 
 def test_newer_initiation_supersedes_one_for_the_same_key_along_the_same_path_only() -> None:
-    """A forgery without the cookie, another path and a response supersede nothing. Garbage does not wait."""
+    """A forgery without the cookie, another path and a response supersede nothing."""
     pair = Pair()
     node, initiation = pair.b.node, pair.initiation(0.0)
     index = wire.parse_initiation(initiation).sender_index
@@ -254,8 +257,24 @@ def test_newer_initiation_supersedes_one_for_the_same_key_along_the_same_path_on
     response = only(datagrams(node.receive(initiation, AT_A, 0.0), wire.RESPONSE))
     assert pair.a.node.handshake_source(response, AT_B, 0.0) == (AT_B, response)
     assert node.handshake_source(flooding(1), ELSEWHERE, 0.0) not in (None, first)
+    assert node.handshake_source(b"\3", AT_A, 0.0) is None
+
+
+def test_only_what_passes_the_screen_may_wait() -> None:
+    """An initiation spends one token, and no hash without it. A response that nothing awaits costs no hash either."""
+    node = Pair().b.node
     forged = flooding(1)[: -wire.MACS_BYTES] + bytes(wire.MACS_BYTES)
-    assert {node.handshake_source(one, AT_A, 0.0) for one in (forged, b"\1", b"\2", b"\3", b"")} == {None}
+    response = wire.response_header(X25519, 1, 2).ljust(wire.response_bytes(X25519), b"1")
+    garbage = (forged, b"\1", b"\2", b"", response)
+    drops = [node.screen(one, ELSEWHERE, 0.0) for one in garbage]
+    assert [drop and drop.reason for drop in drops] == ["bad_mac1", *["malformed"] * 3, "unexpected_response"]
+    initiations = [flooding(number) for number in range(1, c.INITIATIONS_READ.burst - 1)]
+    assert [node.screen(one, ELSEWHERE, 0.0) for one in initiations] == [None] * len(initiations)
+    with patch.object(MacKeys, "has_valid_mac1", lambda *_: pytest.fail("a hash beyond the budget")):
+        drop = node.screen(flooding(1), ELSEWHERE, 0.0)
+        assert drop is not None and drop.reason == "rate_limited"
+        assert reasons(node.receive(flooding(1), ELSEWHERE, 0.0)) == ["rate_limited"]
+        assert "rate_limited" not in reasons(node.receive(initiations[0], ELSEWHERE, 0.0, is_screened=True))
 
 
 # A daemon with many peers, such as a relay, starts again: all of them initiate at once.

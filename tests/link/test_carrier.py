@@ -65,6 +65,7 @@ class Scene:
             receive=self.receive,
             refuse=lambda datagram, path: Dropped(DropReason.OVER_SHARE, None, path),
             claimed_sender=lambda *_: 0,
+            screen=lambda *_: None,
             handshake_source=lambda datagram, path, now: (path, datagram[:2]) if datagram[:1] == b"\1" else None,
             initiations_from=lambda path: [(path, HANDSHAKES[4])],
             next_deadline=lambda: NEVER,
@@ -96,7 +97,7 @@ class Scene:
         self.relays, self.node = parts.relays, node
         self.carrier = FrameCarrier(cast("DaemonParts", parts))
 
-    def receive(self, datagram: bytes, path: Path, now: float) -> list[Output]:
+    def receive(self, datagram: bytes, path: Path, now: float, *, is_screened: bool = False) -> list[Output]:
         """The core's."""
         self.received.append((datagram, path))
         if not self.envelopes:

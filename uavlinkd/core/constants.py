@@ -147,7 +147,7 @@ COOKIED_PER_SOURCE = Rate(10.0, 10)
 COOKIED_PER_S = 200
 """The same from all sources together: an attacker with many addresses still costs a bounded share of a core."""
 INITIATIONS_READ = Rate(2000, 1000)
-"""Initiations a second of which mac1 is checked. What is beyond costs a third, so a flood leaves time for frames."""
+"""Initiations a second that are read. What is beyond costs a quarter, so a flood leaves time for frames."""
 INITIATIONS_READ_PER_KNOWN = Rate(50, 50)
 """The same from each address where a peer is known to be: twelve times what an honest initiator sends."""
 VERSION_CHECKS = Rate(10, 20)

@@ -297,10 +297,15 @@ class Node:
         self._schedule.update(peer)
         return out
 
-    def receive(self, datagram: bytes, path: Path, now: float) -> list[Output]:
-        """What to do about a datagram. Never raises, whatever the bytes."""
+    def receive(self, datagram: bytes, path: Path, now: float, *, is_screened: bool = False) -> list[Output]:
+        """What to do about a datagram. Never raises, whatever the bytes.
+
+        ``is_screened``: it passed :meth:`screen` before it waited.
+        """
         try:
             if datagram[:1] not in wire.ENVELOPE_STARTS:
+                if not is_screened:
+                    self._handshakes.screen(datagram, path, now)
                 return self._handshakes.receive(datagram, path, now)
             header = wire.parse_envelope_header(datagram)
             peer, session = self._indices.owners.get(header[0], (None, None))
@@ -392,11 +397,22 @@ class Node:
             return peer, state is not None and state.is_proven
         return path.sender if self._is_known(path.place) else None
 
+    def screen(self, datagram: bytes, path: Path, now: float) -> Dropped | None:
+        """Drop a datagram that is not an envelope, unless it passes the checks that come before a key exchange.
+
+        A busy shell lets only those that pass wait.
+        """
+        try:
+            self._handshakes.screen(datagram, path, now)
+        except Drop as drop:
+            return self._count(datagram, drop, path)
+        return None
+
     def handshake_source(self, datagram: bytes, path: Path, now: float) -> Hashable | None:
-        """What tells handshake messages apart that wait in a busy shell: a newer one supersedes one that is equal.
+        """What tells screened handshake messages apart that wait: a newer one supersedes one that is equal.
 
         Initiations along one path are equal, unless only one of them has a cookie: a forgery
-        without it does not supersede the other one. None: the message is not for us, and costs little.
+        without it does not supersede the other one. None: the message costs little, and does not wait.
         """
         return self._handshakes.source_of(datagram, path, now)
 

@@ -20,7 +20,6 @@ from uavlinkd.core.session import Session
 from uavlinkd.core.sessions import Indices
 from uavlinkd.core.timers import Schedule
 
-_WAITING_KINDS = frozenset((bytes((wire.INITIATION,)), bytes((wire.RESPONSE,))))
 _MAVLINK_STARTS = frozenset((0xFD, 0xFE))
 _NOT_OUR_VERSION = frozenset((DropReason.MALFORMED, DropReason.BAD_MAC1))
 
@@ -70,31 +69,43 @@ class HandshakeReceiver:
         self._facts = facts
         self._schedule = schedule
 
-    def receive(self, datagram: bytes, path: Path, now: float) -> list[Output]:
-        """What to do about a datagram that is not an envelope.
+    def screen(self, datagram: bytes, path: Path, now: float) -> None:
+        """The checks of a datagram that is not an envelope, up to its mac1. What passes may wait for a key exchange.
 
-        Raises Drop: in particular :class:`.admission.CookieRequired`, with a reply to the sender.
+        Raises Drop.
         """
         kind = datagram[0] if datagram else 0
         if kind == wire.INITIATION:
+            self.admission.read(path, now)  # before any work: a flood costs no more than this
             try:
-                return self._receive_initiation(datagram, path, now)
+                wire.parse_initiation(datagram)
+                self._check_mac1(datagram)
             except Drop as drop:
                 self._name_version(drop.reason, datagram, path, now)
                 raise
-        if kind == wire.RESPONSE:
+        elif kind == wire.RESPONSE:
+            self._find_pending(wire.parse_response(datagram), path)
+            self._check_mac1(datagram)
+        elif kind != wire.COOKIE:
+            raise Drop(DropReason.RAW_MAVLINK if kind in _MAVLINK_STARTS else DropReason.MALFORMED)
+
+    def receive(self, datagram: bytes, path: Path, now: float) -> list[Output]:
+        """What to do about a datagram that passed :meth:`screen`.
+
+        Raises Drop: in particular :class:`.admission.CookieRequired`, with a reply to the sender.
+        """
+        if datagram[0] == wire.INITIATION:
+            return self._receive_initiation(datagram, path, now)
+        if datagram[0] == wire.RESPONSE:
             return self._receive_response(datagram, path, now)
-        if kind == wire.COOKIE:
-            return self._receive_cookie(datagram, path, now)
-        raise Drop(DropReason.RAW_MAVLINK if kind in _MAVLINK_STARTS else DropReason.MALFORMED)
+        return self._receive_cookie(datagram, path, now)
 
     def source_of(self, datagram: bytes, path: Path, now: float) -> Hashable | None:
-        """Equal for initiations along one path with a cookie, or without. None: not for us."""
-        kind = datagram[:1]
-        if kind not in _WAITING_KINDS or not self.cookies.keys.has_valid_mac1(datagram):
+        """Equal for initiations along one path with a cookie, or without. None: it costs little."""
+        kind = datagram[0]
+        if kind == wire.COOKIE:
             return None
-        is_response = kind[0] == wire.RESPONSE
-        return path, (datagram if is_response else self.cookies.has_valid_mac2(datagram, path, now))
+        return path, (datagram if kind == wire.RESPONSE else self.cookies.has_valid_mac2(datagram, path, now))
 
     def initiations_from(self, path: Path) -> list[Hashable]:
         """All that :meth:`source_of` returns for initiations along a path."""
@@ -119,8 +130,6 @@ class HandshakeReceiver:
 
     def _receive_initiation(self, datagram: bytes, path: Path, now: float) -> list[Output]:
         initiation = wire.parse_initiation(datagram)
-        self.admission.read(path, now)
-        self._check_mac1(datagram)
         remembered = self.remembered.get(initiation.ephemeral)
         if remembered is not None:  # before the budget: one recording must not use it up
             self._facts.check_network(remembered.peer, path)
@@ -177,18 +186,22 @@ class HandshakeReceiver:
 
     def _receive_response(self, datagram: bytes, path: Path, now: float) -> list[Output]:
         response = wire.parse_response(datagram)
+        peer, pending = self._find_pending(response, path)  # again: another response may have come meanwhile
+        message = Message(datagram, response.sender_index, path, self.cookies)
+        self.admission.admit(message, now, is_response=True)
+        out = establish.receive_response(peer, pending, response, path, now)
+        self._schedule.update(peer)
+        return out
+
+    def _find_pending(self, response: wire.Response, path: Path) -> tuple[Peer, Pending]:
+        """The initiation that a response answers, and its peer."""
         peer, pending = self._indices.owners.get(response.receiver_index, (None, None))
         if peer is None or not isinstance(pending, Pending):
             # The peer sends its response along several paths; the first one made the session.
             is_copy = isinstance(pending, Session) and pending.remote_index == response.sender_index
             raise Drop(DropReason.DUPLICATE if is_copy else DropReason.UNEXPECTED_RESPONSE)
         self._facts.check_network(peer, path)
-        self._check_mac1(datagram)
-        message = Message(datagram, response.sender_index, path, self.cookies)
-        self.admission.admit(message, now, is_response=True)
-        out = establish.receive_response(peer, pending, response, path, now)
-        self._schedule.update(peer)
-        return out
+        return peer, pending
 
     def _receive_cookie(self, datagram: bytes, path: Path, now: float) -> list[Output]:
         reply = wire.parse_cookie_reply(datagram)

@@ -171,9 +171,12 @@ class FrameCarrier:
         return envelopes
 
     def _hold_handshake(self, datagram: bytes, path: Path, now: float) -> None:
+        if (dropped := self._node.screen(datagram, path, now)) is not None:
+            self.perform((dropped,))
+            return
         # A sender repeats its initiation with other keys. The newest takes the place of the one before it.
         waiting, key = self._handshakes, self._node.handshake_source(datagram, path, now)
-        if key is None:  # it must not push out others
+        if key is None:
             self._do(datagram, path, now)
             return
         if (before := waiting.get(key)) is not None:
@@ -192,7 +195,7 @@ class FrameCarrier:
                 break
 
     def _do(self, datagram: bytes, path: Path, now: float) -> None:
-        self.perform(self._node.receive(datagram, path, now))
+        self.perform(self._node.receive(datagram, path, now, is_screened=True))
 
     def _do_turns(self) -> None:
         """Do one turn of each sender. Then the sockets, the timer and the control socket have theirs."""
