@@ -272,7 +272,8 @@ def test_only_what_passes_the_screen_may_wait() -> None:
     assert [node.screen(one, ELSEWHERE, 0.0) for one in initiations] == [None] * len(initiations)
     with patch.object(MacKeys, "has_valid_mac1", lambda *_: pytest.fail("a hash beyond the budget")):
         drop = node.screen(flooding(1), ELSEWHERE, 0.0)
-        assert drop is not None and drop.reason == "rate_limited"
+        assert drop is not None
+        assert drop.reason == "rate_limited"
         assert reasons(node.receive(flooding(1), ELSEWHERE, 0.0)) == ["rate_limited"]
         assert "rate_limited" not in reasons(node.receive(initiations[0], ELSEWHERE, 0.0, is_screened=True))
 

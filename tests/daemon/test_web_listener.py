@@ -109,6 +109,14 @@ def _https(status: Mapping[str, Any]) -> dict[str, Any]:
     return https
 
 
+def _hello() -> bytes:
+    """What a client of TLS sends first."""
+    outgoing = ssl.MemoryBIO()
+    with suppress(ssl.SSLWantReadError):
+        unverified().wrap_bio(ssl.MemoryBIO(), outgoing).do_handshake()
+    return outgoing.read()
+
+
 async def _ask(port: int, request: str) -> bytes:
     """The whole answer of the relay to a request of HTTP by TLS."""
     reader, writer = await asyncio.open_connection("127.0.0.1", port, ssl=unverified())
@@ -163,8 +171,9 @@ async def test_strangers_are_few(stage: Stage) -> None:
     relay, member, port = _relay(stage)
     await stage.start(relay)
     count, most = STRANGERS_OF_PREFIX + 8, 0
-    silent = [asyncio.open_connection("127.0.0.1", port) for _ in range(count)]
-    opened = await asyncio.gather(*silent)
+    opened = await asyncio.gather(*[asyncio.open_connection("127.0.0.1", port) for _ in range(count)])
+    for _, writer in opened:
+        writer.write(_hello())
     while sum((https := _https(await relay.status()))["refused"].values()) < count:
         most = max(most, https["strangers"])
         await asyncio.sleep(0.02)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import asyncio
 import errno
 import socket
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager, suppress
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager, suppress
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -19,6 +19,7 @@ from uavlinkd.config.model import HttpsServer
 from uavlinkd.core.path import Path, SocketAddress
 from uavlinkd.endpoints.sockets import BindError
 from uavlinkd.lab.sim.loopback_ports import free_port
+from uavlinkd.link import newcomers
 from uavlinkd.link import web_listener as module
 from uavlinkd.link.drop_summary import DropSummary
 from uavlinkd.link.web_listener import WebListener
@@ -60,21 +61,22 @@ class Port:
         peer = SimpleNamespace(paths=SimpleNamespace(by_path=paths | others))
         self.node.peers = cast(Any, {"drone1": peer})
 
-    async def connect(self, start: SocketAddress = ("127.0.0.1", 0)) -> socket.socket:
-        """Another connection."""
+    async def connect(self, start: SocketAddress = ("127.0.0.1", 0), first: bytes = b"G") -> socket.socket:
+        """Another connection. It begins a request, unless its first bytes are others."""
         client = socket.socket()
         self._clients.append(client)
         client.setblocking(False)
         client.bind(start)
         address = self.listener.address
         await asyncio.get_running_loop().sock_connect(client, (address.host, address.port))
+        client.send(first)
         return client
 
     async def open(self, forwarded: str = "", start: SocketAddress = ("127.0.0.1", 0)) -> socket.socket:
         """A connection for messages, which a web server forwards."""
         client = await self.connect(start)
         header = f"X-Forwarded-For: {forwarded}\r\n" if forwarded else ""
-        client.send(REQUEST.format(header).encode())
+        client.send(REQUEST.format(header).encode()[1:])
         return client
 
     @property
@@ -143,16 +145,85 @@ async def test_connections_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:
         assert relay.refused == {"too_many_connections": 1, "closed": 1}
 
 
-async def test_new_connections_wait_in_the_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_new_connections_wait_for_a_handshake(monkeypatch: pytest.MonkeyPatch) -> None:
     """None is refused."""
-    monkeypatch.setattr(module, "ACCEPTED_S", 40.0)
-    monkeypatch.setattr(module, "ACCEPTED_AT_ONCE", 2)
+    monkeypatch.setattr(module, "HANDSHAKES_S", 40.0)
+    monkeypatch.setattr(module, "HANDSHAKES_AT_ONCE", 2)
     watch = Stopwatch()
     async with port() as relay:
         for _ in range(12):
             await relay.connect()
         await until(lambda: relay.counts == (12, 12))
     assert watch.elapsed_s > 10 / 40
+
+
+async def test_silent_connections_cost_no_handshake_and_displace_only_those_of_their_source(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A newcomer that says something waits for none of them."""
+    monkeypatch.setattr(module, "HANDSHAKES_S", 0.001)
+    monkeypatch.setattr(module, "HANDSHAKES_AT_ONCE", 1)
+    monkeypatch.setattr(newcomers, "NEWCOMERS", 4)
+    async with port() as relay:
+        slow = await relay.connect(("127.0.1.1", 0), b"")
+        silent = [await relay.connect(first=b"") for _ in range(5)]
+        assert await is_ended(silent[0])
+        assert await is_ended(silent[1])
+        silent[2].close()
+        await until(lambda: relay.refused == {"displaced": 2, "closed": 1})
+        slow.send(b"G")
+        await until(lambda: relay.counts == (1, 1))
+
+
+@pytest.mark.parametrize(
+    ("pieces", "reasons"),
+    [
+        ([b"\x16\x03\x01", b"\x02\x00", bytes(511), b"\0"], {}),
+        ([b"GET / HTTP/1.1\r\n"], {"tls": 1}),
+        ([b"\x16\x03\x01\xff\xff"], {"tls": 1}),
+    ],
+    ids=["whole", "plain", "long"],
+)
+async def test_handshake_begins_with_a_whole_hello(pieces: list[bytes], reasons: dict[str, int]) -> None:
+    """The kernel keeps what is there of it, and reports the end of one that stays a part."""
+    welcomed: list[None] = []
+    refused: list[str] = []
+    with tcp_pair() as (ours, other):
+        one = newcomers.Newcomers(is_tls=True, refuse=refused.append, on_ready=lambda: welcomed.append(None))
+        one.add(newcomers.Newcomer(ours, ("192.0.2.1", 1), "192.0.2", 0, 0.0))
+        for piece in pieces[:-1]:
+            other.send(piece)
+            await asyncio.sleep(0.01)
+            assert (welcomed, refused) == ([], [])
+        other.send(pieces[-1])
+        await until(lambda: bool(welcomed or refused))
+        assert refused == list(reasons)
+        if welcomed:
+            assert one.pop().sock.recv(9999) == b"".join(pieces)
+
+
+async def test_part_of_a_hello_ends_by_its_age_or_with_its_connection() -> None:
+    """Both are counted."""
+    refused: list[str] = []
+    one = newcomers.Newcomers(is_tls=True, refuse=refused.append, on_ready=lambda: pytest.fail("a part"))
+    with tcp_pair() as (old, first), tcp_pair() as (ours, second):
+        one.add(newcomers.Newcomer(old, ("192.0.2.1", 1), "192.0.2", 0, 1.0))
+        one.add(newcomers.Newcomer(ours, ("192.0.2.1", 2), "192.0.2", 0, 2.0))
+        for other in (first, second):
+            other.send(b"\x16\x03\x01\x02\x00\x01")
+        one.end_since(1.5, "slow_handshake")
+        assert refused == ["slow_handshake"]
+        second.shutdown(socket.SHUT_WR)
+        await until(lambda: refused == ["slow_handshake", "closed"])
+
+
+@contextmanager
+def tcp_pair() -> Iterator[tuple[socket.socket, socket.socket]]:
+    """An accepted connection, and its other end."""
+    with socket.create_server(("127.0.0.1", 0)) as server, socket.create_connection(server.getsockname()) as other:
+        ours, _ = server.accept()
+        with ours:
+            yield ours, other
 
 
 async def test_networks_have_shares_of_the_strangers(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -193,9 +264,9 @@ async def test_newest_of_a_network_displaces_one_that_had_its_time(monkeypatch: 
 
 
 async def test_network_that_is_refused_keeps_no_other_one_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A connection that is refused costs less than one that is accepted."""
-    monkeypatch.setattr(module, "ACCEPTED_S", 0.1)
-    monkeypatch.setattr(module, "ACCEPTED_AT_ONCE", 3)
+    """A connection that is refused costs no handshake."""
+    monkeypatch.setattr(module, "HANDSHAKES_S", 0.1)
+    monkeypatch.setattr(module, "HANDSHAKES_AT_ONCE", 3)
     monkeypatch.setattr(module, "CONNECTIONS", 1)
     async with port() as relay:
         for _ in range(11):

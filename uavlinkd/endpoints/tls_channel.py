@@ -134,6 +134,7 @@ class TlsChannel:
             self._sock.close()
             self._backlog.close()
             self._rest = b""
+            self._tls = None  # otherwise its memory would wait for the collector of circles
 
     # Sending.
 

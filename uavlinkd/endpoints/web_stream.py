@@ -156,6 +156,7 @@ class WebStream:
             self.opened.set_result(reason)
         if self.handler is not None:
             self.handler.on_lost(reason)
+            self.handler = None
 
     def finish(self) -> None:
         """Send what waits, as far as there is room, and close the connection."""

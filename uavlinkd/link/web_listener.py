@@ -17,6 +17,7 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from ipaddress import IPv6Address, ip_address
+from math import inf
 from typing import Final
 
 from uavlinkd.config.model import HttpsServer
@@ -31,6 +32,7 @@ from uavlinkd.endpoints.tls_channel import TlsFactory, server_tls
 from uavlinkd.endpoints.web_stream import WebStream, server_protocol
 from uavlinkd.link.drop_summary import DropSummary
 from uavlinkd.link.networks import Receive
+from uavlinkd.link.newcomers import NEWCOMERS, Newcomer, Newcomers
 from uavlinkd.system.addresses import Address, numeric_host
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.stall import Backlog, StallWatch
@@ -47,23 +49,24 @@ STRANGER_MESSAGES: Final = 128
 has its answer."""
 DISPLACED_S: Final = 1.0
 """In a network that has its share, a new stranger displaces one that is so old."""
-ACCEPTED_S: Final = 200.0
-"""New connections a second: each costs a handshake of TLS. The others wait in the kernel."""
-REFUSED: Final = 0.1
-"""What a refused connection costs, in accepted ones: so one network does not use up what all others need."""
-ACCEPTED_AT_ONCE: Final = 20
-PAUSE_S: Final = 0.05
-"""Until the next connections are accepted,"""
+ACCEPTED_S: Final = 5000.0
+"""TCP connections a second. The others wait in the kernel."""
+ACCEPTED_AT_ONCE: Final = 100
+HANDSHAKES_S: Final = 200.0
+"""Connections a second that get a place when their first bytes are there: each costs a handshake of TLS."""
+HANDSHAKES_AT_ONCE: Final = 20
+PAUSE_S: Final = 0.02
+"""Until there are tokens for the next ones,"""
 EXHAUSTED_S: Final = 1.0
 """and without a file descriptor."""
 LOOK_AGAIN_S: Final = 0.1
 """While there are too many strangers, they are looked at this often at most."""
-FILES: Final = CONNECTIONS + 512
+FILES: Final = CONNECTIONS + NEWCOMERS + 512
 """File descriptors that the daemon asks for, with those of everything else."""
 SENDER: Final = "members by TLS"
 """The name of their stale datagrams."""
-_BACKLOG: Final = 128
-"""So many wait in the kernel, for 0.64 s at most. In a longer queue, members would give up under a flood."""
+_BACKLOG: Final = 1024
+"""So many wait in the kernel, for 0.2 s at most. In a shorter queue, a burst would cost a member a second."""
 _KEEPALIVE: Final = (
     (socket.SOL_SOCKET, "SO_KEEPALIVE", 1),
     (socket.IPPROTO_TCP, "TCP_KEEPIDLE", 30),
@@ -125,6 +128,9 @@ class WebListener:
         self._by_address: dict[SocketAddress, _Connection] = {}  # the open ones
         self._dropped = 0  # datagrams, of connections that ended
         self._accepted = TokenBucket(ACCEPTED_S, ACCEPTED_AT_ONCE, monotonic())
+        self._handshakes = TokenBucket(HANDSHAKES_S, HANDSHAKES_AT_ONCE, monotonic())
+        self._newcomers = Newcomers(is_tls=self._tls is not None, refuse=self._refuse, on_ready=self._welcome)
+        self._welcoming: asyncio.TimerHandle | None = None  # newcomers that are ready wait for tokens
         self._looked_at = 0.0
         self._resume: asyncio.TimerHandle | None = None
         try:
@@ -150,11 +156,13 @@ class WebListener:
 
     def close(self) -> None:
         """End every connection, and do not listen any more."""
-        if self._resume is not None:
-            self._resume.cancel()
+        for timer in (self._resume, self._welcoming):
+            if timer is not None:
+                timer.cancel()
         asyncio.get_running_loop().remove_reader(self._sock.fileno())
         self._sock.close()
         self._backlog.close()
+        self._newcomers.end_since(inf, "closed")
         for connection in list(self._every):
             connection.stream.finish()  # the sessions of the members have just been closed
 
@@ -171,6 +179,7 @@ class WebListener:
         now = monotonic()
         if self._every:
             self._look(now)
+        self._newcomers.end_since(now - STRANGER_S, "slow_handshake")
         for connection in [one for one in self._strangers if now - one.since >= STRANGER_S]:
             connection.stream.lose("unproven")
 
@@ -191,7 +200,7 @@ class WebListener:
     def _on_acceptable(self) -> None:
         now = monotonic()
         epoch = self._backlog.begin(now)
-        while self._accepted.has(now):
+        while self._accepted.take(now):
             try:
                 sock, sockaddr = self._sock.accept()
             except BlockingIOError:
@@ -199,14 +208,13 @@ class WebListener:
                 return
             except OSError as error:
                 if error.errno in _EXHAUSTED:  # else this one is gone already
-                    self._refuse(failure_name(error), now)
+                    self._refuse(failure_name(error))
                     self._pause(EXHAUSTED_S)
                     return
-                self._accepted.take(now, REFUSED)
                 continue
             self._backlog.end(1, is_empty=False)
-            is_accepted = self._accept(sock, (numeric_host(sockaddr), sockaddr[1]), epoch, now)
-            self._accepted.take(now, 1.0 if is_accepted else REFUSED)
+            address = numeric_host(sockaddr), sockaddr[1]
+            self._newcomers.add(Newcomer(sock, address, _prefix_of(address[0]), epoch, now))
         self._pause(PAUSE_S)
 
     def _pause(self, seconds: float) -> None:
@@ -214,26 +222,42 @@ class WebListener:
         loop.remove_reader(self._sock.fileno())
         self._resume = loop.call_later(seconds, self._watch)
 
-    def _accept(self, sock: socket.socket, address: SocketAddress, epoch: int, now: float) -> bool:
-        """Returns whether there was a place."""
-        prefix = None if self._tls is None else _prefix_of(address[0])  # a web server's connections are not its own
-        if reason := self._make_place(prefix, now):
-            self._refuse(reason, now)
-            sock.close()
-            return False
-        set_options(sock, _KEEPALIVE)
-        connection = _Connection(self, address, prefix, now)
-        connection.stream = WebStream(sock, server_protocol(), self._tls, connection, self._stall, SENDER, epoch)
+    def _welcome(self) -> None:
+        """Accept newcomers whose first bytes are there, as far as there are tokens."""
+        if self._welcoming is not None:
+            return
+        now = monotonic()
+        while self._newcomers.ready and self._handshakes.has(now):
+            newcomer = self._newcomers.pop()
+            if reason := self._make_place(newcomer, now):
+                self._refuse(reason)
+                newcomer.sock.close()
+            else:
+                self._handshakes.take(now)
+                self._accept(newcomer, now)
+        if self._newcomers.ready:
+            self._welcoming = asyncio.get_running_loop().call_later(PAUSE_S, self._welcome_later)
+
+    def _welcome_later(self) -> None:
+        self._welcoming = None
+        self._welcome()
+
+    def _accept(self, newcomer: Newcomer, now: float) -> None:
+        set_options(newcomer.sock, _KEEPALIVE)
+        prefix = None if self._tls is None else newcomer.source  # a web server's connections are not its own
+        connection = _Connection(self, newcomer.address, prefix, now)
+        connection.stream = WebStream(
+            newcomer.sock, server_protocol(), self._tls, connection, self._stall, SENDER, newcomer.epoch
+        )
         self._every.add(connection)
         self._add_stranger(connection)
         connection.stream.start()
-        return True
 
-    def _make_place(self, prefix: object, now: float) -> str:
+    def _make_place(self, newcomer: Newcomer, now: float) -> str:
         """For a stranger. Returns why there is none."""
         if len(self._every) >= CONNECTIONS:
             return "too_many_connections"
-        if self._is_full(prefix, now):
+        if self._tls is not None and self._is_full(newcomer.source, now):
             return "prefix_full"
         if len(self._strangers) >= STRANGERS:
             self._look_again(now)
@@ -256,9 +280,9 @@ class WebListener:
         self._drops.add("connections_failed", "displaced", "", 1, now)
         stranger.stream.lose("displaced")
 
-    def _refuse(self, reason: str, now: float) -> None:
+    def _refuse(self, reason: str) -> None:
         self.refused[reason] += 1
-        self._drops.add("connections_failed", reason, "", 1, now)
+        self._drops.add("connections_failed", reason, "", 1, monotonic())
 
     # Strangers.
 
