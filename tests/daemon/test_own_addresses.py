@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from contextlib import suppress
 
 import pytest
@@ -51,12 +52,19 @@ async def test_answers_leave_from_the_address_that_was_asked(
         await hosts.start()
 
         with udp_socket_in(hosts.hosts[0].path, vehicle) as client:
-            client.connect((asked, CLIENTS_PORT))
-            client.send(frame(1, system=7))
 
             def is_served() -> bool:
                 with suppress(BlockingIOError):
                     return bool(client.recv(2048))
                 return False
 
+            if is_ipv6:  # all hosts of the network are asked: no answer can leave from their address
+                hosts.hosts[0].nft("flush ruleset")
+                with hosts.hosts[0].entered():
+                    scope = socket.if_nametoindex(interface_of(ONLY))
+                client.sendto(frame(1, system=7), ("ff02::1", CLIENTS_PORT, 0, scope))
+                await until(is_served)
+                hosts.hosts[0].nft(FIREWALL)
+            client.connect((asked, CLIENTS_PORT))
+            client.send(frame(1, system=7))
             await until(is_served)

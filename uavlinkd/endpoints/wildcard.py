@@ -67,7 +67,10 @@ class WildcardSocket(socket.socket):
                 preferred = other.getsockname()[0].partition("%")[0]
         except OSError:  # no route leads there now
             return sender
-        return sender if preferred == host else (*sender, host)
+        is_multicast = host.startswith(
+            "ff"
+        )  # of IPv6; it cannot be a source. For IPv4 the kernel names an own address
+        return sender if preferred == host or is_multicast else (*sender, host)
 
 
 def sibling(sock: socket.socket) -> socket.socket:
