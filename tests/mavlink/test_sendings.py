@@ -78,6 +78,16 @@ def test_frame_does_not_travel_in_a_circle(delay: float, origin: str) -> None:
     assert all(port in "ab" for port in circles)
 
 
+def test_bridge_that_doubles_each_frame_causes_no_storm() -> None:
+    """A frame of the bridge itself, whose copies return one after the other."""
+    world = World(router("a1", "b1"))
+    ways = [("a1", "b1"), ("b1", "a1")]
+    world.bridges += [Bridge(*way, delay) for way in ways for delay in (0.001, 0.003, 0.009)]
+    world.send(beat(b"x"), "b1")
+    world.run()
+    assert set(world.delivered.values()) == {1}
+
+
 def test_autopilot_joined_by_peer_and_radio_is_no_circle() -> None:
     """The peer's frame goes out of the radio to its own sender, which forwards it to the peer's end."""
     world = World(router("radio", "pilot"))
@@ -93,6 +103,8 @@ def test_client_that_repeats_a_broadcast_loses_one() -> None:
     r = router("a", "b")
     assert [bool(r.route(beat(b"x"), "a", float(at))) for at in range(8)] == [True, False, *[True] * 6]
     assert r.sendings.circles == {}
+    passed = [bool(r.route(beat(b"y"), "a", 9 + at / 16)) for at in range(24)]
+    assert sum(passed) == 12  # at 16 Hz every second one: those are REPEATED_S apart
     r = router("a")
     assert all(r.route(beat(b"x"), "a", at / 10) and r.route(beat(b"y", 9), "peer", at / 10) for at in range(8))
 

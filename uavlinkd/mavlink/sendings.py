@@ -18,6 +18,8 @@ REMEMBERED_S: Final = 5.0
 """A frame is remembered for this time at least, and up to twice that, unless too many arrive."""
 CIRCLE_S: Final = 60.0
 """A circle is remembered for this time after the last return."""
+REPEATED_S: Final = 0.1
+"""Repetitions of one broadcast that could be returns are sent on so far apart at least."""
 SEQUENCE: Final = 256
 """After so many frames a sender may have the same sequence number again."""
 MAX_FRAMES_REMEMBERED: Final = 4096  # in each half of the memory
@@ -141,15 +143,16 @@ class Sendings:
             for port in known.ports
             if not self._is_peer(port) and (not self._is_peer(source) or sender in self._received_at.get(port, ()))
         ]
-        may_return = through and not known.is_repeated and frame.header.target_system == 0
+        is_apart = now - known.at >= REPEATED_S  # a circle with several returns of each sending cannot swell
+        may_return = through and not (known.is_repeated and is_apart) and frame.header.target_system == 0
         if self._count - known.number >= SEQUENCE or not (may_return or is_proven):
             return False
         if known.return_s is None:
             known.return_s = now - known.at
             self._note(source, through or known.ports, now, is_suspected=True)
-        elif quiet_s >= 4 * known.return_s:  # a return would have come earlier
+        elif is_apart and quiet_s >= 4 * known.return_s:  # a return would have come earlier
             return False
-        elif quiet_s >= known.return_s / 2 and not is_proven:  # nothing was sent that could return
+        elif quiet_s >= known.return_s / 2 and is_apart and not is_proven:  # nothing was sent that could return
             known.is_repeated = True
             self.circles.pop(source, None)
             return False
