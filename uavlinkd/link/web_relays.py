@@ -64,9 +64,10 @@ _RNG: Final = SystemRandom()
 
 
 class WebGate(Bucket):
-    """Lets frames out when a connection sends them at once: they wait here, where newer ones replace them."""
+    """Lets frames out when a connection sends them at once: they wait here, where old ones are dropped."""
 
     __slots__ = ("_room",)
+    keeps_order = True
 
     def __init__(self, room: Callable[[], float]) -> None:
         super().__init__(0.0, 0.0, 1.0)

@@ -49,6 +49,28 @@ def test_frames_leave_in_order_whatever_their_class() -> None:
         assert [raw for _, raw in radio.sent] == raws(frames)
 
 
+class Stream(Bucket):
+    """A connection by TLS that takes nothing until it is opened."""
+
+    keeps_order = True
+
+    def level(self, now: float) -> float:
+        return super().level(now) if now >= 0.5 else 0.0
+
+
+def test_frames_wait_in_order_for_room_in_a_stream() -> None:
+    """None replaces or overtakes another one, however many wait."""
+    radio = Radio(NO_BUDGET, Stream(FAST_BITS_S, 0.0))
+    frames = [
+        one for n in range(20) for one in (attitude(n), log_data(n), command(n), attitude(n + 100), heartbeat(n))
+    ]
+    for number, one in enumerate(frames):
+        radio.put(one, now=0.004 * number)
+    assert not radio.sent
+    radio.run(2.0)
+    assert [raw for _, raw in radio.sent] == raws(frames)
+
+
 def test_urgent_frame_goes_when_the_first_network_has_room() -> None:
     """The best path's network is exhausted, the second one is not. All other frames wait for the best one."""
     best, second = Bucket(SLOW_BITS_S, 0.0), Bucket(FAST_BITS_S, 0.0)

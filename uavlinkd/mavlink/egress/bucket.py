@@ -28,6 +28,9 @@ class Bucket:
 
     __slots__ = ("_bytes", "_least_burst", "_line", "_now", "_offered", "burst", "rate")
 
+    keeps_order = False
+    """Whether frames that wait for it leave in the order of arrival: no frame replaces or overtakes another one."""
+
     def __init__(self, budget_bits_s: float, now: float, least_burst: float = 0.0) -> None:
         self.rate = budget_bits_s / 8
         self.burst = 0.0  # the most bytes that it holds
@@ -105,7 +108,7 @@ class Supply:
     without a budget, which always has room.
     """
 
-    __slots__ = ("is_limited", "networks", "own", "rate")
+    __slots__ = ("is_limited", "keeps_order", "networks", "own", "rate")
 
     def __init__(self, own: Bucket | None = None, networks: Sequence[Bucket | None] = (None,)) -> None:
         self.own = own
@@ -113,6 +116,7 @@ class Supply:
         self.networks = tuple(limited) if len(limited) == len(networks) else ()
         self.is_limited = own is not None or bool(self.networks)
         """Whether frames may have to wait for a budget."""
+        self.keeps_order = own is None and all(network.keeps_order for network in self.networks)
         self.rate = min(
             inf if own is None else own.rate, max((network.rate for network in self.networks), default=inf)
         )

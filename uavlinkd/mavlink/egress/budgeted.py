@@ -9,7 +9,8 @@ share an envelope. An urgent frame ends the wait at once and takes along the fra
 *The budget*: a bucket of bytes (:mod:`.bucket`). Every datagram to the peer empties it by all its bytes on the wire:
 IP and UDP header, envelope, handshakes and echoes too.
 
-While the bucket covers all waiting frames, they leave in their order of arrival. When it does not:
+While the bucket covers all waiting frames, they leave in their order of arrival. So do those that wait for room in a
+stream (TLS), which is soon there: the oldest are dropped, and none overtakes another one. Else:
 
 * Urgent frames go first, of each sender in turn, along any network with room. If the best path's network has room,
   they share an envelope with other waiting frames.
@@ -136,7 +137,7 @@ class Egress:
         self._advance(now)
         lanes = self.lanes
         lanes.drop_stale(now, self.settings.max_age_s)
-        next_one = lanes.next if self._is_short(0) else lanes.first
+        next_one = self._next
         first = next_one()
         if first is None or now < self._due_at():
             self._leave()
@@ -165,7 +166,7 @@ class Egress:
 
     def next_deadline(self) -> float:
         """When :meth:`take` is due next; infinity while no frame waits."""
-        first = self.lanes.next()
+        first = self._next()
         if first is None:
             return inf
         supply = self._supply_of(first)
@@ -187,6 +188,10 @@ class Egress:
     def _advance(self, now: float) -> None:
         self._now = max(self._now, now)
         self._bytes = self._level(self._now)
+
+    def _next(self) -> Waiting | None:
+        """The frame whose turn it is."""
+        return self.lanes.next() if self._is_short(0) and not self.supply.keeps_order else self.lanes.first()
 
     def _supply_of(self, first: Waiting) -> Supply:
         return self._urgent_supply if _is_urgent(first.frame) else self.supply
@@ -223,7 +228,7 @@ class Egress:
 
     def _is_superseded(self, waiting: Waiting, newer: Frame, now: float) -> bool:
         """A newer state replaces an older one while the budget is short."""
-        return self._is_short(len(newer.raw))
+        return self._is_short(len(newer.raw)) and not self.supply.keeps_order
 
     def _on_drop(self, waiting: Waiting, reason: EgressDrop) -> None:
         if reason is not EgressDrop.CLOSED:
