@@ -25,9 +25,9 @@ class AdmittingNode(Node):
         self.accepts = True
         """Whether a peer that proved itself is accepted at once."""
 
-    def receive(self, datagram: bytes, path: Path, now: float) -> list[Output]:
+    def receive(self, datagram: bytes, path: Path, now: float, *, is_screened: bool = False) -> list[Output]:
         out: list[Output] = []
-        for output in super().receive(datagram, path, now):
+        for output in super().receive(datagram, path, now, is_screened=is_screened):
             out += self._answer(output, now) if isinstance(output, CertificateShown) else [output]
             if isinstance(output, PeerAdmitted) and isinstance(output.peer, Peer) and self.accepts:
                 self.accept(output.peer)
