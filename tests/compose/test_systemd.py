@@ -29,9 +29,6 @@ name = "$1"
 private_key_file = "$1.key"
 listen = ["$3"]
 control_socket = "/run/uavlinkd/$1/control.sock"
-[recording]
-folder = "/var/lib/uavlinkd/$1/recordings"
-min_free_bytes = 100_000
 [[endpoint]]
 name = "autopilot"
 url = "udpin:127.0.0.1:$5"

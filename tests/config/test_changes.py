@@ -82,7 +82,6 @@ def test_changes_are_found(tmp_path: Path, before: str, after: str, changes: dic
         (GOOD, f'control_socket = "a"\n{GOOD}', "control_socket"),
         (GOOD, GOOD + '[log]\nlevel = "debug"\n', "log"),
         (GOOD, GOOD + "[routing]\nrelay = true\n", "routing"),
-        (GOOD, GOOD + '[recording]\nfolder = "a"\n', "recording"),
         (GOOD, GOOD + member("c"), "member"),
         (GOOD + member("c"), GOOD + member("c") + HTTPS, "relay_server.https"),
     ],

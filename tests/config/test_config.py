@@ -33,7 +33,7 @@ from tests.config.files import (
 from tests.samples import heartbeat
 from uavlinkd.config import keys
 from uavlinkd.config.load import load_config
-from uavlinkd.config.model import ConfigError, NetworkConfig, PeerAddress, Recording
+from uavlinkd.config.model import ConfigError, NetworkConfig, PeerAddress
 from uavlinkd.config.network_rules import used_networks
 from uavlinkd.core import constants as c
 from uavlinkd.core.settings import Link, Redundancy, Timers
@@ -59,7 +59,7 @@ def test_ten_lines_are_enough(tmp_path: Path) -> None:
     assert peer.addresses == (PeerAddress(Address("10.13.0.2", 5790)),)
     assert (peer.settings.link, peer.settings.psk, peer.egress) == (Link(), None, EgressSettings())
     assert (config.log.level, config.log.format, config.relays_frames) == ("info", "auto", False)
-    assert (config.control_socket, config.recording, config.networks) == (None, None, ())
+    assert (config.control_socket, config.networks) == (None, ())
     assert config.warnings == ()
 
 
@@ -68,17 +68,13 @@ def test_every_section_is_read(tmp_path: Path) -> None:
     config = load(
         tmp_path,
         f'control_socket = "a.sock"\n{HEAD}{ENDPOINT}radio_status = true\nstatus_text = true\n{PEER}[routing]\n'
-        'relay = true\n[log]\nlevel = "debug"\nformat = "json"\n'
-        '[recording]\nfolder = "flights"\n',
+        'relay = true\n[log]\nlevel = "debug"\nformat = "json"\n',
     )
     assert config.control_socket == tmp_path / "a.sock"
     assert (config.endpoints[0].radio_status, config.endpoints[0].status_text) == (True, True)
     assert config.relays_frames
     assert (config.log.level, config.log.format) == ("debug", "json")
-    assert config.recording == Recording(tmp_path / "flights", 100, 1_000_000_000)
     assert config.warnings == ()
-    other = load(tmp_path, f"{GOOD}[recording]\nfolder = '/srv/f'\nmax_files = 2\nmin_free_bytes = 100_000\n")
-    assert other.recording == Recording(Path("/srv/f"), 2, 100_000)
     assert load(tmp_path, f'control_socket = "/run/a.sock"\n{GOOD}').control_socket == Path("/run/a.sock")
 
 

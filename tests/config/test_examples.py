@@ -15,7 +15,6 @@ from uavlinkd.config.schema import (
     EndpointSection,
     LinkSection,
     PolicySection,
-    RecordingSection,
     RoutingSection,
 )
 from uavlinkd.mavlink.policy.roles import ROLES
@@ -66,13 +65,11 @@ def test_configuration_in_a_readme_is_valid(tmp_path: Path, text: str) -> None:
 def test_station_has_every_default() -> None:
     """The ground station's file contains every key with its default, and names each key of a policy."""
     table = tomllib.loads(STATION)
-    off = {"recording": {"folder"}}  # the file has it as a comment
     for name, model in (
         ("link", LinkSection),
         ("routing", RoutingSection),
-        ("recording", RecordingSection),
     ):
-        assert set(table[name]) == set(model.model_fields) - off.get(name, set())
+        assert set(table[name]) == set(model.model_fields)
         assert model.model_validate(table[name]) == model()
     (endpoint,) = table["endpoint"]
     assert set(endpoint) == set(EndpointSection.model_fields) - set(PolicySection.model_fields)

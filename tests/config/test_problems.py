@@ -56,7 +56,7 @@ _PEER_ROWS = [
     ('Endpoint = "10.0.0.1:1"', "Endpoint", "addresses"),
     ('interface = "wlan0"', "interface", 'a [[network]] "mesh" with this'),
     ("colour = 'red'", "colour", "the keys are"),
-    ("recording = 1", "recording", "write [recording], a section of its own"),
+    ("routing = 1", "routing", "write [routing], a section of its own"),
     ("confidental = true", "confidental", "did you mean confidential?"),
 ]
 # Old and new text in the good file.
@@ -86,7 +86,6 @@ _CHANGE_ROWS = [
 _AT_TOP_ROWS = [
     ('log_level = "debug"', "log_level", "write [log]"),
     ("relay = true", "relay", "in [routing]"),
-    ('folder = "flights"', "folder", "in [recording]"),
     ("tag_bits = 96", "tag_bits", "in [link] or in a [[peer]]"),
     (f'private_key = "{KEY["b"]}"', "private_key", "this file never contains a key"),
     ('previous_private_key_file = "a.key"', "previous_private_key_file", "`uavlinkd fleet rotate NAME` writes"),
@@ -117,7 +116,7 @@ _FILE_ROWS = [
     ),
     (TOP + ENDPOINT + OTHER_PEER, "peer[0].addresses (drone2)", "neither end could initiate"),
     (GOOD + "[metrics]\n", "metrics", "was removed: delete [metrics]; `uavlinkd web` serves http://127.0.0.1:8790"),
-    (GOOD + "[recording]\nmin_free_bytes = 1e6\n", "recording.min_free_bytes", "min_free_bytes = 1_000_000_000"),
+    (GOOD + "[recording]\n", "recording", "was removed: run `uavlinkd record URL FILE` beside the daemon"),
     # Networks.
     (networks(LTE + LTE.replace("wwan0", "wwan1")), "network[1].name (lte)", "the name of network[0] (lte) too"),
     (networks(LTE + LTE.replace("lte", "b")), "network[1].interface (b)", "the interface of network[0] (lte) too"),

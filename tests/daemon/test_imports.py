@@ -66,12 +66,11 @@ async def imported(hook: Path, *packages: str) -> list[str]:
 
 
 async def test_a_daemon_imports_no_laboratory(stage: Stage) -> None:
-    """Nor what the page speaks HTTP with, nor pymavlink, with every part in use: endpoints, recording, a reload."""
+    """Nor what the page speaks HTTP with, nor pymavlink, with every part in use: endpoints, a reload."""
     a, b = stage.pair()
     a.add_endpoint("client")
     a.add_endpoint("server", "tcp:127.0.0.1:9")
     a.add_endpoint("autopilot", "serial:/dev/absent.test:57600")
-    a.config["recording"] = {"folder": "recordings"}
     hook, environ = hooked(stage, HOOK)
     await a.start(environ)
     await b.start()

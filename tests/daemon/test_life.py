@@ -13,12 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from tests.daemon.frames import frame
 from tests.daemon.harness import Stage
 from tests.daemon.process import DaemonProcess
 from tests.needs import need
 from tests.waiting import PATIENCE_S, until
-from uavlinkd.lab.sim.tlog import read_tlog
 
 
 def run(daemon: DaemonProcess, *command: str) -> subprocess.CompletedProcess[str]:
@@ -163,29 +161,3 @@ async def test_manager_is_notified_from_the_start_to_the_end(stage: Stage) -> No
     await a.stop()
     assert manager.received[-1] == "STOPPING=1"
     transport.close()
-
-
-# The recording of a real daemon.
-
-FROM_PEER = 0
-
-
-def recorded(daemon: DaemonProcess) -> list[tuple[int, bytes]]:
-    """Which way, and what, of its only file."""
-    (path,) = (daemon.folder / "flights").iterdir()
-    return [(record.time_us & 3, record.frame) for record in read_tlog(path).records]
-
-
-async def test_what_a_policy_refuses_is_recorded_as_it_came(stage: Stage) -> None:
-    """It crossed the link: of a captured peer one wants to know what it tried."""
-    a, b = stage.pair()
-    b.config["recording"] = {"folder": "flights", "min_free_bytes": 100_000}
-    into_a = a.add_endpoint("autopilot")
-    b.config["peer"][0] |= {"system_ids": [7], "role": "vehicle"}
-    await stage.start(a, b)
-    client = await stage.client()
-    client.send(frame(1), into_a)
-    await b.until(lambda status: bool(status["peers"]["drone0"]["refused"]["in"]))
-    await b.until(lambda status: status["recording"]["frames"] == 1)
-    await b.stop()
-    assert recorded(b) == [(FROM_PEER, frame(1))]

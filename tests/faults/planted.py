@@ -142,9 +142,6 @@ PLACES: Final[Sequence[Place]] = (
     Place("authority/state_file.py", "write", trigger="bulletin"),
     Place("authority/state_file.py", "write", "return", trigger="bulletin"),
     Place("link/fleet_members.py", "FleetMembers._on_written", trigger="bulletin"),
-    Place("ops/recorder.py", "Recorder.do_housekeeping"),
-    Place("ops/recorder.py", "Recorder._write"),
-    Place("ops/tlog_files.py", "TlogFolder.append"),
     Place("link/status.py", "daemon_status", trigger="status"),
     # Again and again, in the middle of a reload, and before a timer could set itself again.
     Place("core/node.py", "Node.handle_next", times=MOST_FAULTS),
@@ -248,7 +245,7 @@ class Scene:
         ground.code, ground.is_planted = RUN, True
         ground.environ |= self.manager.environ
         self.fleet.join(ground, MemberRole.OPERATOR, 255)
-        ground.config |= {"relay_server": {}, "recording": {"folder": str(ground.folder / "flights")}}
+        ground.config["relay_server"] = {}
         ground.config["endpoint"].append({"name": "tcp", "url": f"tcpin:127.0.0.1:{self._tcp_port}"})
         self._parties["ground"] = Party(await self.stage.client(), ground.add_endpoint("screen"), 255)
         for number, vehicle in enumerate(self.vehicles.values(), 1):

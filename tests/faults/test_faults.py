@@ -49,32 +49,24 @@ async def clock_jumps(stage: Stage) -> Outcome:
     a, b = stage.pair(rekey_after_s=1.0, reject_after_s=5.0)
     clock = a.folder / "clock"
     clock.write_text("+0")
-    a.config["recording"] = {"folder": "recordings", "min_free_bytes": 100_000}
     a.config["log"] = {"level": "debug"}  # rekeys are logged
     talk = prepare(a, b)
     environ |= {"FAKETIME_TIMESTAMP_FILE": str(clock), "FAKETIME_NO_CACHE": "1"}
     a.environ = environ
     await stage.start(a, b)
     await talk.start()
-    await a.until(lambda status: status["recording"]["frames"] > 0)
     began, log = monotonic(), Log(a)
     recovered_s = 0.0
-    recordings = a.folder / "recordings"
-    for files, years in ((2, 10), (3, -54)):
+    for years in (10, -54):
         clock.write_text(f"{365 * years:+}d")
         jumped = monotonic()
         recovered_s = max(recovered_s, await talk.back(jumped))
         await until(lambda years=years: _has_keys_of(a, years))  # type: ignore[misc]
-        await until(lambda files=files: len(list(recordings.iterdir())) == files)  # type: ignore[misc]
     ended = monotonic()
     await talk.check_lost_none(began, ended, a, b)
     assert not a.events("peer_lost")
-    status = await a.status()
-    assert status["recording"]["frames_lost"] == 0
     talk.stop()
-    return Outcome(
-        "no frame lost, new keys made meanwhile; three recordings, one for each time", recovered_s, log.count
-    )
+    return Outcome("no frame lost, new keys made meanwhile", recovered_s, log.count)
 
 
 def _has_keys_of(daemon: DaemonProcess, years: int) -> bool:

@@ -78,7 +78,6 @@ def config(name: str, url: NetworkUrl, peer: str, addresses: tuple[Address, ...]
         ),
         relays_frames=False,
         control_socket=None,
-        recording=None,
         log=Log("info", "json"),
         warnings=(),
     )

@@ -85,7 +85,6 @@ class Daemon(Scene):
             relays=SimpleNamespace(by_name={}),
             relay=None,
             fleet=None,
-            recorder=None,
             guard=SimpleNamespace(faults=Counter(), last_at=0.0),
             local=SimpleNamespace(endpoints=self.local),
             switch=SimpleNamespace(router=self.router),
@@ -307,7 +306,7 @@ def test_own_key_on_another_machine(daemon: Daemon) -> None:
 
 
 def test_problems_of_the_daemon(daemon: Daemon) -> None:
-    """Bare MAVLink, a flood of handshakes, a pause, a refused file, and a recording that cannot be written."""
+    """Bare MAVLink, a flood of handshakes, a pause, and a refused file."""
     daemon.set_up(role="all", system_ids="all")
     daemon.dropped(DropReason.RAW_MAVLINK, STRANGER)
     for _ in range(diagnosis.LOAD // 2):
@@ -315,15 +314,13 @@ def test_problems_of_the_daemon(daemon: Daemon) -> None:
         daemon.dropped(DropReason.RATE_LIMITED, STRANGER)
     daemon.history.paused = NOW, 4.0
     daemon.history.refused_file = ["drone0.toml: link.tag_bits: must be 64, 96, 128 or 256", "another"]
-    daemon.parts.recorder = SimpleNamespace(is_recording=False, failures={"ENOSPC": 1})
-    findings, lasting = daemon.findings(), {"recording_stopped", "configuration_refused"}
-    assert set(findings) == {*lasting, "raw_mavlink", "under_load", "daemon_paused"}
+    findings = daemon.findings()
+    assert set(findings) == {"configuration_refused", "raw_mavlink", "under_load", "daemon_paused"}
     assert {finding.severity for finding in findings.values()} == {Severity.WARNING}
     assert "198.51.100.7:5790" in findings["raw_mavlink"].text
     assert "never block a peer's address" in findings["under_load"].remedy
-    assert "ENOSPC" in findings["recording_stopped"].text
     assert "tag_bits: must be 64, 96, 128 or 256 and 1 more" in findings["configuration_refused"].text
-    assert set(daemon.findings(NOW + 31)) == lasting
+    assert set(daemon.findings(NOW + 31)) == {"configuration_refused"}
 
 
 def test_senders_without_a_member_here_have_their_own_addresses(daemon: Daemon) -> None:

@@ -88,14 +88,13 @@ LINK_ROWS = (
     Mistake(
         "47", scenes.closed_client, signs=_here("client_unreachable", r"start the client there, or correct the port")
     ),
-    Mistake("48", scenes.recording, signs=_here("recording_stopped", r"daemon's user")),
     Mistake(
         "50",
         scenes.reload,
         command=r"tag_bits: must be 64, 96, 128 or 256",
         signs=_here("configuration_refused", r"`uavlinkd check --config .*` prints, and run `uavlinkd reload`"),
     ),
-    Mistake("51", scenes.reload_listen, command=r"recording: cannot change while the daemon runs: restart it"),
+    Mistake("51", scenes.reload_listen, command=r"routing: cannot change while the daemon runs: restart it"),
     Mistake(
         "52",
         scenes.without_restart,

@@ -244,16 +244,6 @@ async def closed_client(scene: Scene) -> None:
     await scene.send(into, _vehicle(2))
 
 
-async def recording(scene: Scene) -> None:
-    """A file has the name of the folder."""
-    scene.introduce()
-    (scene.here.folder / "file").touch()
-    scene.here.config["recording"] = {"folder": "file"}
-    into = scene.here.add_endpoint("autopilot")
-    await _linked(scene)
-    await scene.send(into, _vehicle(1))
-
-
 async def reload(scene: Scene) -> None:
     """The running daemon gets an invalid file."""
     scene.introduce()
@@ -266,7 +256,7 @@ async def reload_listen(scene: Scene) -> None:
     """It gets a file with a key that needs a restart."""
     scene.introduce()
     await scene.start(scene.here)
-    scene.here.config["recording"] = {"folder": "recordings"}
+    scene.here.config["routing"] = {"relay": True}
     scene.command = await said_by_process("reload", "--config", str(scene.here.write_config()))
 
 

@@ -36,7 +36,6 @@ COUNTS: Mapping[str, int] = {
     "stale": 1,
     "unrouted": 1,
     "send_failures": 1,
-    "recording.failures": 1,
     "relay.dropped": 1,
     "relay.https.refused": 1,
     "relay.https.lost": 1,
@@ -69,7 +68,6 @@ ALSO = {
     "relays.*.paths[].network": "string",
     "relays.*.paths[].own_address": "string",
     "endpoints.*.clients.*.last_received_s": "null",
-    "recording": "null",
     "relay.https": "null",
     "process.resident_bytes": "null",
     "fleet.events.*": "number",
@@ -87,7 +85,6 @@ async def observed() -> dict[str, str]:
     async with Stage() as stage:
         a, b = stage.pair(probe_interval_s=0.1)
         a.config["peer"][0]["system_ids"] = [9]
-        a.config["recording"] = {"folder": "recordings"}
         into_a, into_b = a.add_endpoint("autopilot"), b.add_endpoint("autopilot")
         await stage.start(a, linked=False)
         statuses.append(await a.status())

@@ -34,7 +34,6 @@ def overview(names: Iterable[str] = ("drone1",), **facts: object) -> Status:
         "unrouted": {},
         "send_failures": {},
         "relay": None,
-        "recording": None,
         **facts,
     }
 

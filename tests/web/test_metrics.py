@@ -130,7 +130,6 @@ STATUS: dict[str, Any] = {
     "unrouted": numbered("unknown_target"),
     "send_failures": numbered("ENETUNREACH"),
     "stale": numbered("autopilot"),
-    "recording": {"is_recording": True, "failures": numbered("ENOSPC"), **numbered("frames", "bytes", "frames_lost")},
 }
 ALL_NUMBERS = set(range(1000, next(_NUMBERS)))
 
@@ -181,8 +180,8 @@ def test_unknown_values_have_no_sample() -> None:
     assert 'line_radio_rssi{end="there",network="sik"}' not in names
     assert not any('="quiet"' in name and "line_radio_r" in name and "reports" not in name for name in names)
     assert not any('network="lte"' in name for name in names if name.startswith("line_"))
-    bare = samples(STATUS | {"recording": None, "relay": None})
-    assert not any(name.startswith(("recording", "relay_")) for name in bare)
+    bare = samples(STATUS | {"relay": None})
+    assert not any(name.startswith("relay_") for name in bare)
 
 
 def test_prometheus_accepts_the_format() -> None:

@@ -20,7 +20,6 @@ from uavlinkd.config.model import (
     PeerAddress,
     PeerConfig,
     PolicyData,
-    Recording,
     RelayConfig,
     RelayServer,
 )
@@ -33,7 +32,6 @@ from uavlinkd.config.schema import (
     LinkSection,
     MemberSection,
     PolicySection,
-    RecordingSection,
     RelayServerSection,
 )
 from uavlinkd.core import constants as c
@@ -76,7 +74,6 @@ def build(path: Path, file: Sections, states: Path) -> Config:
         peers=(*pinned, *(_contact_peers(file, fleet) if fleet else ())),
         relays_frames=file.routing.get("relay", False),
         control_socket=file.folder / socket if socket else None,
-        recording=_recording(file),
         log=Log(**file.log.valid),
         networks=tuple(network_of(network) for network in file.networks),
         relay_server=_relay_server(file),
@@ -147,11 +144,6 @@ def _contact_peers(file: Sections, fleet: FleetConfig) -> Iterator[PeerConfig]:
         certificate: Certificate = section.valid["certificate"].certificate
         if certificate.role in fleet.policies:
             yield member_peer(fleet, section.valid["public_key"], certificate)
-
-
-def _recording(file: Sections) -> Recording | None:
-    keys = RecordingSection.model_construct(**file.recording.valid)
-    return Recording(file.folder / keys.folder, keys.max_files, keys.min_free_bytes) if keys.folder else None
 
 
 def _endpoint(section: Values) -> EndpointConfig:

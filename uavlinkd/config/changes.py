@@ -17,7 +17,6 @@ _FIXED = {
     "control_socket": "control_socket",
     "log": "log",
     "relays_frames": "routing",
-    "recording": "recording",
 }
 """Fields that cannot change while the daemon runs, with the key of each in the file."""
 _NEEDS_RESTART = "cannot change while the daemon runs: restart it, or put the old value back"

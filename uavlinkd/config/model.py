@@ -229,15 +229,6 @@ class FleetConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class Recording:
-    """Recordings of the frames on the link: the newest ``max_files``. ``min_free_bytes`` stay free on the disk."""
-
-    folder: Path
-    max_files: int
-    min_free_bytes: int
-
-
-@dataclass(frozen=True, slots=True)
 class Log:
     """``level``: debug, info, warning or error. ``format``: console, json, or auto (console on a terminal)."""
 
@@ -263,7 +254,6 @@ class Config:
     peers: tuple[PeerConfig, ...]
     relays_frames: bool
     control_socket: Path | None
-    recording: Recording | None
     log: Log
     networks: tuple[NetworkConfig, ...] = ()
     relay_server: RelayServer | None = None

@@ -64,7 +64,6 @@ class Sections:
     link: Values
     log: Values
     routing: Values
-    recording: Values
     relay_server: Values
     fleet: Values
     networks: list[Values]
@@ -257,6 +256,7 @@ _REMOVED = {
         " and reload the others at the same time; in a fleet, `uavlinkd fleet rotate NAME` writes the files",
     ),
     **dict.fromkeys(("deny_in", "deny_out"), INSTEAD_OF_DENIAL),
+    "recording": "run `uavlinkd record URL FILE` beside the daemon",
     "metrics": "delete [metrics]; `uavlinkd web` serves http://127.0.0.1:8790/metrics",
 }
 """Keys and sections that files of earlier versions may have."""

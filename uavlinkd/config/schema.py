@@ -378,12 +378,6 @@ class RoutingSection(Section):
     relay: bool = False
 
 
-class RecordingSection(Section):
-    folder: FileName | None = Field(default=None, examples=['"recordings"'])
-    max_files: int = Field(default=100, ge=2, le=100_000)
-    min_free_bytes: int = Field(default=1_000_000_000, ge=100_000, le=10**15, examples=["1_000_000_000"])
-
-
 class LogSection(Section):
     level: Literal["debug", "info", "warning", "error"] = "info"
     format: Literal["auto", "console", "json"] = "auto"
@@ -402,7 +396,6 @@ SINGLE: dict[str, type[Section]] = {
     "link": LinkSection,
     "log": LogSection,
     "routing": RoutingSection,
-    "recording": RecordingSection,
     "relay_server": RelayServerSection,
     "fleet": FleetSection,
 }

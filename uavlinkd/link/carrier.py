@@ -29,7 +29,6 @@ from uavlinkd.link.relay_link import RELAYED_START, WaitingDatagram
 from uavlinkd.link.relays import TOKEN_START
 from uavlinkd.link.turns import Turns, cost_of
 from uavlinkd.mavlink.frames import Frame, parse_frames, pass_faults
-from uavlinkd.ops.recorder import FROM_PEER
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.guard import report, run
 
@@ -293,8 +292,6 @@ class FrameCarrier:
                 if link.peer not in self._links:  # revoked since these frames came
                     continue
                 try:
-                    if link.recorder is not None:
-                        link.recorder.add(link.name, [frame.raw for frame in frames], FROM_PEER, self._read_at)
                     self._switch.forward(link, frames, self._read_at, self._epoch)
                 except Exception as error:
                     report(error)

@@ -28,7 +28,6 @@ from uavlinkd.mavlink.own_frames import INTERVAL_S
 from uavlinkd.ops import LOG_SCHEMA
 from uavlinkd.ops.control import ControlServer
 from uavlinkd.ops.log import shown
-from uavlinkd.ops.recorder import Recorder
 from uavlinkd.ops.sdnotify import Supervisor
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.base64_text import to_base64
@@ -99,8 +98,6 @@ class Daemon:
         except Exception:
             self._close_sockets()
             raise
-        if config.recording is not None:
-            parts.recorder = Recorder(config.recording, self.log)
         self.carrier.peers.start()
         parts.peer_sockets.web.on_room = self.carrier.send_waiting
         parts.peer_sockets.start(self.carrier.receive, self.carrier.arm)
@@ -137,8 +134,6 @@ class Daemon:
             parts.events.check_link(link, now)
         parts.drops.close()
         parts.events.close()
-        if parts.recorder is not None:
-            await parts.recorder.stop(now)
         counted = {**parts.drops.plain_totals(), **parts.events.totals, **parts.peer_sockets.serial.totals}
         self.log.info("daemon_stopped", uptime_s=round(now - parts.started_at, 1), counted=counted)
 
@@ -249,8 +244,6 @@ class Daemon:
         self._feed_watchdog(now)
         if parts.relay is not None:
             run(self._do_housekeeping_of_relay, parts.relay, now)
-        if parts.recorder is not None:
-            run(parts.recorder.do_housekeeping, now)
         sockets, links = parts.peer_sockets, list(parts.links.values())
         run(sockets.do_housekeeping)
         if rates := sockets.serial.follow_rates(sockets.budgets, links, now):

@@ -108,12 +108,6 @@ def daemon_problems(moment: Moment) -> Iterator[Found]:
             f"correct what `uavlinkd check --config {daemon.config.path}` prints, and run `uavlinkd reload`",
         )
     yield from _circles(moment)
-    if daemon.recorder is not None and not daemon.recorder.is_recording:
-        yield warning(
-            "recording_stopped",
-            f"no frame is recorded now ({listed(daemon.recorder.failures)})",
-            "make room on its disk, and let the daemon's user write there",
-        )
 
 
 def _circles(moment: Moment) -> Iterator[Found]:

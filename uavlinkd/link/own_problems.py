@@ -41,7 +41,6 @@ PROBLEMS: Final = {
         "radio_disturbed", "a radio's line is disturbed", frozenset({"line_noise", "modem_reports", "radio_slow"})
     ),
     9: ReportedProblem("daemon_paused", "its process was paused", frozenset({"daemon_paused"})),
-    10: ReportedProblem("recording_stopped", "it does not record", frozenset({"recording_stopped"})),
     11: ReportedProblem(
         "key_twice", "two machines use one private key", frozenset({"key_on_two_machines", "own_key_elsewhere"})
     ),

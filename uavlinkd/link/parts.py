@@ -26,7 +26,6 @@ from uavlinkd.link.switch import Switch
 from uavlinkd.mavlink.payloads import screen
 from uavlinkd.mavlink.routing import Router
 from uavlinkd.ops.findings import Finding
-from uavlinkd.ops.recorder import Recorder
 from uavlinkd.relay.service import RelayService, RelayShell
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.guard import FaultGuard
@@ -70,8 +69,6 @@ class DaemonParts:
         self.events = EventLog(log, limits, sockets.network_name)
         self.switch = Switch(Router[PeerLink | LocalPort](relays=config.relays_frames), self.stall, self.drops)
         self.local = LocalEndpoints(config.name, self.switch, self.events, self.stall)
-        self.recorder: Recorder | None = None
-        """From the start on, if the daemon records."""
         self.relays = Relays(node, sockets, self.links, relay_links, log)
         """Those that this daemon uses."""
         self.relay: RelayService | None = None

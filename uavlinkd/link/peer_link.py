@@ -9,7 +9,7 @@ from operator import itemgetter, sub
 from uavlinkd.config.model import PeerConfig
 from uavlinkd.core.constants import CONFIGURED_PATHS, LOSS_WINDOW_S, NEVER
 from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import Output, Transmit
+from uavlinkd.core.outputs import Output
 from uavlinkd.core.path import Path
 from uavlinkd.core.path_state import PathState
 from uavlinkd.core.peer import Peer
@@ -24,7 +24,6 @@ from uavlinkd.mavlink.own_frames import LinkFigures, worst
 from uavlinkd.mavlink.payloads import REQUESTS
 from uavlinkd.mavlink.policy.delivery import Source
 from uavlinkd.ops.findings import LinkProblem
-from uavlinkd.ops.recorder import TO_PEER, Recorder
 
 NOT_ANSWERING_S = 3.0
 """A peer or relay that is silent for this long is reported. A normal start takes less, and tries are more often."""
@@ -80,15 +79,12 @@ class Carriage:
 class PeerLink:
     """Carries frames to one peer of a node. Compared by identity; times are monotonic seconds."""
 
-    def __init__(
-        self, config: PeerConfig, peer: Peer, carriage: Carriage, now: float, recorder: Recorder | None = None
-    ) -> None:
+    def __init__(self, config: PeerConfig, peer: Peer, carriage: Carriage, now: float) -> None:
         self.config = config
         self.peer = peer
         """Its object in the core."""
         self.name = config.name
         self.policy = config.make_policy()
-        self.recorder = recorder
         self.counters = SplitCounters()
         """Frames and faults in its payloads."""
         self.frames_superseded = 0
@@ -116,7 +112,7 @@ class PeerLink:
         self._missing: list[tuple[int, int, int]] = []  # session, expected, missing; the oldest first
         self._sample: tuple[int, tuple[int, int, int, int]] | None = None
         # A session, and its counters at one moment: expected and received here, and as the peer reports.
-        self.output = PeerOutput(config.egress, peer, carriage.node, carriage.budgets, self._on_sent, now)
+        self.output = PeerOutput(config.egress, peer, carriage.node, carriage.budgets, self._perform, now)
         """What waits for it."""
 
     def __repr__(self) -> str:
@@ -176,12 +172,7 @@ class PeerLink:
             if self.output.send(frames, now, waited_s):
                 self.send_waiting(now)
             return
-        raws = list(map(RAW, frames))
-        outputs = self._node.send(self.peer, raws, now)
-        if self.recorder is not None:
-            self._on_sent(raws, outputs, now)
-        else:
-            self._perform(outputs)
+        self._perform(self._node.send(self.peer, list(map(RAW, frames)), now))
 
     @property
     def gather_s(self) -> float:
@@ -224,12 +215,6 @@ class PeerLink:
         for frame in frames:
             if frame.header.msgid in REQUESTS:
                 self.output.answers.note(frame, now)
-
-    def _on_sent(self, frames: list[bytes], outputs: list[Output], now: float) -> None:
-        # Without a session no frame crosses the link.
-        if self.recorder is not None and frames and any(isinstance(output, Transmit) for output in outputs):
-            self.recorder.add(self.name, frames, TO_PEER, now)
-        self._perform(outputs)
 
     def _set_deadline(self, now: float) -> None:
         self.timers.next_at = self.output.next_deadline(now)

@@ -36,9 +36,6 @@ third one is copied, so a path that dies costs at most two in a row."""
 
 _STICKS: Final = frozenset(IDS[name] for name in ("MANUAL_CONTROL", "RC_CHANNELS_OVERRIDE"))
 
-OnSent = Callable[[list[bytes], list[Output], float], None]
-"""Receives frames that were sent, and the outputs of the core for them, which are to be performed."""
-
 
 class PeerOutput:
     """What waits for one peer. ``budgets``: of networks, by the number of the socket."""
@@ -49,7 +46,7 @@ class PeerOutput:
         peer: Peer,
         node: Node,
         budgets: Mapping[int, NetworkBudget],
-        on_sent: OnSent,
+        perform: Callable[[list[Output]], None],
         now: float,
     ) -> None:
         self._settings = settings
@@ -58,7 +55,7 @@ class PeerOutput:
         self._budgets = budgets
         self.answers = ParameterAnswers()
         """Requests of the peer, whose answers are critical."""
-        self._on_sent = on_sent
+        self._perform = perform
         self.egress = PeerEgress(settings, now) if settings.is_needed else None
         """Frames that wait; None if frames never wait."""
         self.copies = Copies(budgets, now)
@@ -100,7 +97,7 @@ class PeerOutput:
                     peer.recount(path, 1, len(datagram))
                 else:
                     peer.note_repeat(path, number, datagram)
-            self._on_sent([], [transmit for transmit, _ in released], now)
+            self._perform([transmit for transmit, _ in released])
 
     def next_deadline(self, now: float) -> float:
         """When :meth:`send_waiting` is due."""
@@ -230,7 +227,7 @@ class PeerOutput:
             for datagram, sent in _by_datagram(outputs).items():  # along the same paths
                 paths = [transmit.path for transmit in sent]
                 self.copies.repeat(datagram, paths, frames, self.repair.transmissions, now)
-        self._on_sent(raws, outputs, now)
+        self._perform(outputs)
 
     def _is_spared(self, frames: Sequence[Frame], now: float) -> bool:
         """Whether these frames go along the best path alone: stick positions, which newer ones replace soon."""

@@ -132,7 +132,7 @@ class Peers:
             return
         if peer is None:
             peer = parts.node.add_peer(config.settings, now)
-        link = PeerLink(config, peer, self._carriage, now, parts.recorder)
+        link = PeerLink(config, peer, self._carriage, now)
         parts.links[config.name] = link
         self._map_peers()
         parts.switch.add(link, link.policy)

@@ -116,15 +116,6 @@ def _status(
             "https": None if (listener := daemon.peer_sockets.listener) is None else listener.status(),
             "dropped": _counts(relay.forwarding.dropped),
         },
-        "recording": None
-        if (recorder := daemon.recorder) is None
-        else {
-            "is_recording": recorder.is_recording,
-            "frames": recorder.frames,
-            "bytes": recorder.bytes,
-            "frames_lost": recorder.frames_lost,
-            "failures": dict(recorder.failures),
-        },
     }
 
 

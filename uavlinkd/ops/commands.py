@@ -1,4 +1,4 @@
-"""The commands that talk to a running daemon: ``status``, ``reload``, ``peer list``, ``ping`` and ``netcheck``.
+"""The commands beside a running daemon: ``status``, ``reload``, ``peer list``, ``ping``, ``netcheck`` and ``record``.
 
 Each command imports what it needs when it runs: the other commands start without it.
 """
@@ -44,6 +44,20 @@ def add_parsers(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     add_json(ping)
     text = "show whether UDP gets out, how relays see this machine, and its NAT"
     add_json(for_daemon(commands, "netcheck", _netcheck, text))
+    text = "record the frames that a daemon sends to a local client, until Ctrl-C"
+    record = commands.add_parser("record", help=text, description=f"{text[0].upper()}{text[1:]}.")
+    record.set_defaults(command=_record)
+    record.add_argument(
+        "url", metavar="URL", help="the daemon's endpoint as a client sees it: udpout:127.0.0.1:14550 for its udpin"
+    )
+    record.add_argument("file", metavar="FILE", type=Path, help="a new telemetry log (.tlog, mode 0600)")
+    record.add_argument(
+        "--system-id",
+        metavar="ID",
+        type=int,
+        default=254,
+        help="of its HEARTBEAT, 1 to 254: never that of a ground station (default: %(default)s)",
+    )
 
 
 def for_daemon(
@@ -230,6 +244,24 @@ def _netcheck(options: argparse.Namespace) -> int:
         return OK if any(relay["state"] == "up" for relay in answer["relays"].values()) else FAILED
 
     return _for_each(control_sockets(options), "netcheck", show)
+
+
+def _record(options: argparse.Namespace) -> int:
+    import asyncio
+
+    from uavlinkd.endpoints.url import UrlError, parse_url
+    from uavlinkd.ops.recorder import record
+
+    if not 1 <= options.system_id <= 254:
+        raise UsageError("--system-id must be 1 to 254: 255 is that of ground stations")
+    try:
+        count = asyncio.run(record(parse_url(options.url), options.file, options.system_id))
+    except UrlError as error:
+        raise UsageError(f"{options.url} {error}") from None
+    except OSError as error:
+        raise CommandError(f"{options.file}: {error.strerror}") from None
+    print(printable(f"{count} frames in {options.file}"))
+    return OK if count else FAILED
 
 
 def _peer_list(options: argparse.Namespace) -> int:

@@ -129,9 +129,6 @@ def _identity(config: Config) -> Iterator[tuple[str, str | Text]]:
             "by TLS",
             f"{https.listen}{'' if https.certificate else ' (without TLS, for a web server on this machine)'}",
         )
-    if config.recording is not None:
-        free = f"keeps {config.recording.min_free_bytes / 1e9:g} GB of the disk free"
-        yield "recordings", f"{config.recording.folder} ({free})"
 
 
 def _fleet(fleet: FleetConfig) -> Iterator[tuple[str, str | Text]]:

@@ -138,11 +138,6 @@ def _endpoints(status: Status) -> Iterator[Part]:
         yield (name,), endpoint | {"clients": len(endpoint["clients"]), "refusals": _refusals(endpoint)}
 
 
-def _recording(status: Status) -> Iterator[Part]:
-    if (recording := status["recording"]) is not None:
-        yield (), recording
-
-
 def _fleet(status: Status) -> Iterator[Part]:
     if (fleet := status["fleet"]) is not None:
         yield (), fleet | {"members": len(fleet["held"]), "is_degraded": bool(fleet["problem"])}
@@ -202,6 +197,5 @@ _PARTS: Mapping[str, Callable[[Status], Iterator[Part]]] = {
     "relay by TLS": _relay_by_tls,
     "member": _members,
     "used relay": _used_relays,
-    "recording": _recording,
 }
 _METRICS = tomllib.loads(Path(__file__).with_name("metrics.toml").read_text("utf-8"))["part"]
