@@ -22,7 +22,7 @@ else:
     _CAN_ASK = True
 
 DATAGRAMS_PER_WAKE_UP = 512
-"""The most datagrams that one read takes from a socket; then the others have their turn. Two reads empty a full socket:
+"""The most datagrams that one read takes from a socket; then the others have their turn. Two reads empty a full one:
 behind a flood of usual datagrams, another one waits for two turns of the flood's sender."""
 RECEIVE_BYTES = 65536
 _buffer = memoryview(bytearray(RECEIVE_BYTES))
