@@ -7,15 +7,11 @@ passed begins a valid MAVLink frame that policy would not pass from the same sou
 Without it a captured peer puts a forbidden frame into the payload of an allowed one. A parser that reads bytes
 differently than this daemon (another dialect, MAVLink 1 only, a byte lost) then accepts the forbidden frame.
 
-A frame is refused (:attr:`Refusal.HIDDEN_FRAME`) where it
-
-* contains a hidden frame, or
-* completes one that began in an earlier frame, with no bytes between but those of the same source.
-
-A frame that completes one to which *another* source contributed is delivered behind separator bytes, which end the
-hidden frame before it is complete. So a source cannot cause the refusal of another's frame. It cannot have a parser
-swallow another's urgent frame either: where the receiver may have rejected another source's frame, and resumed at a
-start byte in it, separator bytes end what it reads there.
+A frame that contains a hidden frame is refused (:attr:`Refusal.HIDDEN_FRAME`). One that completes a hidden frame
+which began in an earlier frame is delivered behind separator bytes, which end the hidden frame before it is complete.
+So a source cannot cause the refusal of another's frame, and an accident of random bytes seldom costs a frame. A
+source cannot have a parser swallow another's urgent frame either: where the receiver may have rejected another
+source's frame, and resumed at a start byte in it, separator bytes end what it reads there.
 
 A hidden frame that every source of its bytes may send is harmless: the download of a recorded flight carries whole
 frames of the vehicle itself. Rates do not apply to hidden frames. Dialects that the daemon does not know are a limit:
@@ -53,16 +49,20 @@ Forget = Callable[[bytes], None]
 class Source:
     """One port that frames come from, as the ports that they go to know it. Compared by identity."""
 
-    __slots__ = ("_forget", "_report", "gate", "name")
+    __slots__ = ("_forget", "_refused", "_report", "gate", "name")
 
     def __init__(self, name: str, gate: Gate, report: Report | None = None, forget: Forget | None = None) -> None:
         self.name = name  # the peer or endpoint, as the configuration names it
         self.gate = gate  # the incoming rules that its frames passed
         self._report = report
         self._forget = forget
+        self._refused: Frame | None = None
 
     def refuse(self, frame: Frame, now: float) -> None:
-        """Count and report a frame that carries hidden ones."""
+        """Count and report a frame that carries hidden ones: once, whatever the number of its clients."""
+        if frame is self._refused:
+            return
+        self._refused = frame
         self.gate.count(frame.header, Refusal.HIDDEN_FRAME)
         if self._forget is not None:
             self._forget(frame.raw)
@@ -138,7 +138,7 @@ class DeliveredStream:
                 # First what rules out almost all: a source can have hundreds of starts in a frame.
                 if start != itself and hidden.has_checksum(data, start, end, any_extra=True):
                     if self._is_forbidden(data, start, end, authors):
-                        if cause[0] >= begun_at or self._is_only(source, cause[0]):
+                        if cause[0] >= begun_at:
                             source.refuse(frame, now)
                             return b""
                         is_hidden_elsewhere = True

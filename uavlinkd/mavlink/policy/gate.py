@@ -10,7 +10,7 @@ from typing import Final
 
 from uavlinkd.core.drops import Attention, Reason
 from uavlinkd.core.refusals import Refused
-from uavlinkd.mavlink.dialect import COMMANDS, IDS, MESSAGES, SETUP_SIGNING
+from uavlinkd.mavlink.dialect import COMMANDS, GROUPS, IDS, MESSAGES, SETUP_SIGNING
 from uavlinkd.mavlink.flows import FlowKey, flow_key
 from uavlinkd.mavlink.frames import Frame, payload_bytes
 from uavlinkd.mavlink.headers import Header
@@ -44,6 +44,9 @@ DONE_AT_ONCE: Final[Mapping[int, int]] = {
     3: COMMANDS["MAV_CMD_DO_CHANGE_ALTITUDE"],
 }
 
+# What these carry is not their sender's own: a file, or the traffic of another wire, may well contain frames.
+CARRY_ANYTHING: Final = frozenset(IDS[name] for group in ("files", "shell") for name in GROUPS[group])
+
 # Behind three bytes of target: sequence 2, session 1, opcode 1, size 1, requested opcode 1, flags 2, offset 4, data.
 OPCODE_IN_FILE_TRANSFER: Final = 6
 DATA_IN_FILE_TRANSFER: Final = 15
@@ -56,7 +59,6 @@ class Refusal(Reason):
         "foreign_system",
         "the system id of the frame is not in system_ids",
         "from a system not in system_ids",
-        Attention.SECURITY,
     )
     MESSAGE_NOT_ALLOWED = (
         "message_not_allowed",
@@ -92,9 +94,10 @@ class Refusal(Reason):
     RATE_LIMITED = ("rate_limited", "the messages exceed rate_in or rate_out", "above the rate limit")
     HIDDEN_FRAME = (
         "hidden_frame",
-        "the frame hides another frame that the policy refuses: an attack, or a file with such frames",
+        "the frame is lost, as its bytes contain another one that the policy refuses: by accident, in a file with"
+        " recorded MAVLink, or as an attack",
         "that hide a forbidden frame",
-        Attention.SECURITY,
+        Attention.EVERYDAY,
     )
 
 
@@ -141,6 +144,7 @@ class Gate:
         self.refused_commands: Counter[tuple[int, int, Refusal]] = Counter()
         self.refused_systems: Counter[int] = Counter()  # the senders' system ids of FOREIGN_SYSTEM
         self.totals: Counter[Refusal] = Counter()
+        self.hiding = 0  # frames that hid others, without CARRY_ANYTHING
         self._reported: dict[tuple[int, int, int], int] = {}  # by message, command and code: the last result
         self._reported_sum = 0
 
@@ -168,6 +172,7 @@ class Gate:
             counted = (ANY_OTHER, refusal)
         self.refused[counted] += 1
         self.totals[refusal] += 1
+        self.hiding += refusal is Refusal.HIDDEN_FRAME and header.msgid not in CARRY_ANYTHING
         if refusal is Refusal.FOREIGN_SYSTEM:
             self.refused_systems[header.system] += 1
         if header.msgid in DIRECT_COMMANDS:
