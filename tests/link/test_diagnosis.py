@@ -15,7 +15,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from tests.core.harness import PLAIN
 from tests.daemon.frames import command_long, ground_heartbeat, heartbeat
+from tests.link.daemon_parts import parts_of
 from tests.link.test_evidence import HOST, OWN_KEY, THERE, Scene
+from tests.samples import blank
 from tests.test_readmes import ROOT
 from uavlinkd.config.keys import encode_key
 from uavlinkd.config.model import EndpointConfig, PeerConfig
@@ -29,7 +31,7 @@ from uavlinkd.core.sessions import Twin
 from uavlinkd.core.settings import PeerSettings
 from uavlinkd.endpoints.url import parse_url
 from uavlinkd.link import diagnosis, down_problems
-from uavlinkd.link.evidence import EVIDENCE_S, OWN_FRAMES_S, REPORTED, History
+from uavlinkd.link.evidence import EVIDENCE_S, HIDDEN_LEAST, OWN_FRAMES_S, REPORTED, History
 from uavlinkd.link.facts import ICMP_S
 from uavlinkd.link.own_problems import PROBLEMS, own_codes
 from uavlinkd.link.peer_link import PeerLink
@@ -55,40 +57,12 @@ class Daemon(Scene):
     def __init__(self) -> None:
         super().__init__()
         self.now = NOW
-        self.sockets: Any = SimpleNamespace(
-            unresolved=lambda name: set[str](),
-            without_socket=set(),
-            absent_addresses=list,
-            absent_networks=dict,
-            networks=SimpleNamespace(networks=[]),
-            is_own=lambda address: False,
-            serial=SimpleNamespace(networks=[]),
-            web=SimpleNamespace(states=lambda addresses: {}),
-        )
         self.history = History(0.0)
         self.router = Router[Any]()
-        self.local: list[Any] = []
-        self.parts: Any = SimpleNamespace(
-            config=SimpleNamespace(
-                name="drone0",
-                path="drone0.toml",
-                public_key=OWN_KEY,
-                listen=[Address("0.0.0.0", 5799)],
-                endpoints=[],
-                relays_frames=False,
-            ),
-            links=self.links,
-            node=self.node,
-            peer_sockets=self.sockets,
-            evidence=self.evidence,
-            history=self.history,
-            relays=SimpleNamespace(by_name={}),
-            relay=None,
-            fleet=None,
-            guard=SimpleNamespace(faults=Counter(), last_at=0.0),
-            local=SimpleNamespace(endpoints=self.local),
-            switch=SimpleNamespace(router=self.router),
-        )
+        self.parts = parts_of(self.node, self.links, self.evidence, self.history, self.router)
+        self.parts.config.public_key = OWN_KEY
+        self.sockets: Any = self.parts.peer_sockets
+        self.local: list[Any] = self.parts.local.endpoints
 
     def findings(self, now: float | None = None) -> dict[str, Finding]:
         """The findings, by cause."""
@@ -145,7 +119,7 @@ def test_every_cause_is_documented_with_its_severity() -> None:
     assert set(documented) == set(causes)
     assert all(documented[cause].startswith(severity) for cause, severity in causes.items())
     assert {cause for cause, severity in causes.items() if severity == "security"} == {
-        *("own_key_elsewhere", "key_on_two_machines", "hidden_frame", "impersonation"),
+        *("own_key_elsewhere", "key_on_two_machines", "hidden_frame"),
         *("bulletin_conflict", "bulletin_shrinks"),
     }
 
@@ -337,7 +311,7 @@ def test_senders_without_a_member_here_have_their_own_addresses(daemon: Daemon) 
 
 
 def test_system_of_another(daemon: Daemon) -> None:
-    """It is an attack beside own frames, and trusting it is never advised. A system of no one is a warning."""
+    """It has a finding of its own beside own frames, and trusting it is never advised."""
     daemon.set_up(role="all", system_ids=[1])
     for _ in range(3):
         daemon.cross([heartbeat(1), heartbeat(7)])
@@ -416,16 +390,35 @@ def test_role_of_a_member_is_signed_again(daemon: Daemon) -> None:
     assert "`uavlinkd fleet sign --replace drone1 --role operator`" in daemon.findings()["roles_exchanged"].remedy
 
 
-def test_hidden_frame_is_the_first_line(daemon: Daemon) -> None:
-    """Of a captured member. Everyday findings do not displace it, and it is not counted as a refusal."""
+@pytest.mark.parametrize(
+    ("message", "hiding", "frames", "is_found"),
+    [
+        ("SERVO_OUTPUT_RAW", 1, 1, False),
+        ("ATTITUDE", HIDDEN_LEAST, HIDDEN_LEAST, False),
+        ("ATTITUDE", HIDDEN_LEAST + 1, HIDDEN_LEAST + 1, True),
+        ("ATTITUDE", 60, 20_000, False),  # 0.3 % of random bytes, beside unknown messages that pass
+        ("ATTITUDE", 60, 1500, True),
+        ("LOG_DATA", 500, 500, False),  # a file with recorded MAVLink
+        ("TUNNEL", 500, 500, False),
+    ],
+)
+def test_hidden_frames_are_an_alarm_above_the_rate_of_honest_ones(
+    daemon: Daemon, message: str, hiding: int, frames: int, is_found: bool
+) -> None:
+    """Of a captured member they are the first line, which everyday findings do not displace."""
     daemon.set_up(role="vehicle", system_ids=[1])
     daemon.cross([heartbeat(1), heartbeat(9)])
-    daemon.link.policy.incoming.totals[Refusal.HIDDEN_FRAME] += 3
-    daemon.cross()
-    first, *others = daemon.findings().values()
-    assert (first.cause, first.severity) == ("hidden_frame", Severity.SECURITY)
-    assert first.text.startswith("3 of its frames hid")
-    assert [finding.cause for finding in others] == ["other_system"]
+    gate = daemon.link.policy.incoming
+    for number in range(1, 31):
+        while gate.totals[Refusal.HIDDEN_FRAME] < hiding * number // 30:
+            gate.count(blank(message).header, Refusal.HIDDEN_FRAME)
+        daemon.link.counters.frames = 2 + frames * number // 30
+        daemon.cross()
+    first = next(iter(daemon.findings().values()), None)
+    assert (first is not None and first.cause == "hidden_frame") is is_found
+    if first is not None and is_found:
+        assert first.severity is Severity.SECURITY
+        assert first.text.startswith(f"{hiding:,} of its frames hid")
 
 
 def test_commands_by_name(daemon: Daemon) -> None:

@@ -192,6 +192,10 @@ REMEMBERED_S: Final = 600.0
 """The growth of a counter is remembered for this time after it stopped."""
 LASTING_S: Final = 5.0
 """A counter that grows for this time, with shorter pauses, counts something that lasts."""
+HIDDEN_SHARE: Final = 0.02
+"""Fewer frames hide others by accident: of random bytes, at most 0.2 % do."""
+HIDDEN_LEAST: Final = 10
+"""So many more than this share are a sign of an attack."""
 OWN_FRAMES_S: Final = 10.0
 """A foreign system counts as mixed with a peer's own if own frames passed within this time."""
 
@@ -250,8 +254,11 @@ class GateHistory:
         self.commands = RecentGrowth[tuple[int, int, Refusal]]()
         self.systems = RecentGrowth[int]()
         self.passed_at = self._refused_at = float("-inf")
+        self.hiding_at = float("-inf")
+        """When frames last hid others more often than by accident."""
         self._gate: Gate | None = None
-        self._frames = self._refused = 0
+        self._frames = self._refused = self._hiding = 0
+        self._beyond_accident = 0.0
 
     def update(self, gate: Gate, frames: int, now: float, *, frames_may_be_refused: bool) -> dict[int, int]:
         """Read the counters. ``frames``: all received ones, or those that were sent.
@@ -261,14 +268,17 @@ class GateHistory:
         self.reasons.update(gate.totals, now)
         self.commands.update(gate.refused_commands, now)
         if gate is not self._gate:  # a new policy: what the one before refused does not count
-            self._gate, self._refused, self._refused_at = gate, 0, float("-inf")
-        # A hidden frame is counted once for each client that reads it.
-        refused = gate.totals.total() - gate.totals[Refusal.HIDDEN_FRAME]
+            self._gate, self._refused, self._hiding, self._refused_at = gate, 0, 0, float("-inf")
+        refused = gate.totals.total()
         grown = frames - self._frames if frames >= self._frames else frames
         refused_now = refused - self._refused
         self._frames, self._refused = frames, refused
         if refused_now:
             self._refused_at = now
+        hiding, self._hiding = gate.hiding - self._hiding, gate.hiding
+        self._beyond_accident = max(0.0, self._beyond_accident + hiding - HIDDEN_SHARE * grown)
+        if hiding and self._beyond_accident > HIDDEN_LEAST:
+            self.hiding_at = now
         if grown > (refused_now if frames_may_be_refused else 0):
             self.passed_at = now
         return self.systems.update(gate.refused_systems, now)

@@ -67,10 +67,10 @@ def peer_problems(peer: PeerFacts) -> Iterator[Found]:
         cut_off = "delete its [[peer]] and run `uavlinkd reload`"
         if peer.link.config.settings.is_certified:
             cut_off = f"run `uavlinkd fleet remove {peer.name}`"
-        yield security(
+        yield warning(
             "impersonation",
-            f"beside its own frames it sends as system {whose}: it may be captured, relay without leave, or have the"
-            " same id by mistake",
+            f"beside its own frames it sends as system {whose}, which is refused: it passes on frames from there, has"
+            " the same id by mistake, or is captured",
             f"inspect {peer.name}; if it is captured, {cut_off}",
         )
     claims = [claim for claim in peer.link.peer.refusal_claims.recent() if peer.now - claim.changed_at <= CLAIMS_S]
@@ -108,11 +108,13 @@ def two_machines(facts: str) -> Found:
 
 
 def _hidden_frames(part: PartFacts) -> Iterator[Found]:
-    if count := part.history.incoming.reasons.within(SECURITY_S, part.now).get(Refusal.HIDDEN_FRAME):
+    if part.now - part.history.incoming.hiding_at <= SECURITY_S:
+        count = part.history.incoming.reasons.within(SECURITY_S, part.now)[Refusal.HIDDEN_FRAME]
         yield security(
             "hidden_frame",
-            f"{count:,} of its frames hid a forbidden frame, and were refused: an attack, or a file with such frames",
-            f"if no file transfer of yours explains it, treat {part.name} as captured",
+            f"{count:,} of its frames hid a forbidden frame, and were refused: more than by accident, and outside of"
+            " files",
+            f"treat {part.name} as captured",
         )
 
 
