@@ -75,12 +75,12 @@ def test_flood_formats_text_for_written_lines_only(
 def test_reasons_and_peers_are_separate(recorder: Recorder, summary: DropSummary) -> None:
     """A flood of one hides no other. What another event explains is counted only."""
     for name in ("drone1", "drone2"):
-        for reason in (DropReason.BAD_TAG, DropReason.REPLAYED, DropReason.NO_SESSION):
+        for reason in (DropReason.BAD_TAG, DropReason.MALFORMED, DropReason.NO_SESSION):
             summary.add_dropped(Dropped(reason, Named(name), None, 2), 100.0)
     facts = {"reason": "bad_tag", "who": "drone1", "count": 2, "meaning": DropReason.BAD_TAG.meaning}
     assert recorder.lines[0] == ("frames_dropped", facts)
     assert recorder.counts() == [2, 2, 2, 2]
-    assert repr(summary.plain_totals()) == "{'bad_tag': 4, 'replayed': 4, 'no_session': 4}"
+    assert repr(summary.plain_totals()) == "{'bad_tag': 4, 'malformed': 4, 'no_session': 4}"
 
 
 def test_what_a_policy_withholds_is_logged_once_per_start(recorder: Recorder, summary: DropSummary) -> None:

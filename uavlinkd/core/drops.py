@@ -9,7 +9,7 @@ from typing import Self
 class Attention(Enum):
     """When the log has a line about a reason."""
 
-    SECURITY = "at once, with limits of its own: an attack, a captured member, or wrong keys"
+    SECURITY = "at once, with limits of its own: what only an attacker, a captured member or a wrong key causes"
     PROBLEM = "at once"
     EVERYDAY = "if it persists: a lost datagram, a rekey or a restarted peer causes a few"
     DESIGN = "once per start: the policy works as configured"
@@ -113,11 +113,13 @@ class DropReason(Reason):
         "cookie_required",
         "the daemon is under load, or a peer initiates too often: it sent a cookie, which the sender must return",
         "handshakes that have to return a cookie",
+        Attention.EVERYDAY,
     )
     RATE_LIMITED = (
         "rate_limited",
         "handshake messages or cookie replies exceed the limit of one source, or of all sources together",
         "handshakes above the rate limit",
+        Attention.EVERYDAY,
     )
     REPLAYED_INITIATION = (
         "replayed_initiation",
@@ -264,15 +266,16 @@ class DropReason(Reason):
     )
     REPLAYED = (
         "replayed",
-        "an older envelope came again, along no proven path of the peer: an attacker replays it",
+        "an older envelope came again, along no proven path of the peer: a network held it back, or an attacker"
+        " replays it",
         "replayed",
-        Attention.SECURITY,
+        Attention.EVERYDAY,
     )
     DELAYED = (
         "delayed",
-        "the peer sent the envelope too long ago: it was delayed on its path",
+        "the peer sent the envelope too long ago: a network held it back, or an attacker",
         "delayed on the path",
-        Attention.SECURITY,
+        Attention.EVERYDAY,
     )
     BAD_TAG = (
         "bad_tag",

@@ -49,7 +49,7 @@ class EventLog:
         self._ended = deque[tuple[Finding, float, float]](maxlen=ENDED_PROBLEMS)  # when they began and ended
         self._forgotten: Counter[LinkProblem] = Counter()  # problems of peers that were removed
         self._problem_conditions = Conditions[tuple[str, LinkProblem]](
-            "link", self._limits, self._write_problem, lambda key: (key[0], key[1] is LinkProblem.PATHS_UNPROVEN)
+            "link", self._limits, self._write_problem, lambda key: (key[0], False)
         )
         self._pauses = Conditions[str]("pause", self._limits, self._write_pause, lambda _: ("", False))
         self._paused_s = 0.0
@@ -158,6 +158,8 @@ class EventLog:
         watch = self._watches[peer]
         received = link.peer.traffic.envelopes_received
         for problem, growth in watch.measure(link.problems(now), received, now).items():
+            if problem is LinkProblem.ENVELOPES_OUT_OF_ORDER and link.peer.paths.has_several:
+                continue  # its paths overtake one another: `status` shows how often
             key = peer, problem
             is_open = key in self._problem_conditions
             if growth.minute and is_noteworthy(problem, growth, is_logged=is_open):
@@ -277,10 +279,10 @@ class Threshold(NamedTuple):
 THRESHOLDS: Final[Mapping[LinkProblem, Threshold]] = {
     LinkProblem.ENVELOPES_MISSING: Threshold(10, 0.05),
     LinkProblem.ENVELOPES_OUT_OF_ORDER: Threshold(50, 0.25),  # jitter reorders frames that were sent in a burst
-    LinkProblem.PATHS_UNPROVEN: Threshold(1),  # no bad radio causes it: an attacker forwards envelopes
-    LinkProblem.ECHOES_UNANSWERED: Threshold(20),
-    LinkProblem.HANDSHAKES_UNANSWERED: Threshold(10),
-    LinkProblem.COOKIES_TAKEN: Threshold(5),
+    LinkProblem.PATHS_UNPROVEN: Threshold(5),  # more than a network that changes
+    LinkProblem.ECHOES_UNANSWERED: Threshold(60),  # each restart of the peer costs some 20 and 10
+    LinkProblem.HANDSHAKES_UNANSWERED: Threshold(60),
+    LinkProblem.COOKIES_TAKEN: Threshold(20),
 }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from operator import itemgetter, sub
 
 from uavlinkd.config.model import PeerConfig
@@ -11,6 +12,7 @@ from uavlinkd.core.constants import CONFIGURED_PATHS, LOSS_WINDOW_S, NEVER
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Output
 from uavlinkd.core.path import Path
+from uavlinkd.core.path_measures import lost_share
 from uavlinkd.core.path_state import PathState
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.problem_reports import LARGEST_PROBLEM_REPORT
@@ -108,7 +110,7 @@ class PeerLink:
         self._newest = NewestStates()
         self._direct: Sequence[Path] = ()
         self.losses: tuple[tuple[int, int], ...] = ()
-        """In and out, how many envelopes were sent recently, and how many of them lost: by the last measurement."""
+        """In and out, how many envelopes were sent recently, and how many of them lost, if the loss lasts."""
         self._missing: list[tuple[int, int, int]] = []  # session, expected, missing; the oldest first
         self._sample: tuple[int, tuple[int, int, int, int]] | None = None
         # A session, and its counters at one moment: expected and received here, and as the peer reports.
@@ -280,11 +282,13 @@ class PeerLink:
             return ()
         counted_now = session.local_index, session.expected, missing
         earlier = [one for one in self._missing if one[0] == session.local_index]
-        self._missing = [*earlier[-round(LOSS_WINDOW_S) :], counted_now]
+        window = round(LOSS_WINDOW_S)
+        self._missing = [*earlier[-2 * window :], counted_now]
         into, out = best.recent_losses(now)
-        if not self.peer.paths.has_several:  # then the peer may send few reports
-            counted = session.expected - self._missing[0][1], missing - self._missing[0][2]
-            into = max(into, counted, key=itemgetter(1))
+        if not self.peer.paths.has_several and len(self._missing) > 2 * window:  # then the peer may send few reports
+            windows = pairwise(self._missing[::window])
+            counted = [(after[1] - before[1], after[2] - before[2]) for before, after in windows]
+            into = max(into, min(counted, key=lost_share), key=itemgetter(1))
         return into, out
 
     @property

@@ -58,18 +58,19 @@ class LinkProblem(Reason):
     )
     PATHS_UNPROVEN = (
         "paths_unproven",
-        "the peer's envelopes came from an address that is not the peer's: an attacker forwards them, or a second"
-        " machine has its key",
+        "envelopes of the peer came from an address that did not answer: its network changes, an attacker forwards"
+        " them, or a second machine has its key",
         "addresses without an answer",
     )
     ECHOES_UNANSWERED = (
         "echoes_unanswered",
-        "the peer did not answer echo requests: it does not receive them, or an attacker drops the replies",
+        "the peer did not answer echo requests: it restarts, does not receive them, or an attacker drops replies",
         "unanswered echo requests",
     )
     HANDSHAKES_UNANSWERED = (
         "handshakes_unanswered",
-        "the daemon repeated handshakes while the peer was up: the radio is bad, or an attacker drops them",
+        "the daemon repeated handshakes while the peer was up: it restarts, the radio is bad, or an attacker drops"
+        " them",
         "unanswered handshakes",
     )
     COOKIES_TAKEN = (

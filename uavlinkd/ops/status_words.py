@@ -156,7 +156,7 @@ def other_losses(status: Status) -> Iterator[str]:
     relay = status["relay"]
     if relay is not None and (text := listed(by_count(relay["dropped"], DropReason, RelayReason))):
         yield f"not forwarded: {text}"
-    if dropped := listed(by_count(status["drops"], DropReason)):
+    if dropped := listed(_dropped(status)):
         yield f"dropped, from no known peer: {dropped}"
     for error, count in ranked(list(status["send_failures"].items()))[:_SHOWN_REASONS]:
         yield f"not sent: {count:,}, because {meaning_of(error) or error}"
@@ -216,12 +216,15 @@ def web_line(https: Status) -> str:
 def peer_drops(peer: Status) -> list[Count]:
     """All reasons of a peer. Missing envelopes are in its losses."""
     return [
-        *by_count({reason: count for reason, count in peer["drops"].items() if reason not in _COPIES}, DropReason),
+        *_dropped(peer),
         *by_count(peer["malformed"], FrameFault),
         *by_count(peer["waiting_dropped"], EgressDrop),
         *by_count(_refused(peer), Refusal),
-        *((problem.phrase, peer[problem]) for problem in LinkProblem if problem.phrase and peer[problem]),
     ]
+
+
+def _dropped(part: Status) -> list[Count]:
+    return by_count({reason: count for reason, count in part["drops"].items() if reason not in _COPIES}, DropReason)
 
 
 def overtaken(peer: Status) -> str:
