@@ -186,7 +186,7 @@ async def test_an_older_daemon_does_not_know_the_request() -> None:
         assert "'overview'" in lost["lost"]
 
 
-@pytest.mark.parametrize("missing", sorted(overview().keys() - {"public_key", "monotonic_s", "unrouted"}))
+@pytest.mark.parametrize("missing", sorted(overview().keys() - {"public_key", "monotonic_s", "unrouted", "faults"}))
 async def test_a_status_without_a_key_stops_nothing(missing: str) -> None:
     """Nor one with another type in its place."""
     daemon = Daemon()

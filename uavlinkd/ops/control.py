@@ -128,11 +128,17 @@ def _remedy(path: Path) -> str:
 
 
 def ask(
-    path: Path, request: str, timeout_s: float = REQUEST_TIMEOUT_S, on_waiting: Callable[[], None] | None = None
+    path: Path,
+    request: str,
+    timeout_s: float = REQUEST_TIMEOUT_S,
+    on_waiting: Callable[[], None] | None = None,
+    *,
+    for_terminal: bool = True,
 ) -> dict[str, Any]:
     """Send a request to the daemon that listens at ``path``, and return its answer.
 
     With ``on_waiting`` there is no time limit: it is called after each ``timeout_s`` without an answer.
+    ``for_terminal``: no text in the answer acts on a terminal.
     Raises ControlError if no daemon listens, it refuses the client or the request, or does not answer in time.
     """
     try:
@@ -140,7 +146,9 @@ def ask(
             sock.settimeout(timeout_s)
             sock.connect(str(path))
             sock.sendall(request.encode() + b"\n")
-            answer = _without_controls(json.loads(_read_answer(sock, on_waiting)))
+            answer = json.loads(_read_answer(sock, on_waiting))
+            if for_terminal:
+                answer = _without_controls(answer)
     except PermissionError:
         raise ControlError(
             f"no permission to connect to {path}: only root and the daemon's user have it; use sudo"

@@ -37,7 +37,7 @@ class Page:
         more: Sequence[BaseRoute] = (),
     ) -> None:
         async def ask_daemon(request: str) -> dict[str, Any]:
-            return await asyncio.to_thread(ask, control_socket, request, PATIENCE_S)
+            return await asyncio.to_thread(ask, control_socket, request, PATIENCE_S, for_terminal=False)
 
         self._watch = Watcher(ask_daemon)
         self._listener = tcp_listener(address)
