@@ -99,7 +99,7 @@ def test_removal_without_a_daemon_says_what_is_left_to_do(tmp_path: Path, capsys
     )
     said = capsys.readouterr()
     assert "drone1 is revoked, by bulletin 2." in said.out
-    assert "the 1 other members have not heard of it" in said.err
+    assert "the other members (1) have not heard of it" in said.err
     assert f"when you run `uavlinkd fleet publish --socket {tmp_path / 'no'}`" in said.err
     assert read_manifest(tmp_path / "fleet").bulletin.revoked == (2,)
 

@@ -123,7 +123,7 @@ def _change(options: argparse.Namespace) -> None:
         except CommandError as error:
             given = "".join(f" --{key} {value}" for key in ("config", "socket") if (value := getattr(options, key)))
             raise CommandError(
-                f"the {len(result.fleet.current)} other members have not heard of it: {error}\n"
+                f"the other members ({len(result.fleet.current)}) have not heard of it: {error}\n"
                 f"They will when you run `uavlinkd fleet publish{given}` beside a member's daemon that is up"
             ) from None
     _print_result(options, result)
