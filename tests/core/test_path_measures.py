@@ -75,20 +75,6 @@ def test_repeats_that_were_counted_along_another_path_are_not_compared() -> None
     assert loss.share() == pytest.approx(0.5, abs=1e-3)
 
 
-@pytest.mark.parametrize("every_s", [1.0, 4.0, 5.0])
-def test_outage_is_no_loss_that_lasts(every_s: float) -> None:
-    """It is in the last window, or in the one before. Half of the datagrams in both windows are a loss."""
-    outage, lossy = PathLoss(), PathLoss()
-    for number in range(1, 20):
-        sent, is_over = 100 * number, number > 9
-        outage.add(number * every_s, sent, sent - 100 * is_over)
-        lossy.add(number * every_s, sent, sent // 2)
-        assert outage.lasting(c.LOSS_WINDOW_S)[1] == 0
-        if number * every_s > 3 * c.LOSS_WINDOW_S:
-            reported, lost = lossy.lasting(c.LOSS_WINDOW_S)
-            assert lost == reported // 2 > 0
-
-
 def test_reports_are_limited_in_age_and_number() -> None:
     """The window of repair is the longest one. An older report, or one of fewer envelopes, does not count."""
     loss = PathLoss()

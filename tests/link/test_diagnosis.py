@@ -31,7 +31,7 @@ from uavlinkd.core.sessions import Twin
 from uavlinkd.core.settings import PeerSettings
 from uavlinkd.endpoints.url import parse_url
 from uavlinkd.link import diagnosis, down_problems
-from uavlinkd.link.evidence import EVIDENCE_S, HIDDEN_LEAST, OWN_FRAMES_S, REPORTED, History
+from uavlinkd.link.evidence import EVIDENCE_S, HIDDEN_LEAST, REPORTED, History
 from uavlinkd.link.facts import ICMP_S
 from uavlinkd.link.own_problems import PROBLEMS, own_codes
 from uavlinkd.link.peer_link import PeerLink
@@ -311,7 +311,7 @@ def test_senders_without_a_member_here_have_their_own_addresses(daemon: Daemon) 
 
 
 def test_system_of_another(daemon: Daemon) -> None:
-    """It has a finding of its own beside own frames, and trusting it is never advised."""
+    """A client that forwards frames, an id that is used twice, or an attack: trusting it is never advised."""
     daemon.set_up(role="all", system_ids=[1])
     for _ in range(3):
         daemon.cross([heartbeat(1), heartbeat(7)])
@@ -326,13 +326,8 @@ def test_system_of_another(daemon: Daemon) -> None:
     daemon.local.append(SimpleNamespace(name="autopilot", ports=[client], policy=daemon.link.policy, failures={}))
     daemon.router.add_port(client)
     daemon.router.route(split_payload(heartbeat(7), daemon.link.counters)[0], client, daemon.now)
-    assert "7 (endpoint autopilot)" in daemon.findings()["impersonation"].text
-    assert "`uavlinkd fleet remove drone1`" in daemon.findings()["impersonation"].remedy
-    daemon.link.config = replace(daemon.link.config, settings=settings)
-    assert "delete its [[peer]]" in daemon.findings()["impersonation"].remedy
-    assert "7 is endpoint autopilot's" in daemon.findings()["other_system"].remedy
+    assert "7 is endpoint autopilot's; if no client there forwards" in daemon.findings()["other_system"].remedy
     assert "write it into system_ids" not in daemon.findings()["other_system"].remedy
-    assert next(iter(daemon.findings())) == "impersonation"
 
 
 @pytest.mark.parametrize(("owner", "remedy"), [(2, "only if you know that endpoint autopilot"), (1, "1 is drone1's")])
@@ -357,18 +352,6 @@ def test_autopilot_with_another_system_id(daemon: Daemon, owner: int, remedy: st
     found = diagnosis.find(daemon.parts, daemon.now)
     assert own_codes(found, is_cut_off=False) == [1], "its peers see that it refuses its own autopilot"
     assert not own_codes([one._replace(subject=Subject.PEER) for one in found], is_cut_off=False)
-
-
-@pytest.mark.parametrize(("pause", "is_found"), [(1, True), (int(OWN_FRAMES_S) + 1, False)])
-def test_own_and_foreign_frames_in_different_seconds(daemon: Daemon, pause: int, is_found: bool) -> None:
-    """Alternating hides nothing; a peer that sent its last own frames long ago only has another id."""
-    daemon.set_up(role="all", system_ids=[1])
-    owner = daemon.add("drone2", bytes([3]) * 32, [STRANGER])
-    owner.policy = PeerConfig(owner.config.settings, (), {"role": "all", "system_ids": [2]}).make_policy()
-    for _ in range(3):
-        daemon.cross([heartbeat(1)], seconds=pause)
-        daemon.cross([heartbeat(2)])
-    assert ("impersonation" in daemon.findings()) is is_found
 
 
 @pytest.mark.parametrize(("received", "sent", "which"), [([heartbeat(1)], [], "from"), ([], [heartbeat(1)], "to")])

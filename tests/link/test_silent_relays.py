@@ -21,9 +21,9 @@ from uavlinkd.link import diagnosis
 from uavlinkd.link.daemon import netcheck
 from uavlinkd.link.down_problems import silent_relays
 from uavlinkd.link.facts import Moment
-from uavlinkd.link.peer_link import NOT_ANSWERING_S, PeerLink
+from uavlinkd.link.peer_link import LOSSES, NOT_ANSWERING_S, PeerLink
 from uavlinkd.link.relay_link import RelayHandles, RelayLink
-from uavlinkd.link.traffic_problems import LOSSES
+from uavlinkd.link.traffic_problems import LOSS_LASTS_S
 from uavlinkd.ops.findings import Finding, Severity
 from uavlinkd.system.addresses import Address
 
@@ -334,10 +334,16 @@ def test_responses_that_do_not_arrive(is_up: bool, begun: tuple[float, ...], is_
         (((50, 10), (50, 20)), "20% from it to here and 40% from here to it"),
     ],
 )
-def test_loss_is_named_by_direction(losses: tuple[tuple[int, int], ...], text: str) -> None:
-    """Few lost envelopes, and a small share of many, are no problem."""
+def test_loss_that_lasts_is_named_by_direction(losses: tuple[tuple[int, int], ...], text: str) -> None:
+    """Few lost envelopes, a small share of many, and an outage that is over, are no problem."""
     daemon = Daemon()
-    daemon.set_up(role="all", system_ids="all").losses = losses
-    findings = daemon.findings(NOW)
+    link = daemon.set_up(role="all", system_ids="all")
+    link.note_losses(((50, 0), (50, 0)), NOW)
+    for now in (NOW + 1.0, NOW + LOSS_LASTS_S - 0.1):
+        assert daemon.findings(now) == {}
+        link.note_losses(losses, now)
+    findings = daemon.findings(NOW + LOSS_LASTS_S)
     assert set(findings) == ({"high_loss"} if text else set())
     assert not text or findings["high_loss"].text == f"many datagrams are lost: {text}"
+    link.note_losses(((50, 0), (50, 0)), NOW + LOSS_LASTS_S)
+    assert daemon.findings(NOW + LOSS_LASTS_S) == {}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
 from typing import NamedTuple
 
 from uavlinkd.core import constants as c
@@ -56,12 +55,9 @@ class PathLoss:
 
         Where reports are rarer than that, since the report before.
         """
-        return _between(*self._ends(window_s))
-
-    def lasting(self, window_s: float) -> tuple[int, int]:
-        """As :meth:`recent`, or of the window before if less of that was lost: an outage is in one of them only."""
         first, last = self._ends(window_s)
-        return min(_between(*self._ends(window_s, first)), _between(first, last), key=lost_share)
+        sent = last.sent - first.sent
+        return sent, max(0, sent - (last.received - first.received))
 
     def share(self, window_s: float = c.LOSS_WINDOW_S) -> float:
         """The lost share of datagrams in this window. A repeated envelope is as many datagrams."""
@@ -72,10 +68,8 @@ class PathLoss:
         repeats = [after - before for before, after in zip(first.repeats, last.repeats, strict=True)]
         return datagram_loss(lost, sent, repeats) if any(repeats) else lost / sent
 
-    def _ends(self, window_s: float, until: _Point | None = None) -> tuple[_Point, _Point]:
-        points: Sequence[_Point] = self._points
-        if until is not None:
-            points = [point for point in points if point.at <= until.at]
+    def _ends(self, window_s: float) -> tuple[_Point, _Point]:
+        points = self._points
         if len(points) < 2:
             return _NOTHING, _NOTHING
         last = points[-1]
@@ -84,17 +78,6 @@ class PathLoss:
 
 
 _NOTHING = _Point(0.0, 0, 0, NO_REPEATS)
-
-
-def _between(first: _Point, last: _Point) -> tuple[int, int]:
-    sent = last.sent - first.sent
-    return sent, max(0, sent - (last.received - first.received))
-
-
-def lost_share(counts: tuple[int, int]) -> float:
-    """Of so many that were sent, and so many that were lost."""
-    sent, lost = counts
-    return lost / sent if sent else 0.0
 
 
 def datagram_loss(lost: int, sent: int, repeats: list[int]) -> float:

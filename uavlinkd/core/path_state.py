@@ -151,12 +151,12 @@ class PathState:
         return self._reported_loss.share()
 
     def recent_losses(self, now: float) -> list[tuple[int, int]]:
-        """In and out, how many envelopes were sent in :data:`c.LOSS_WINDOW_S`, and how many were lost, if it lasts.
+        """In and out, how many envelopes were sent in :data:`c.LOSS_WINDOW_S`, and how many were lost.
 
         Zero where there was no report for two of the usual intervals.
         """
         directions, oldest = (self._loss_in, self._reported_loss), now - 2 * c.PROBE_INTERVAL_S
-        return [loss.lasting(c.LOSS_WINDOW_S) if loss.reported_at > oldest else (0, 0) for loss in directions]
+        return [loss.recent(c.LOSS_WINDOW_S) if loss.reported_at > oldest else (0, 0) for loss in directions]
 
     def loss_to_repair(self) -> tuple[float, int]:
         """The share of our datagrams that it lost in the last :data:`c.REPAIR_WINDOW_S`, and how many envelopes."""

@@ -21,7 +21,7 @@ from uavlinkd.link.evidence import ELSEWHERE, EVIDENCE_S
 from uavlinkd.link.facts import EndpointFacts, Found, Moment, PeerFacts, details_at, fault, listed, security, warning
 from uavlinkd.link.fleet_problems import fleet_problems, pinned_problems
 from uavlinkd.link.parts import DaemonParts
-from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.link.peer_link import LOSSES, PeerLink
 from uavlinkd.link.serial_networks import RECENT_S
 from uavlinkd.link.switch import Port
 from uavlinkd.ops.findings import Finding, Subject
@@ -87,7 +87,7 @@ def daemon_problems(moment: Moment) -> Iterator[Found]:
             "send what `uavlinkd status --json` prints, and the log, to the developers; frames pass meanwhile",
         )
     full = evidence.seen_anywhere("ENOBUFS", now)
-    if full is not None and full.count >= traffic.LOSSES:
+    if full is not None and full.count >= LOSSES:
         yield warning(
             "network_full",
             f"{full.count:,} times there was no room for datagrams, the last time to {facts.at(full)}: more is sent"

@@ -196,8 +196,6 @@ HIDDEN_SHARE: Final = 0.02
 """Fewer frames hide others by accident: of random bytes, at most 0.2 % do."""
 HIDDEN_LEAST: Final = 10
 """So many more than this share are a sign of an attack."""
-OWN_FRAMES_S: Final = 10.0
-"""A foreign system counts as mixed with a peer's own if own frames passed within this time."""
 
 BLOCKED_S: Final = 10.0
 """How far back refusals count for whether frames pass."""
@@ -260,13 +258,11 @@ class GateHistory:
         self._frames = self._refused = self._hiding = 0
         self._beyond_accident = 0.0
 
-    def update(self, gate: Gate, frames: int, now: float, *, frames_may_be_refused: bool) -> dict[int, int]:
-        """Read the counters. ``frames``: all received ones, or those that were sent.
-
-        Returns the foreign systems that sent since the last call.
-        """
+    def update(self, gate: Gate, frames: int, now: float, *, frames_may_be_refused: bool) -> None:
+        """Read the counters. ``frames``: all received ones, or those that were sent."""
         self.reasons.update(gate.totals, now)
         self.commands.update(gate.refused_commands, now)
+        self.systems.update(gate.refused_systems, now)
         if gate is not self._gate:  # a new policy: what the one before refused does not count
             self._gate, self._refused, self._hiding, self._refused_at = gate, 0, 0, float("-inf")
         refused = gate.totals.total()
@@ -281,7 +277,6 @@ class GateHistory:
             self.hiding_at = now
         if grown > (refused_now if frames_may_be_refused else 0):
             self.passed_at = now
-        return self.systems.update(gate.refused_systems, now)
 
     def is_blocked(self, now: float) -> bool:
         """Whether frames came within :data:`BLOCKED_S` and all were refused, unless the policy means to."""
@@ -300,18 +295,14 @@ class PartHistory:
         self.unsent = RecentGrowth[EgressDrop]()
         self.silent_since = now
         """When the last frame was received."""
-        self.mixed = (float("-inf"),) * 3
-        """The latest three seconds in which a foreign system was refused, soon after frames passed."""
         self._frames = 0
 
     def update(self, frames: int, frames_sent: int, policy: Policy, now: float) -> None:
         """Read the counters of received and sent frames, and of the policy."""
         if frames != self._frames:
             self._frames, self.silent_since = frames, now
-        foreign = self.incoming.update(policy.incoming, frames, now, frames_may_be_refused=True)
+        self.incoming.update(policy.incoming, frames, now, frames_may_be_refused=True)
         self.outgoing.update(policy.outgoing, frames_sent, now, frames_may_be_refused=False)
-        if foreign and now - self.incoming.passed_at <= OWN_FRAMES_S:
-            self.mixed = (*self.mixed[1:], now)
 
     def blocked(self, now: float) -> list[str]:
         """The directions, ``in`` and ``out``, in which the policy recently refused all frames."""

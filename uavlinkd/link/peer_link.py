@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from operator import itemgetter, sub
 
 from uavlinkd.config.model import PeerConfig
@@ -12,7 +11,6 @@ from uavlinkd.core.constants import CONFIGURED_PATHS, LOSS_WINDOW_S, NEVER
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Output
 from uavlinkd.core.path import Path
-from uavlinkd.core.path_measures import lost_share
 from uavlinkd.core.path_state import PathState
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.problem_reports import LARGEST_PROBLEM_REPORT
@@ -29,6 +27,11 @@ from uavlinkd.ops.findings import LinkProblem
 
 NOT_ANSWERING_S = 3.0
 """A peer or relay that is silent for this long is reported. A normal start takes less, and tries are more often."""
+
+LOSSY = 0.1
+"""A link that loses more than this share of one direction has a high loss,"""
+LOSSES = 5
+"""if at least so many envelopes are lost."""
 
 RELAYED_LEAST = 3
 """Slots for configured paths that relayed ones have at least: one for each relay."""
@@ -110,7 +113,9 @@ class PeerLink:
         self._newest = NewestStates()
         self._direct: Sequence[Path] = ()
         self.losses: tuple[tuple[int, int], ...] = ()
-        """In and out, how many envelopes were sent recently, and how many of them lost, if the loss lasts."""
+        """In and out, how many envelopes were sent recently, and how many of them lost: by the last measurement."""
+        self.lossless_at = [now, now]
+        """When the loss of each was last not high."""
         self._missing: list[tuple[int, int, int]] = []  # session, expected, missing; the oldest first
         self._sample: tuple[int, tuple[int, int, int, int]] | None = None
         # A session, and its counters at one moment: expected and received here, and as the peer reports.
@@ -255,7 +260,7 @@ class PeerLink:
         loss_in = loss_out = 0.0
         best = peer.paths.best
         missing = peer.missing(now)
-        self.losses = self._recent_losses(missing, now)
+        self.note_losses(self._recent_losses(missing, now), now)
         if best is not None and peer.paths.has_several:
             loss_in, loss_out = best.loss_in, best.loss_out  # gaps in the counters say nothing about one path
         elif self._sample is not None and before is not None and before[0] == self._sample[0]:
@@ -275,6 +280,12 @@ class PeerLink:
         )
         return self.figures
 
+    def note_losses(self, losses: tuple[tuple[int, int], ...], now: float) -> None:
+        """Note the losses that were measured in and out; none without a path."""
+        self.losses = losses
+        both = zip(losses or ((0, 0), (0, 0)), self.lossless_at, strict=True)
+        self.lossless_at = [before if lost >= max(LOSSES, LOSSY * sent) else now for (sent, lost), before in both]
+
     def _recent_losses(self, missing: int, now: float) -> tuple[tuple[int, int], ...]:
         """``missing``: all that ever did not arrive."""
         best, session = self.peer.paths.best, self.peer.sessions.current
@@ -282,13 +293,11 @@ class PeerLink:
             return ()
         counted_now = session.local_index, session.expected, missing
         earlier = [one for one in self._missing if one[0] == session.local_index]
-        window = round(LOSS_WINDOW_S)
-        self._missing = [*earlier[-2 * window :], counted_now]
+        self._missing = [*earlier[-round(LOSS_WINDOW_S) :], counted_now]
         into, out = best.recent_losses(now)
-        if not self.peer.paths.has_several and len(self._missing) > 2 * window:  # then the peer may send few reports
-            windows = pairwise(self._missing[::window])
-            counted = [(after[1] - before[1], after[2] - before[2]) for before, after in windows]
-            into = max(into, min(counted, key=lost_share), key=itemgetter(1))
+        if not self.peer.paths.has_several:  # then the peer may send few reports
+            counted = session.expected - self._missing[0][1], missing - self._missing[0][2]
+            into = max(into, counted, key=itemgetter(1))
         return into, out
 
     @property

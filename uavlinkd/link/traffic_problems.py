@@ -35,10 +35,8 @@ CLAIMS_S: Final = 60.0
 """A peer's claim whose count grew within this time is a present problem."""
 REFUSED_S: Final = 10.0
 """Other refusals stay for this time."""
-LOSSY: Final = 0.1
-"""A link that loses more than this share of one direction is reported,"""
-LOSSES: Final = 5
-"""if at least so many envelopes are lost."""
+LOSS_LASTS_S: Final = 12.0
+"""A high loss is reported if it lasts for this time. An outage that is over counts as a loss for up to 10 s."""
 SILENT_S: Final = 5.0
 """An endpoint without frames for this time is reported: MAVLink clients send a heartbeat every second. Its errors
 count for the same time. It is opened again more often."""
@@ -61,18 +59,6 @@ def peer_problems(peer: PeerFacts) -> Iterator[Found]:
     if has_twin(peer.link.peer, Twin.PEERS, peer.now):
         yield two_machines(f"{peer.name}'s private key: sessions came from {places(peer.link.peer)}")
     yield from _hidden_frames(peer)
-    is_mixed = peer.now - peer.history.mixed[0] <= SECURITY_S
-    if is_mixed and (owned := _owned(peer, peer.history.incoming.systems.within(SECURITY_S, peer.now))):
-        whose = listed(f"{system} ({owner})" for system, owner in owned.items())
-        cut_off = "delete its [[peer]] and run `uavlinkd reload`"
-        if peer.link.config.settings.is_certified:
-            cut_off = f"run `uavlinkd fleet remove {peer.name}`"
-        yield warning(
-            "impersonation",
-            f"beside its own frames it sends as system {whose}, which is refused: it passes on frames from there, has"
-            " the same id by mistake, or is captured",
-            f"inspect {peer.name}; if it is captured, {cut_off}",
-        )
     claims = [claim for claim in peer.link.peer.refusal_claims.recent() if peer.now - claim.changed_at <= CLAIMS_S]
     if claims:
         yield _refused_there(peer, claims)
@@ -139,10 +125,11 @@ def up_problems(peer: PeerFacts) -> Iterator[Found]:
 def _losses(peer: PeerFacts) -> Iterator[Found]:
     """Loss by direction, which a network may have in one only, and paths that drop long datagrams."""
     directions = ("from it to here", "from here to it")
+    measured = zip(directions, peer.link.losses, peer.link.lossless_at, strict=False)
     shares = [
         (direction, min(1.0, lost / max(1, sent)))
-        for direction, (sent, lost) in zip(directions, peer.link.losses, strict=False)
-        if lost >= max(LOSSES, LOSSY * sent)
+        for direction, (sent, lost), lossless_at in measured
+        if peer.now - lossless_at >= LOSS_LASTS_S
     ]
     if shares:
         yield warning(
@@ -183,7 +170,8 @@ def _about_systems(part: PartFacts, systems: Mapping[int, int], which: str) -> t
     own = f"set {SYSTEM_ID} of its autopilot to {ids}"
     if owned := _owned(part, systems):  # never advise to trust one peer as another
         whose = listed(f"{system} is {owner}'s" for system, owner in owned.items())
-        return text, f"{own}: {whose}"
+        is_captured = f"; if no client there forwards such frames, treat {part.name} as captured"
+        return text, f"{own}: {whose}{is_captured if isinstance(part, PeerFacts) else ''}"
     remedy = "write it into its system_ids"
     if is_certified:
         remedy = _sign_again(part.name, f"--id {min(systems)}")

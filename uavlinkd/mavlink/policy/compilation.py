@@ -17,11 +17,8 @@ A policy cannot inspect the content of files, shells, tunnels and raw buses. A m
 or has in another definition, passes only if ``all`` or its number is allowed. No policy passes SETUP_SIGNING, which
 carries a signing key in clear, nor a request for a file with one (`secrets`).
 
-A message that is longer than the dialect's definition passes by the fields that the dialect has. Its checksum shows
-that these are where they were: what is behind them are extension fields of a newer definition. Extension fields are
-optional, so they do not change what the known fields say; every receiver of the older definition ignores them. A
-policy cannot inspect them: where a future extension would give an allowed message an effect that you do not want,
-update the daemon first. Frames that are hidden in them are found as in any payload (`delivery`).
+A message that is longer than its definition passes by the fields that the dialect has (`frames`). A policy cannot
+inspect the extension fields of a newer definition. They are optional: a known field means the same without them.
 """
 
 from __future__ import annotations
