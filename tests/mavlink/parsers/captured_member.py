@@ -31,7 +31,11 @@ CAST: Final[Mapping[str, Mapping[str, object]]] = {
     "other member": {"role": "swarm-member", "system_ids": [3]},
     "vehicle": {"role": "vehicle", "system_ids": [2]},
     "observer": {"role": "observer", "system_ids": [200], "allow_in": ["REQUEST_EVENT"]},
-    "operator": {"system_ids": [255], "allow_in": ["heartbeat", "files", "parameters"], "allow_out": ["all"]},
+    "operator": {
+        "system_ids": [255],
+        "allow_in": ["heartbeat", "files", "parameters", "signals"],
+        "allow_out": ["all"],
+    },
     "operator without MAVLink 1": {"role": "operator", "system_ids": [255], "mavlink1": False},
     "private dialect": {"role": "swarm-member", "system_ids": [7], "allow_in": [54321, 150]},
     "everything": EVERYTHING,
