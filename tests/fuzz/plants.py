@@ -200,7 +200,7 @@ PLANTS: Final = {
         "_verdict",
         lambda right: lambda self, header: None if header.system == 3 else right(self, header),
     ),
-    "a frame comes back": Plant("switch", routing.Router, "_decide", _back_to_sender),
+    "a frame comes back": Plant("switch", routing.Router, "_ports_for", _back_to_sender),
     "text that is not ASCII ends the control socket": Plant(
         "control",
         control.ControlServer,

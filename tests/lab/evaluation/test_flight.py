@@ -168,7 +168,7 @@ async def test_quick_run(tmp_path: Path) -> None:
     for link in LinkKind:
         assert findings.of("sample", link=link, aircraft="drone0")
         assert findings.of("sample", link=link, aircraft="drone1")
-    assert "replayed" in findings.noticed(LinkKind.OURS, AttackPhase.REPLAY)
+    assert "late_copy" in findings.noticed(LinkKind.OURS, AttackPhase.REPLAY)
     assert "bad_tag" in findings.noticed(LinkKind.OURS, AttackPhase.ALTER)
     assert "(flight.svg)" in (tmp_path / "flight.md").read_text()
     interventions = [json.loads(line) for line in (tmp_path / "mitm-flight-uavlinkd.jsonl").read_text().splitlines()]
