@@ -21,9 +21,7 @@ except ImportError:  # Windows
 else:
     _CAN_ASK = True
 
-DATAGRAMS_PER_WAKE_UP = 512
-"""The most datagrams that one read takes from a socket; then the others have their turn. Two reads empty a full one:
-behind a flood of usual datagrams, another one waits for two turns of the flood's sender."""
+DATAGRAMS_PER_WAKE_UP = 128  # most that one read takes from a socket; then the others have their turn
 RECEIVE_BYTES = 65536
 _buffer = memoryview(bytearray(RECEIVE_BYTES))
 """Every datagram is read into this buffer and copied at its own size. A new buffer of 64 KiB for each of them would

@@ -44,7 +44,7 @@ TURN_S: Final = 0.003
 """The longest turn of one sender, without the delivery of its frames. Another sender's frames wait for a few turns,
 which is far below a radio's delay. It is CPU time: by the wall clock each turn would end after one datagram when
 other processes use the processor."""
-TURN_FRAMES: Final = 150
+TURN_FRAMES: Final = 300
 """Frames that end a turn too, by :func:`cost_of`: the delivery of a frame costs as much as reading it."""
 _OF_RELAYS: Final = frozenset({RELAYED_START, TOKEN_START})
 
