@@ -318,6 +318,17 @@ def test_a_member_with_a_new_key_takes_the_name_when_it_is_there() -> None:
     assert fleet.b.peer is admitted.peer
 
 
+def test_certificate_along_a_network_of_another_peer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is valid, and gets no answer there."""
+    fleet = Fleet()
+
+    def refuse(*arguments: object) -> None:
+        raise Drop(DropReason.UNKNOWN_PEER)
+
+    monkeypatch.setattr(fleet.b.node.facts.__class__, "check_network", refuse)
+    assert reasons(fleet.b.receive(fleet.initiation(0.0), 0.0)) == [DropReason.UNKNOWN_PEER]
+
+
 def test_certificate_is_shown_again_without_answers() -> None:
     """A rekey is short while the peer answers. One that is silent may have restarted: it gets the long form."""
     fleet = Fleet()

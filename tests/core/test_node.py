@@ -6,7 +6,7 @@ import random
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 
@@ -623,3 +623,24 @@ def test_many_peers_that_are_due_together_are_handled_in_parts() -> None:
     assert max(parts) == PEERS_AT_ONCE
     assert sum(parts) >= count
     assert all(peer.timers.next_at > 5.0 for peer in node.peers.values())
+
+
+def test_a_fault_while_an_envelope_is_received_leaves_all_timers_of_its_peer_soon_due(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The shell gets the exception. A datagram that names no peer wakes none."""
+    pair = established()
+    envelope = pair.a.envelope(1.0)
+
+    def fail(*arguments: Any) -> Any:
+        raise RuntimeError("planted")
+
+    monkeypatch.setattr("uavlinkd.core.node.receive_envelope", fail)
+    with pytest.raises(RuntimeError, match="planted"):
+        pair.b.receive(envelope, 1.0)
+    assert pair.b.node.next_deadline() <= 1.0 + c.RECOVER_S
+    monkeypatch.undo()
+    assert pair.carries(1.5)
+    monkeypatch.setattr(type(pair.b.node._handshakes), "receive", fail)
+    with pytest.raises(RuntimeError, match="planted"):
+        pair.b.receive(made_initiation(), 2.0)
