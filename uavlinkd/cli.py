@@ -27,7 +27,7 @@ _LINE_LIMIT = 4096
 OF_THE_LABORATORY = {
     "sim": "fly a simulated autopilot, or play a recorded flight",
     "demo": "run two daemons on this machine that exchange frames",
-    "evaluate": "measure uavlinkd: beside the paper's method, under attack, and with radios that fail",
+    "evaluate": "measure uavlinkd: beside the paper's method, under attack, and in flight",
 }
 """Commands of an optional package, which adds their arguments."""
 _REMOVED = {"report": "send what `uavlinkd status --json` prints, and the log of `journalctl -u uavlinkd`"}

@@ -25,7 +25,6 @@ EVALUATIONS = {
     "timing": "time the paper's method and uavlinkd's",
     "tampering": "attack the paper's protocol and real daemons",
     "flight": "let two aircraft exchange positions in flight under attack",
-    "paths": "let radios between a vehicle and its station fail: two paths, one path, and duplicated frames",
 }
 STAGES = ("handshake", "data", "keys", "paper", "paths", "spoiled", "line", "relay", "web", "fleet")
 
@@ -34,20 +33,13 @@ _Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 def add_evaluations(commands: _Commands) -> None:
     """Add the evaluations, and ``report``."""
-    _, tampering, _, paths = (_add(commands, name) for name in EVALUATIONS)
+    _, tampering, _ = (_add(commands, name) for name in EVALUATIONS)
     tampering.add_argument(
         "--only",
         metavar="STAGE",
         choices=STAGES,
         action="append",
         help=f"run this stage alone; may be repeated: {', '.join(STAGES)} (default: all)",
-    )
-    paths.add_argument(
-        "--tlog",
-        metavar="FILE",
-        type=Path,
-        action="append",
-        help="also measure the redundancy of this recorded flight; may be repeated, but not with --quick",
     )
     report = commands.add_parser("report", help="write the figures and the report again, from the records")
     report.add_argument("folder", metavar="DIR", type=Path, help="folder with the records")
@@ -74,8 +66,9 @@ def evaluation_of(name: str) -> Evaluation[Any, Any]:
 
 def settings_of(evaluation: Evaluation[Any, Any], options: argparse.Namespace) -> Any:
     values = {item.name: getattr(options, item.name) for item in fields(evaluation.settings)}
-    repeated: dict[str, Any] = {name: tuple(values[name] or ()) for name in ("only", "tlog") if name in values}
-    return evaluation.settings(**{**values, **repeated})
+    if "only" in values:
+        values["only"] = tuple(values["only"] or ())
+    return evaluation.settings(**values)
 
 
 def _evaluate(options: argparse.Namespace) -> int:
@@ -118,10 +111,9 @@ def _errors() -> tuple[type[Exception], ...]:
     from uavlinkd.lab.sim.aircraft import PilotError  # noqa: PLC0415
     from uavlinkd.lab.sim.drone_process import DroneError  # noqa: PLC0415
     from uavlinkd.lab.sim.real_autopilot import RealAutopilotError  # noqa: PLC0415
-    from uavlinkd.lab.sim.tlog import TlogError  # noqa: PLC0415
     from uavlinkd.ops.control import ControlError  # noqa: PLC0415
 
-    return (EvaluationError, DroneError, PilotError, RealAutopilotError, TlogError, ControlError, OSError)
+    return (EvaluationError, DroneError, PilotError, RealAutopilotError, ControlError, OSError)
 
 
 def _show(line: str) -> None:

@@ -13,11 +13,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from uavlinkd.core.settings import Class
 from uavlinkd.lab.evaluation.flight_plan import ATTACKS, LINK_NAMES, PAIR, AttackPhase, LinkKind
 from uavlinkd.lab.evaluation.flight_report import FlightFindings
-from uavlinkd.lab.evaluation.paths_plan import STALE_S, Scenario
-from uavlinkd.lab.evaluation.paths_report import PathsFindings, TrialView
 from uavlinkd.lab.evaluation.records import Record, Value
 from uavlinkd.lab.evaluation.timing_report import TimingFindings
 
@@ -27,7 +24,7 @@ Series = list[tuple[str, dict[Value, list[float]]]]
 
 COLOURS: Final = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#d55e00", "#56b4e9", "#7f7f7f", "#000000")
 """The palette of Okabe and Ito, for colour-blind readers too."""
-_BLUE, _ORANGE, _GREEN, _PINK, _RED, _SKY, _GREY, _BLACK = COLOURS
+_BLUE, _ORANGE, _GREEN, _PINK, _RED, _, _GREY, _BLACK = COLOURS
 STYLE: dict[Any, Any] = {
     "svg.hashsalt": "uavlinkd",
     "font.size": 10,
@@ -181,38 +178,3 @@ def _draw_errors(axes: Axes, findings: FlightFindings, link: LinkKind, samples: 
         axes.set_xlim(spans[0][1], spans[-1][2])
     for state, begin_s, end_s in findings.states(link):
         axes.axvspan(begin_s, end_s, ymin=0.0, ymax=0.05, color=_STATE_COLOURS[state], linewidth=0)
-
-
-def draw_paths(findings: PathsFindings) -> dict[str, Figure]:
-    """The ages of the delivered frames when a path dies, and when it stalls."""
-    figures = {}
-    for scenario in (Scenario.DIES, Scenario.STALLS):
-        trials = [trial for trial in findings.trials if trial.scenario is scenario]
-        if trials:
-            figures[f"paths-{scenario}"] = _draw_ages(trials)
-    return figures
-
-
-def _draw_ages(trials: Sequence[TrialView]) -> Figure:
-    """The age of each delivered frame over the time of its delivery, one panel for each of the means."""
-    figure = Figure(figsize=(9.6, 0.8 + 1.6 * len(trials)), layout="constrained")
-    panels: Sequence[Axes] = list(figure.subplots(len(trials), 1, sharex=True, sharey=True, squeeze=False)[:, 0])
-    for axes, trial in zip(panels, trials, strict=True):
-        for cls, colour, size in ((Class.STREAM, _SKY, 2.5), (Class.CRITICAL, _RED, 5.0)):
-            points = [
-                (at_s, max(at_s - flow.sent_s[number], 0.005))
-                for flow in trial.of(cls)
-                for number, at_s in flow.deliveries
-            ]
-            axes.plot(*_split(points), ".", markersize=size, color=colour, label=f"{cls} frames")
-        for outage in trial.outages:
-            axes.axvspan(outage.at_s, outage.until_s, color="#fde9d9", zorder=0)
-        axes.axhline(STALE_S, color=_GREY, linestyle="--", linewidth=1)
-        axes.set_yscale("log")
-        axes.set_yticks([0.01, 0.1, 1, 10], ["10 ms", "0.1 s", "1 s", "10 s"])
-        axes.set_ylim(0.005, 20)
-        axes.set_title(trial.means, loc="left", fontsize=10)
-    panels[len(trials) // 2].set_ylabel("age of the delivered frame")
-    panels[-1].set_xlabel("time (s); shaded: one path does not work")
-    panels[-1].legend(loc="upper center", bbox_to_anchor=(0.5, -0.35), ncols=2)
-    return figure

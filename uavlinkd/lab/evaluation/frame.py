@@ -125,7 +125,7 @@ def command(name: str, settings: EvaluationSettings) -> str:
         if value is True:
             words.append(option)
         elif isinstance(value, tuple):
-            words += [f"{option} {getattr(part, 'name', part)}" for part in value]
+            words += [f"{option} {part}" for part in value]
         elif value != item.default or item.name == "seed":
             words.append(f"{option} {value}")
     return " ".join(words)
