@@ -23,7 +23,6 @@ SLOWEST = (
     "packages",
     "compose",
     "faults",
-    "soak",
     "evaluation",
     "bench",
     "fleet",
@@ -32,7 +31,7 @@ SLOWEST = (
     "network",
 )
 """Folders, the slowest tests first."""
-ALONE = ("pressure", "faults", "soak", "daemon", "link")
+ALONE = ("pressure", "faults", "daemon", "link")
 """Folders whose tests measure delays, losses and processor time of real daemons: marked ``alone``."""
 LONG = ("natlab", "faults", "modem", "compose")
 """Folders of machines: routers, modems, containers, broken networks. Marked ``long``; most of them need root."""

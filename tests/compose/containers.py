@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 import subprocess
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from tests.compose import images
-from tests.compose.cluster import SYSTEM_IDS, Cluster, run
+from tests.compose.cluster import run, until
 from tests.fleet.vehicles import create
 from uavlinkd.fleet.manifest import FleetSettings
 from uavlinkd.ops.control import ControlError, ask
@@ -19,25 +19,27 @@ from uavlinkd.system.addresses import Address
 USER = 10001
 NETWORK = f"10.{64 + os.getpid() % 128}"
 """The first half of the addresses. Another checkout may test on the same machine."""
-SUBNET, MITM_SUBNET = f"{NETWORK}.0.0/24", f"{NETWORK}.1.0/24"
+SUBNET = f"{NETWORK}.0.0/24"
+LINKED_S = 5.0
+"""From the last daemon's start until all links are up, on an idle machine."""
+SYSTEM_IDS = {"drone1": 1, "drone2": 2, "drone3": 3, "ground-station": 255}
+
+Status = dict[str, Any]
 
 
-class Containers(Cluster):
+class Containers:
     """The services of compose.yaml."""
 
-    def __init__(self, folder: Path, image: str, *, mitm: bool = False) -> None:
+    def __init__(self, folder: Path, image: str) -> None:
         self._folder = folder
-        self.project = f"uavlinkd-test-{os.getpid()}{'-mitm' if mitm else ''}"
-        self._mitm = mitm
+        self.project = f"uavlinkd-test-{os.getpid()}"
         compose = images.compose_command()
         assert compose is not None
         self._compose = [*compose, "--project-name", self.project, "--file", str(images.HERE / "compose.yaml")]
-        if mitm:
-            self._compose += ["--profile", "mitm"]
         self.environ = {
             "UAVLINKD_IMAGE": image,
             "FLEET": str(folder / "fleet"),
-            "SUBNET": MITM_SUBNET if mitm else SUBNET,
+            "SUBNET": SUBNET,
             "RESTART": "no",
         }
         self._pids: dict[str, int] = {}
@@ -49,9 +51,6 @@ class Containers(Cluster):
         )
         fleet = self._folder / "fleet"
         create(fleet, settings, drones=3, stations=1, at=[Address("ground-station", 5790)])
-        if self._mitm:
-            replace(fleet / "drone1" / "drone1.toml", '"ground-station:5790"', '"mitm:5801"')
-            replace(fleet / "drone1" / "drone1.toml", "listen = []", 'listen = ["0.0.0.0:5790"]')
         for path in (fleet, *fleet.rglob("*")):
             os.chown(path, USER, USER)
         for path in (fleet, *fleet.parents):
@@ -59,7 +58,7 @@ class Containers(Cluster):
                 break
             path.chmod(0o755)
         await self.compose("up", "--detach", "--no-build")
-        for name in (*SYSTEM_IDS, *(("mitm",) if self._mitm else ())):
+        for name in SYSTEM_IDS:
             pid = await run("docker", "inspect", "--format", "{{.State.Pid}}", await self.container(name))
             self._pids[name] = int(pid)
 
@@ -78,39 +77,44 @@ class Containers(Cluster):
         assert len(containers.split()) == 1, f"{service} has the containers: {containers}"
         return containers.strip()
 
-    def namespace_of(self, name: str) -> Path:
-        return Path(f"/proc/{self._pids[name]}/ns/net")
-
     def control_socket_of(self, name: str) -> Path:
         return Path(f"/proc/{self._pids[name]}/root/run/uavlinkd/control.sock")
 
     def logs(self) -> str:
         return self._logs
 
-    # The man in the middle.
+    def status(self, name: str) -> Status | None:
+        """What the daemon says; None where it does not answer."""
+        with suppress(ControlError, OSError, LookupError):
+            return ask(self.control_socket_of(name), "status", timeout_s=1.0)
+        return None
 
-    def ask_mitm(self, request: str) -> dict[str, Any]:
-        """What the man in the middle answers; nothing where he is not there."""
-        try:
-            return ask(Path(f"/proc/{self._pids['mitm']}/root/run/uavlinkd/mitm.sock"), request)
-        except ControlError:
-            return {}
+    def states(self, name: str) -> dict[str, str]:
+        """How its peers are, as it says."""
+        status = self.status(name)
+        return {} if status is None else {peer: facts["state"] for peer, facts in status["peers"].items()}
 
-    def interventions(self, attack: str) -> int:
-        counts: dict[str, int] = self.ask_mitm("statistics").get("interventions", {})
-        return sum(count for name, count in counts.items() if name.partition(":")[0] == attack)
+    def are_all_linked(self) -> bool:
+        return all(
+            len(states) == len(SYSTEM_IDS) - 1 and set(states.values()) == {"up"}
+            for states in map(self.states, SYSTEM_IDS)
+        )
+
+    async def until_linked(self) -> None:
+        """Wait until all daemons listen, and see that all links are up in time from there.
+
+        Raises:
+            AssertionError: they are not.
+        """
+        starting = await until(lambda: all(map(self.status, SYSTEM_IDS)), "all daemons listen")
+        took = await until(self.are_all_linked, "all links are up")
+        print(f"all daemons listened after {starting:.2f} s, and all links were up {took:.2f} s later")
+        assert took < LINKED_S
 
 
 def health(container: str) -> str:
     command = ("docker", "inspect", "--format", "{{.State.Health.Status}}", container)
     return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
-
-
-def replace(path: Path, old: str, new: str) -> None:
-    """Replace the only occurrence of a text in a file."""
-    text = path.read_text()
-    assert text.count(old) == 1
-    path.write_text(text.replace(old, new))
 
 
 @asynccontextmanager

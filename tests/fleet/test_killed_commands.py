@@ -90,7 +90,6 @@ def check(folder: Path) -> None:
 
 
 PAPER = "paper"
-ENROLLED = ["enroll v7", "fleet sign", "enroll --finish"]
 COMMANDS: list[tuple[str, list[str], str]] = [
     # The command; those before it, each of which reads the line of the one before; and what it reads.
     ("fleet add v9 --id 9", [], ""),

@@ -35,9 +35,6 @@ _SPENT = ONLY_COUNTED | {"_cookied", "_sources"} | _OF_COPIES
 _DEADLINES = {"deadlines", "next_at", "scheduled_at", "_heap", "_pushed"}
 _SPENT_WITH_COOKIES = _SPENT | {"_received_cookies", "cookied", "retry_at", "cookies_taken", *_DEADLINES}
 _KINDS = (*range(1, 4), 0x40, 0x41, 0xFD, 0xFE, 0)
-_HANDSHAKE_SIZES = tuple(
-    size(suite) for suite in SUITES.values() for size in (wire.initiation_bytes, wire.response_bytes)
-)
 _SUITE_NUMBERS = tuple(SUITES)
 _REPAIRED = (wire.INITIATION, wire.RESPONSE)
 

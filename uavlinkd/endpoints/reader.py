@@ -25,7 +25,7 @@ DATAGRAMS_PER_WAKE_UP = 128  # most that one read takes from a socket; then the 
 RECEIVE_BYTES = 65536
 _buffer = memoryview(bytearray(RECEIVE_BYTES))
 """Every datagram is read into this buffer and copied at its own size. A new buffer of 64 KiB for each of them would
-leave holes between objects that live long, and the heap would grow for hours (tests/soak/README.md)."""
+leave holes between objects that live long, and the heap would grow for hours."""
 BUSY_S = 0.0005  # a socket that is readable again so soon after its last batch is busy: about 2,000 datagrams/s
 PAUSE_S = 0.001
 """How long datagrams gather in a busy socket. A radio's delay is many times that. At 10,000 datagrams/s the process

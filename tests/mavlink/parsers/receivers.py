@@ -19,9 +19,6 @@ import pymavlink.generator
 from uavlinkd.mavlink.dialect import OTHER_EXTRAS
 
 DIALECTS = ("minimal", "common", "ardupilotmega", "all")
-LIBRARIES = ("2.0", "2.0-unknown", "2.0-other", "1.0")
-"""The library of MAVLink 2: as it is, as it was before 2025, and with other definitions of some messages, public and
-private ones. And the library of receivers that know MAVLink 1 only."""
 PRIVATE_EXTRAS = {54321: 77, 150: 13}
 """CRC_EXTRA of messages in a private dialect."""
 _SOURCE = Path(__file__).with_name("receiver.c")

@@ -1,1 +1,0 @@
-"""What a relay carries, beside coturn on the same work."""

@@ -1,1 +1,0 @@
-"""A long run of real daemons over the emulated radio: ``python -m tests.soak``."""
