@@ -15,6 +15,8 @@ ORDER = (
     *("link", "cli", "__main__"),
 )
 """Each package may import those before it."""
+ORDER_OF_LABORATORY = ("child_processes", "mitm", "hostile", "sim", "evaluation", "demo", "commands")
+"""Each part of the laboratory may import those before it."""
 IMPURE = {
     *("asyncio", "concurrent", "multiprocessing", "select", "selectors", "signal", "socket", "ssl", "threading"),
     *("datetime", "time", "uuid", "random", "secrets"),
@@ -102,6 +104,18 @@ def test_packages_import_in_one_direction() -> None:
         for module, others in graph().items()
         for other in others
         if package_of(other) and ORDER.index(package_of(other)) > ORDER.index(package_of(module))
+    ]
+    assert forbidden == []
+
+
+def test_parts_of_the_laboratory_import_in_one_direction() -> None:
+    """The man in the middle needs no simulator, and the simulator no evaluation."""
+    part = {module: f"{module}..".split(".")[2] for module in graph() if is_inside(module, "uavlinkd.lab")}
+    forbidden = [
+        f"{module} imports {other}"
+        for module, of_module in part.items()
+        for other in graph()[module] & part.keys()
+        if part[other] and ORDER_OF_LABORATORY.index(part[other]) > ORDER_OF_LABORATORY.index(of_module)
     ]
     assert forbidden == []
 

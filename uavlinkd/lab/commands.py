@@ -90,13 +90,13 @@ def _sim(options: argparse.Namespace) -> int:
 def _demo(options: argparse.Namespace) -> int:
     from uavlinkd.lab.child_processes import interrupted_by_signals  # noqa: PLC0415
     from uavlinkd.lab.mitm.attack import AttackError  # noqa: PLC0415
-    from uavlinkd.lab.sim.demo import DEMO_ERRORS, run_demo  # noqa: PLC0415
+    from uavlinkd.lab.demo.run import DEMO_ERRORS, run_demo  # noqa: PLC0415
 
     _check_seconds(options)
     if options.web:
         with of_the_extra("uavlinkd demo --web"):
-            from uavlinkd.lab.sim import demo_web  # noqa: PLC0415
-    serve = demo_web.serve if options.web else None
+            from uavlinkd.lab.demo import web  # noqa: PLC0415
+    serve = web.serve if options.web else None
     try:
         with interrupted_by_signals():
             summary = asyncio.run(

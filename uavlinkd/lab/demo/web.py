@@ -20,8 +20,8 @@ from starlette.routing import Route
 from uavlinkd.core.drops import DropReason
 from uavlinkd.lab.evaluation.middle import HOST
 from uavlinkd.lab.mitm.attacks import parse_attack
-from uavlinkd.lab.sim.demo import NAMES, SCREEN_S, Demo
-from uavlinkd.lab.sim.demo_screen import AttackResult
+from uavlinkd.lab.demo.run import NAMES, SCREEN_S, Demo
+from uavlinkd.lab.demo.screen import AttackResult
 from uavlinkd.ops import status_words as words
 from uavlinkd.ops.findings import LinkProblem
 from uavlinkd.system.addresses import Address
@@ -76,7 +76,7 @@ class _Attacks:
     def routes(self) -> list[Route]:
         """The first page with one script more, that script, its events, and the start of an attack."""
         document = (files("uavlinkd.web") / "static" / "index.html").read_text()
-        script = (files("uavlinkd.lab.sim") / "demo_web.js").read_text()
+        script = (files("uavlinkd.lab.demo") / "web.js").read_text()
         document = document.replace("</head>", '<script src="/attacks.js" defer></script>\n</head>')
         return [
             Route("/", Response(document, media_type="text/html"), methods=["GET"]),

@@ -20,7 +20,7 @@ import pytest
 
 from tests.daemon.test_demo import ENDED_S, demo
 from tests.waiting import PATIENCE_S, until
-from uavlinkd.lab.sim.demo_web import ATTACKS
+from uavlinkd.lab.demo.web import ATTACKS
 from uavlinkd.web.app import make_app
 from uavlinkd.web.watch import Watcher
 

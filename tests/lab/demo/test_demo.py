@@ -10,8 +10,8 @@ import pytest
 from rich.console import Console
 
 from uavlinkd.core.drops import DropReason
-from uavlinkd.lab.sim.demo import attacks_of
-from uavlinkd.lab.sim.demo_screen import AttackResult, Summary, render
+from uavlinkd.lab.demo.run import attacks_of
+from uavlinkd.lab.demo.screen import AttackResult, Summary, render
 from uavlinkd.lab.sim.drone_process import DroneProcess
 
 ATTACKED: dict[str, Any] = {"attacks": [AttackResult("drop", 9)]}

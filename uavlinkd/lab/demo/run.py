@@ -27,7 +27,7 @@ from uavlinkd.lab.evaluation.records import EvaluationError
 from uavlinkd.lab.evaluation.stage import DaemonStage
 from uavlinkd.lab.mitm.attack import AttackContext
 from uavlinkd.lab.mitm.attacks import ATTACKS, AttackSpec, parse_attack
-from uavlinkd.lab.sim.demo_screen import AttackResult, Summary, render, render_summary
+from uavlinkd.lab.demo.screen import AttackResult, Summary, render, render_summary
 from uavlinkd.lab.sim.drone_process import DroneError
 from uavlinkd.ops.findings import LinkProblem
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from playwright.async_api import expect
 
-from tests.lab.sim.test_demo_web import folder, page
+from tests.lab.demo.test_demo_web import folder, page
 from tests.web.browser import open_browser, window
-from uavlinkd.lab.sim.demo_web import ATTACKS
+from uavlinkd.lab.demo.web import ATTACKS
 
 __all__ = ["folder"]  # a fixture
 
