@@ -16,7 +16,7 @@ from typing import Final
 
 from fastcrc.crc16 import mcrf4xx
 
-from uavlinkd.lab.sim.tlog import parse_tlog
+from tests.tlog import read_tlog
 from uavlinkd.mavlink.dialect import MESSAGES
 from uavlinkd.mavlink.policy.compilation import Policy
 
@@ -63,7 +63,7 @@ def load_frames(flight: Path = FLIGHT) -> FrameSet:
     said: Iterable[bytes] = _simulated()
     source = "a flight of `uavlinkd sim`, as no recorded one is there"
     if flight.exists():
-        said = (record.frame for record in parse_tlog(flight.read_bytes()).records)
+        said = (record.frame for record in read_tlog(flight))
         source = f"{flight.name}: a recorded flight"
     frames = list(islice(_carried(said), MOST_FRAMES))
     whole = len(frames) - len(frames) % (PROBE_EVERY - 1)

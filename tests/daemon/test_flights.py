@@ -12,7 +12,7 @@ import pytest
 from tests.daemon.harness import Stage
 from tests.daemon.process import Status
 from tests.daemon.udp import pour
-from uavlinkd.lab.sim.tlog import read_tlog
+from tests.tlog import read_tlog
 
 FLIGHTS = {
     # MAVLink 2, a simulated copter.
@@ -31,7 +31,7 @@ MODES: dict[str, dict[str, Any]] = {
 
 @cache
 def recorded(path: Path) -> list[bytes]:
-    return [record.frame for record in read_tlog(path).records]
+    return [record.frame for record in read_tlog(path)]
 
 
 def drops(status: Status) -> Counter[str]:

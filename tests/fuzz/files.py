@@ -22,7 +22,6 @@ from uavlinkd.core.suites import SUITES
 from uavlinkd.fleet.manifest import FILE_NAME, read_manifest, write_manifest
 from uavlinkd.lab.mitm import anatomy
 from uavlinkd.lab.mitm.proxy_settings import ProxySettings, SettingsError, load_proxy_settings
-from uavlinkd.lab.sim.tlog import TlogError, parse_tlog
 
 SECRET: Final = encode_key(bytes(range(7, 39)))
 """A private key, which a person may paste into the wrong place."""
@@ -144,24 +143,6 @@ def make_enrolment() -> Run:
                 reply = enrolment.parse_reply(line)
                 assert reply.line() == line, "a reply with two spellings"
                 enrolment.verify_reply(reply, decode_key(PUBLIC))
-
-    return run
-
-
-def make_tlog() -> Run:
-    """A recorded flight: records that are in the file, in order, or a TlogError."""
-
-    def run(data: bytes) -> None:
-        try:
-            log = parse_tlog(data)
-        except TlogError:
-            return
-        whole = [record.time_us.to_bytes(8, "big") + record.frame for record in log.records]
-        position = 0
-        for record in whole:
-            position = data.find(record, position) + len(record)
-            assert position >= len(record), "a record that is not in the log"
-        assert sum(map(len, whole)) + log.skipped_bytes == len(data), "bytes are unaccounted for"
 
     return run
 

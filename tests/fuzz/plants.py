@@ -19,7 +19,6 @@ from uavlinkd.core.outputs import Transmit
 from uavlinkd.endpoints import line_framing, web_stream
 from uavlinkd.lab.mitm import anatomy
 from uavlinkd.lab.mitm import proxy_settings as mitm_settings
-from uavlinkd.lab.sim import tlog
 from uavlinkd.link import direct_search, relays
 from uavlinkd.mavlink import frames, routing
 from uavlinkd.mavlink.policy import gate
@@ -226,12 +225,6 @@ PLANTS: Final = {
     ),
     "two spellings of a line": Plant(
         "enrolment", enrolment, "_decoded", lambda _: lambda text, reason: base64.b64decode(text.encode())
-    ),
-    "a record of the last three bytes": Plant(
-        "tlog",
-        tlog,
-        "_plausible_end",
-        lambda right: lambda data, position: len(data) if len(data) - position == 3 else right(data, position),
     ),
     "an index beyond the end": Plant(
         "anatomy",

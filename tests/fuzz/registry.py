@@ -48,7 +48,6 @@ _TARGETS: Final = (
     Target("manifest", "a fleet's manifest", files.make_manifest, 4096, files.WORDS, True),
     Target("key", "a key file", files.make_key, 300),
     Target("enrolment", "the lines of an enrolment", files.make_enrolment),
-    Target("tlog", "a recorded flight", files.make_tlog),
     Target("anatomy", "a datagram as the man in the middle parses it", files.make_anatomy),
 )
 TARGETS: Final = {target.name: target for target in _TARGETS}

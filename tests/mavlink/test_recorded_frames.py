@@ -8,13 +8,13 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from tests.samples import raws
-from uavlinkd.lab.sim.tlog import read_tlog
+from tests.tlog import read_tlog
 from uavlinkd.mavlink.frames import SplitCounters, StreamSplitter, split_datagram, split_payload
 
 
 def frames_of(folder: Path, flight: str) -> list[bytes]:
     """The frames of a recorded flight, also broken ones."""
-    return [record.frame for record in read_tlog(folder / f"{flight}.tlog").records]
+    return [record.frame for record in read_tlog(folder / f"{flight}.tlog")]
 
 
 # No parser accepts these: four camera messages recorded with a checksum that fits nothing.

@@ -6,7 +6,6 @@ import argparse
 import asyncio
 import math
 from contextlib import suppress
-from pathlib import Path
 
 from uavlinkd.system.terminal import FAILED, OK, CommandError, UsageError, printable
 from uavlinkd.web.commands import of_the_extra
@@ -32,8 +31,6 @@ def _add_sim(sim: argparse.ArgumentParser) -> None:
     sim.add_argument("--rate", type=float, default=10.0, metavar="HZ", help="rate of ATTITUDE (default: %(default)s)")
     sim.add_argument("--seconds", type=float, metavar="N", help="end after N seconds")
     sim.add_argument("--seed", type=int, default=0, metavar="N", help="seed of sensor noise (default: %(default)s)")
-    sim.add_argument("--tlog", type=Path, metavar="FILE", help="play this recorded flight instead")
-    sim.add_argument("--speed", type=float, default=1.0, metavar="N", help="N times as fast; 0: as fast as possible")
 
 
 def _add_demo(demo: argparse.ArgumentParser) -> None:
@@ -57,10 +54,7 @@ def _add_demo(demo: argparse.ArgumentParser) -> None:
 def _sim(options: argparse.Namespace) -> int:
     from uavlinkd.lab.sim.flight import SimOptions, run_sim  # noqa: PLC0415
     from uavlinkd.lab.sim.links import LinkError, parse_url  # noqa: PLC0415
-    from uavlinkd.lab.sim.tlog import TlogError  # noqa: PLC0415
 
-    if not (math.isfinite(options.speed) and options.speed >= 0):
-        raise UsageError("--speed must be 0 or more")
     _check_seconds(options)
     try:
         url = parse_url(options.url)
@@ -70,18 +64,12 @@ def _sim(options: argparse.Namespace) -> int:
     def write(line: str) -> None:
         print(printable(line), flush=True)
 
-    settings = SimOptions(
-        url, options.system_id, options.rate, options.seconds, options.seed, options.tlog, options.speed
-    )
+    settings = SimOptions(url, options.system_id, options.rate, options.seconds, options.seed)
     try:
         with suppress(KeyboardInterrupt):  # it runs until then
             asyncio.run(run_sim(settings, write))
-    except (LinkError, TlogError) as error:
+    except (LinkError, OSError) as error:
         raise CommandError(error) from None
-    except OSError as error:
-        raise CommandError(
-            f"cannot read {options.tlog}: {error.strerror or error}" if options.tlog else error
-        ) from None
     except ValueError as error:  # a setting out of range
         raise UsageError(error) from None
     return OK
@@ -89,8 +77,8 @@ def _sim(options: argparse.Namespace) -> int:
 
 def _demo(options: argparse.Namespace) -> int:
     from uavlinkd.lab.child_processes import interrupted_by_signals  # noqa: PLC0415
-    from uavlinkd.lab.mitm.attack import AttackError  # noqa: PLC0415
     from uavlinkd.lab.demo.run import DEMO_ERRORS, run_demo  # noqa: PLC0415
+    from uavlinkd.lab.mitm.attack import AttackError  # noqa: PLC0415
 
     _check_seconds(options)
     if options.web:

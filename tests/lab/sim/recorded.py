@@ -1,4 +1,4 @@
-"""Frames and telemetry logs made for tests, and a connection that stores frames."""
+"""Frames made for tests, and a connection that stores frames."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from tests import waiting
 from uavlinkd.lab.sim.links import MavlinkConnection, open_connection
-
-START_US = 1_700_000_000_000_000
 
 
 def frames(count: int, system_id: int = 1) -> list[bytes]:
@@ -25,10 +23,6 @@ def frames(count: int, system_id: int = 1) -> list[bytes]:
         codec.seq, codec.signing.sign_outgoing = number % 256, number % 3 == 2
         made.append(bytes(message.pack(codec, force_mavlink1=number % 3 == 1)))
     return made
-
-
-def log_of(parts: list[bytes], step_us: int = 10_000) -> bytes:
-    return b"".join((START_US + number * step_us).to_bytes(8) + part for number, part in enumerate(parts))
 
 
 class Collector:

@@ -5,12 +5,11 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
-from pathlib import Path
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from tests.lab.sim.recorded import Collector, frames, log_of
+from tests.lab.sim.recorded import Collector
 from tests.waiting import until
 from uavlinkd.lab.sim.flight import SimOptions, run_sim
 from uavlinkd.lab.sim.links import parse_url
@@ -42,16 +41,3 @@ async def test_it_reports_a_ground_station() -> None:
             await until(lambda: "gcs connected: system_id 255 component_id 190" in lines)
         assert lines[-1].startswith("sent ")
         assert "received 1 in" in lines[-1]
-
-
-async def test_a_recorded_flight_has_its_length_and_its_counters(tmp_path: Path) -> None:
-    path = tmp_path / "flight.tlog"
-    path.write_bytes(log_of(frames(30)) + b"damaged")
-    lines: list[str] = []
-    async with Collector("udpin:127.0.0.1:0") as ground:
-        url = f"udpout:127.0.0.1:{ground.address[1]}"
-        await run_sim(SimOptions(parse_url(url), tlog=path, speed=0.0), lines.append)
-        await ground.until(lambda: len(ground.frames) == 30)
-    assert lines[0] == f"{path}: 30 frames of 0 s, sends to {url}; Ctrl-C ends it"
-    assert lines[1] == "7 bytes of the file are not MAVLink frames with timestamps: skipped"
-    assert lines[2].startswith("sent 30 frames, received 0 in ")

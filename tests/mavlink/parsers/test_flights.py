@@ -22,7 +22,7 @@ from tests.mavlink.parsers.hidden_frames import frame as build
 from tests.mavlink.parsers.judge import Deliverer, Judge, Stream, judge_all
 from tests.mavlink.parsers.receivers import Options, Receiver
 from tests.samples import frames_of
-from uavlinkd.lab.sim.tlog import TlogRecord, read_tlog
+from tests.tlog import TlogRecord, read_tlog
 from uavlinkd.mavlink.dialect import IDS, MESSAGES, name_of
 from uavlinkd.mavlink.frames import Frame, parse_frame
 from uavlinkd.mavlink.policy.compilation import Policy
@@ -119,7 +119,7 @@ def parsed(records: Sequence[TlogRecord]) -> list[tuple[float, Frame]]:
 @pytest.mark.parametrize("name", FLIGHTS)
 def test_recorded_flight_passes(shared_data: Path, name: str) -> None:
     """Every frame of vehicle and ground station, by policy, rates and invariant, in both directions, unchanged."""
-    flight = parsed(read_tlog(shared_data / name).records)
+    flight = parsed(read_tlog(shared_data / name))
     systems = sorted({frame.header.system for _, frame in flight} - {0, GROUND})
     vehicle = Policy({"role": "vehicle", "system_ids": systems})
     operator = Policy({"role": "operator", "system_ids": [GROUND]})

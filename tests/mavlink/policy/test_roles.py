@@ -24,7 +24,7 @@ from tests.samples import (
     mission_item,
     position,
 )
-from uavlinkd.lab.sim.tlog import read_tlog
+from tests.tlog import read_tlog
 from uavlinkd.mavlink.dialect import COMMANDS, GROUPS
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.mavlink.policy.gate import SYSTEM_SHARE, Refusal
@@ -214,7 +214,7 @@ WITH_RATES = ("swarm-member", "observer")
 @cache
 def flight(path: Path) -> list[tuple[float, Frame]]:
     """The genuine frames of a recorded flight, and the time of each."""
-    records = read_tlog(path).records
+    records = read_tlog(path)
     return [(record.time_us / 1e6, one) for record in records for one in frames_of([record.frame])]
 
 

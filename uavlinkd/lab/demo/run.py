@@ -22,12 +22,12 @@ from rich.live import Live
 
 from uavlinkd.core.constants import LATE_AFTER_S, LATE_STEP_S
 from uavlinkd.lab.child_processes import private_folder
+from uavlinkd.lab.demo.screen import AttackResult, Summary, render, render_summary
 from uavlinkd.lab.evaluation.middle import MiddleHere
 from uavlinkd.lab.evaluation.records import EvaluationError
 from uavlinkd.lab.evaluation.stage import DaemonStage
 from uavlinkd.lab.mitm.attack import AttackContext
 from uavlinkd.lab.mitm.attacks import ATTACKS, AttackSpec, parse_attack
-from uavlinkd.lab.demo.screen import AttackResult, Summary, render, render_summary
 from uavlinkd.lab.sim.drone_process import DroneError
 from uavlinkd.ops.findings import LinkProblem
 

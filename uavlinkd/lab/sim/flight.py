@@ -1,4 +1,4 @@
-"""``uavlinkd sim``: the simulated autopilot on a MAVLink connection, or a recorded flight."""
+"""``uavlinkd sim``: the simulated autopilot on a MAVLink connection."""
 
 from __future__ import annotations
 
@@ -7,12 +7,22 @@ import contextlib
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Self
 
 from uavlinkd.lab.sim.autopilot import Autopilot, AutopilotSettings, Event
 from uavlinkd.lab.sim.links import LinkURL, MavlinkConnection, open_connection
-from uavlinkd.lab.sim.tlog import PlaybackReport, play_tlog, read_tlog
+
+
+@dataclass(frozen=True, slots=True)
+class FlightReport:
+    """The counters of a simulated flight."""
+
+    frames_sent: int
+    frames_received: int
+    seconds: float
+
+    def __str__(self) -> str:
+        return f"sent {self.frames_sent:,} frames, received {self.frames_received:,} in {self.seconds:.1f} s"
 
 
 class Flight:
@@ -36,10 +46,10 @@ class Flight:
         self._failure: asyncio.Future[None] = self._loop.create_future()
 
     @property
-    def report(self) -> PlaybackReport:
+    def report(self) -> FlightReport:
         """The counters so far."""
         seconds = self._loop.time() - self._started_at
-        return PlaybackReport(self._frames_sent, self.autopilot.frames_received, seconds)
+        return FlightReport(self._frames_sent, self.autopilot.frames_received, seconds)
 
     async def run(self, seconds: float | None = None) -> None:
         """Fly for ``seconds``, or until cancelled. Raises what a callback raised."""
@@ -101,25 +111,15 @@ class SimOptions:
     rate_hz: float = 10.0
     seconds: float | None = None
     seed: int = 0
-    tlog: Path | None = None
-    speed: float = 1.0
 
 
 async def run_sim(options: SimOptions, write: Write) -> None:
-    """Fly or play until the end, or until cancelled, then write the counters.
+    """Fly until the end, or until cancelled, then write the counters.
 
     Raises:
-        OSError, TlogError: the log cannot be read.
         LinkError: the connection cannot be opened.
         ValueError: a setting is out of range.
     """
-    if options.tlog is None:
-        await _fly(options, write)
-    else:
-        await _play(options, options.tlog, write)
-
-
-async def _fly(options: SimOptions, write: Write) -> None:
     settings = AutopilotSettings(system_id=options.system_id, attitude_rate_hz=options.rate_hz, seed=options.seed)
 
     def on_event(name: str, fields: dict[str, object]) -> None:
@@ -135,27 +135,6 @@ async def _fly(options: SimOptions, write: Write) -> None:
             write(str(flight.report))
             if flight.frames_unsent:
                 write(f"{flight.frames_unsent:,} frames had no receiver")
-
-
-async def _play(options: SimOptions, path: Path, write: Write) -> None:
-    log = await asyncio.to_thread(read_tlog, path)
-    write(f"{path}: {len(log.records):,} frames of {log.seconds:.0f} s, {_where(options.url)}; Ctrl-C ends it")
-    if log.skipped_bytes:
-        write(f"{log.skipped_bytes:,} bytes of the file are not MAVLink frames with timestamps: skipped")
-    report = PlaybackReport()
-    watching: list[asyncio.Task[None]] = []
-
-    def on_open(link: MavlinkConnection, counters: PlaybackReport) -> None:
-        nonlocal report
-        report = counters
-        watching.append(asyncio.create_task(_watch(link, lambda: counters.frames_received > 0, write)))
-
-    try:
-        await play_tlog(log, str(options.url), speed=options.speed, seconds=options.seconds, on_open=on_open)
-    finally:
-        for task in watching:
-            task.cancel()
-        write(str(report))
 
 
 def _where(url: LinkURL) -> str:
