@@ -30,7 +30,7 @@ local TYPES = {
     [LONG_ENVELOPE] = "Envelope, 4-byte counter",
 }
 local AEAD_TAG_BYTES, COOKIE_BYTES, CERTIFICATE_BYTES = 16, 52, 100
-local TAG_LENGTHS = { 16, 8, 12, 32 } -- 16 is the default, so it comes first
+local TAG_LENGTHS = { 16, 8, 12 } -- 16 is the default, so it comes first
 local IS_TAG_LENGTH = { [8] = true, [12] = true, [16] = true, [32] = true }
 
 -- Control records: first byte of the payload, name, bytes. Payloads of frames start at 0xF0 or above.
@@ -130,8 +130,7 @@ uavlink.prefs.tag = Pref.enum("Tag length", INFER, "Tag length of envelopes, or 
     { 2, "8 bytes", 8 },
     { 3, "12 bytes", 12 },
     { 4, "16 bytes", 16 },
-    { 5, "32 bytes", 32 },
-    { 6, "confidential", CONFIDENTIAL },
+    { 5, "confidential", CONFIDENTIAL },
 }, false)
 
 -- The length of the frame at `offset`, or nil if no whole frame begins there.

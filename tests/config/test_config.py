@@ -86,15 +86,15 @@ def test_peer_inherits_key_by_key(tmp_path: Path) -> None:
             "suites = ['ffdhe2048', 'x25519']\ntag_bits = 96\nrekey_after_s = 60\nbudget_bits_s = 1000\n"
             "coalesce_s = 0.5\nredundancy = 'all'"
         )
-        + "tag_bits = 256\nconfidential = true\nkeepalive_s = 20\npsk_file = 'pair.psk'\nmax_age_s = 60\n"
-        + f"budget_bits_s = 1_000_000_000\nidle_probe_s = 0\n{OTHER_PEER}suites = ['mlkem768']\nmac_key_bits = 512\n"
+        + "tag_bits = 128\nconfidential = true\nkeepalive_s = 20\npsk_file = 'pair.psk'\nmax_age_s = 60\n"
+        + f"budget_bits_s = 1_000_000_000\nidle_probe_s = 0\n{OTHER_PEER}suites = ['mlkem768']\n"
         "max_envelope_bytes = 320\ncoalesce_s = 0\nredundancy = 'none'\n",
     )
     first, second = config.peers
     assert first.settings.link == Link(
         suites=(SUITES_BY_NAME["ffdhe2048"], SUITES_BY_NAME["x25519"]),
         confidential=True,
-        tag_bytes=32,
+        tag_bytes=16,
         timers=Timers(rekey_after_s=60, keepalive_s=20),
         redundancy=Redundancy.ALL,
         idle_probe_s=0,
@@ -102,7 +102,6 @@ def test_peer_inherits_key_by_key(tmp_path: Path) -> None:
     assert second.settings.link == Link(
         suites=(SUITES_BY_NAME["mlkem768"],),
         tag_bytes=12,
-        mac_key_bits=512,
         max_envelope=c.MIN_ENVELOPE_LIMIT,
         timers=Timers(rekey_after_s=60),
         redundancy=Redundancy.NONE,
@@ -419,7 +418,7 @@ def test_warning_is_given_once(tmp_path: Path, text: str, says: str) -> None:
         *(
             f"{GOOD}{line}\n"
             for line in (
-                *("tag_bits = 96", "mac_key_bits = 512", "max_envelope_bytes = 1452", "suites = ['ffdhe8192']"),
+                *("tag_bits = 96", "max_envelope_bytes = 1452", "suites = ['ffdhe8192']"),
                 *("budget_bits_s = 1000", "[routing]\nrelay = true", 'allow_in = ["commands"]'),
                 '[[endpoint]]\nname = "companion"\nurl = "tcp:127.0.0.1:5760"\nsystem_ids = [1]\nrole = "vehicle"',
             )

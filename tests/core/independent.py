@@ -126,23 +126,22 @@ class Parameters(NamedTuple):
     generation: int = 0
     confidential: bool = False
     tag_bytes: int = 16
-    mac_key_bits: int = 256
     largest_envelope: int = 1232
     features: int = 0
 
     def encode(self) -> bytes:
-        generation, confidential, *rest, features = self
-        return struct.pack(">IHBBHH", generation, features, int(confidential), *rest)
+        generation, confidential, tag_bytes, largest, features = self
+        return struct.pack(">IHBBHH", generation, features, int(confidential), tag_bytes, 256, largest)
 
 
 def _agree(ours: Parameters, encoded: bytes) -> Parameters:
     generation, features, flags, tag_bytes, mac_key_bits, largest = struct.unpack(">IHBBHH", encoded)
+    assert mac_key_bits == 256
     confidential = ours.confidential or bool(flags & 1)
     return Parameters(
         max(ours.generation, generation) + 1,
         confidential,
         16 if confidential else max(ours.tag_bytes, tag_bytes),
-        max(ours.mac_key_bits, mac_key_bits),
         min(ours.largest_envelope, largest),
         ours.features & features,
     )
@@ -159,10 +158,9 @@ class Session:
         self.index, self.remote_index = index, remote_index
         self.counter = 0
         purpose = b" confidential" if agreed.confidential else b" authenticated"
-        length = 32 if agreed.confidential else agreed.mac_key_bits // 8
         first, second = self.transport_keys
-        ours = _expand(first, VERSION + purpose + b" initiator to responder" + noise.h, length)
-        theirs = _expand(second, VERSION + purpose + b" responder to initiator" + noise.h, length)
+        ours = _expand(first, VERSION + purpose + b" initiator to responder" + noise.h, 32)
+        theirs = _expand(second, VERSION + purpose + b" responder to initiator" + noise.h, 32)
         self.send_key, self.receive_key = (ours, theirs) if is_initiator else (theirs, ours)
         ours = _expand(first, VERSION + b" records initiator to responder" + noise.h, 32)
         theirs = _expand(second, VERSION + b" records responder to initiator" + noise.h, 32)

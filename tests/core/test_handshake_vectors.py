@@ -33,12 +33,12 @@ def raw(vector: dict[str, Any], key: str) -> bytes:
 def settings_of(vector: dict[str, Any], side: str) -> PeerSettings:
     """What ``side`` knows of the other one."""
     other = "responder" if side == "initiator" else "initiator"
-    _, confidential, tag_bytes, mac_key_bits, max_envelope, features = vector[f"{side}_parameters"]
+    _, confidential, tag_bytes, max_envelope, features = vector[f"{side}_parameters"]
     return PeerSettings(
         other,
         KeyPair(raw(vector, f"{other}_static")).public,
         Secret(raw(vector, "psk")) if vector["psk"] else None,
-        Link((SUITES[vector["suite"]],), confidential, tag_bytes, mac_key_bits, max_envelope, features=features),
+        Link((SUITES[vector["suite"]],), confidential, tag_bytes, max_envelope, features=features),
     )
 
 

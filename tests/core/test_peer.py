@@ -78,7 +78,7 @@ def test_responder_sends_nothing_before_confirmation() -> None:
 
     Both ends report it then.
     """
-    pair = Pair(link_a=Link(confidential=True), link_b=Link(tag_bytes=32))
+    pair = Pair(link_a=Link(confidential=True), link_b=Link(tag_bytes=8))
     response = only(datagrams(pair.b.receive(pair.initiation(0.0), 0.0)))
     assert reasons(pair.b.send(0.0)) == [DropReason.NO_SESSION]
     assert pair.b.peer.path is None

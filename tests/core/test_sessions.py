@@ -24,9 +24,7 @@ QUARANTINE_S = c.INDEX_QUARANTINE_S
 
 def session(index: int, generation: int = 1, *, initiator: bool = True) -> Session:
     """A session with this local index, from second 0 to second 180."""
-    keys = Keys(
-        X25519, (Secret(bytes(32)), Secret(bytes(32))), bytes(32), Parameters(generation, False, 16, 256, 1232), 1
-    )
+    keys = Keys(X25519, (Secret(bytes(32)), Secret(bytes(32))), bytes(32), Parameters(generation, False, 16, 1232), 1)
     return Session(keys, index, 0.0, 180.0, is_initiator=initiator)
 
 

@@ -37,7 +37,6 @@ PARAMETERS = st.builds(
     generation=U32,
     confidential=st.booleans(),
     tag_bytes=st.sampled_from(wire.TAG_LENGTHS),
-    mac_key_bits=st.sampled_from(wire.MAC_KEY_LENGTHS),
     max_envelope=st.integers(c.MIN_ENVELOPE_LIMIT, 2**16 - 1),
     features=st.integers(0, c.KNOWN_FEATURES),
 )
@@ -168,18 +167,23 @@ def changed(parameters: Parameters, field: str, value: int) -> Parameters:
 
 @pytest.mark.parametrize(
     ("field", "invalid"),
-    [
-        ("tag_bytes", set(range(256)) - set(wire.TAG_LENGTHS)),
-        ("mac_key_bits", {0, 1, 8, 128, 255, 257, 384, 1023, 4096, 65535}),
-        ("max_envelope", {0, c.MIN_ENVELOPE_LIMIT - 1}),
-    ],
+    [("tag_bytes", set(range(256)) - set(wire.TAG_LENGTHS)), ("max_envelope", {0, c.MIN_ENVELOPE_LIMIT - 1})],
 )
 def test_parameters_outside_the_protocol_are_refused(field: str, invalid: set[int]) -> None:
-    """Tags are 8, 12, 16 or 32 bytes, MAC keys 256 to 2,048 bits; the largest frame fits an envelope."""
-    least = Parameters(1, False, 8, 256, c.MIN_ENVELOPE_LIMIT)
+    """Tags are 8, 12 or 16 bytes, and the largest frame fits an envelope."""
+    least = Parameters(1, False, 8, c.MIN_ENVELOPE_LIMIT)
     assert wire.parse_parameters(least.encode()) == least
     refused = {outcome_of(wire.parse_parameters, changed(least, field, value).encode()) for value in invalid}
     assert refused == {DropReason.BAD_PARAMETERS}
+
+
+@pytest.mark.parametrize("bits", [0, 1, 128, 255, 257, 512, 1024, 2048, 65535])
+def test_an_hmac_key_of_another_length_is_refused(bits: int) -> None:
+    """Earlier versions could ask for a longer key. Its field is at offset 8."""
+    encoded = Parameters(1, False, 8, c.MIN_ENVELOPE_LIMIT).encode()
+    assert int.from_bytes(encoded[8:10], "big") == 256
+    asked = encoded[:8] + bits.to_bytes(2, "big") + encoded[10:]
+    assert outcome_of(wire.parse_parameters, asked) is DropReason.BAD_PARAMETERS
 
 
 @given(PARAMETERS, PARAMETERS)
@@ -190,7 +194,6 @@ def test_both_ends_agree_on_the_stronger(ours: Parameters, theirs: Parameters) -
         min(2**32 - 1, 1 + max(ours.generation, theirs.generation)),
         ours.confidential or theirs.confidential,
         max(ours.tag_bytes, theirs.tag_bytes),
-        max(ours.mac_key_bits, theirs.mac_key_bits),
         min(ours.max_envelope, theirs.max_envelope),
         ours.features & theirs.features,
     )

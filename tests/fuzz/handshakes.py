@@ -61,8 +61,7 @@ def _payload(script: Script, header: bytes) -> bytes:
         wire.Parameters(
             generation=script.long() if how & 1 else script.byte(),
             confidential=bool(how & 2),
-            tag_bytes=wire.TAG_LENGTHS[how >> 2 & 3],
-            mac_key_bits=wire.MAC_KEY_LENGTHS[how >> 4 & 3],
+            tag_bytes=wire.TAG_LENGTHS[(how >> 2 & 3) % 3],
             max_envelope=max(c.MIN_ENVELOPE_LIMIT, script.word() if how & 1 else 1232),
         ).encode()
     )
@@ -102,7 +101,7 @@ def expected(payload: bytes, header: bytes) -> DropReason | None:
     *_, tag_bytes = payload[: len(header) + 7]
     mac_key_bits = int.from_bytes(payload[len(header) + 7 : len(header) + 9], "big")
     largest = int.from_bytes(payload[len(header) + 9 :], "big")
-    if tag_bytes not in (8, 12, 16, 32) or mac_key_bits not in (256, 512, 1024, 2048) or largest < 320:
+    if tag_bytes not in (8, 12, 16) or mac_key_bits != 256 or largest < 320:
         return DropReason.BAD_PARAMETERS
     return None
 
@@ -161,7 +160,6 @@ def _check_answer(state: HandshakeState, asked: wire.Parameters, datagram: bytes
     assert agreed.generation > min(asked.generation, 2**32 - 2)
     assert agreed.confidential == (asked.confidential or ours.confidential)
     assert agreed.tag_bytes >= max(asked.tag_bytes, ours.tag_bytes)
-    assert agreed.mac_key_bits >= max(asked.mac_key_bits, ours.mac_key_bits)
     assert agreed.max_envelope <= min(asked.max_envelope, ours.max_envelope)
 
 

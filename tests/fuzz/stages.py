@@ -171,7 +171,7 @@ def session(link: Link, counter: int = 0) -> Stage:
     return Stage(pair, False, coming[0], templates, tuple(coming[1:]))
 
 
-LINKS: Final = (quiet(), quiet(tag_bytes=8), quiet(tag_bytes=32, mac_key_bits=1024), quiet(confidential=True))
+LINKS: Final = (quiet(), quiet(tag_bytes=8), quiet(tag_bytes=12), quiet(confidential=True))
 """Kinds of sessions."""
 
 

@@ -287,13 +287,13 @@ def test_problems_of_the_daemon(daemon: Daemon) -> None:
         daemon.dropped(DropReason.COOKIE_REQUIRED, STRANGER)
         daemon.dropped(DropReason.RATE_LIMITED, STRANGER)
     daemon.history.paused = NOW, 4.0
-    daemon.history.refused_file = ["drone0.toml: link.tag_bits: must be 64, 96, 128 or 256", "another"]
+    daemon.history.refused_file = ["drone0.toml: link.tag_bits: must be 64, 96 or 128", "another"]
     findings = daemon.findings()
     assert set(findings) == {"configuration_refused", "raw_mavlink", "under_load", "daemon_paused"}
     assert {finding.severity for finding in findings.values()} == {Severity.WARNING}
     assert "198.51.100.7:5790" in findings["raw_mavlink"].text
     assert "never block a peer's address" in findings["under_load"].remedy
-    assert "tag_bits: must be 64, 96, 128 or 256 and 1 more" in findings["configuration_refused"].text
+    assert "tag_bits: must be 64, 96 or 128 and 1 more" in findings["configuration_refused"].text
     assert set(daemon.findings(NOW + 31)) == {"configuration_refused"}
 
 

@@ -91,7 +91,7 @@ LINK_ROWS = (
     Mistake(
         "50",
         scenes.reload,
-        command=r"tag_bits: must be 64, 96, 128 or 256",
+        command=r"tag_bits: must be 64, 96 or 128",
         signs=_here("configuration_refused", r"`uavlinkd check --config .*` prints, and run `uavlinkd reload`"),
     ),
     Mistake("51", scenes.reload_listen, command=r"routing: cannot change while the daemon runs: restart it"),

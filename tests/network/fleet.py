@@ -80,7 +80,7 @@ class Fleet:
                 reject_after_s=max(180.0, 1.5 * rekey_after_s),
                 keepalive_s=lot.choice((10.0, 25.0, 60.0)),
             )
-            link = Link(confidential=lot.random() < 0.3, tag_bytes=lot.choice((8, 12, 16, 32)), timers=timers)
+            link = Link(confidential=lot.random() < 0.3, tag_bytes=lot.choice((8, 12, 16)), timers=timers)
             if plan.has_paths:
                 self._introduce(pair, link)
             else:

@@ -253,8 +253,8 @@ def test_preference_sets_the_tag_length(folder: Path) -> None:
     """A wrong choice shows too: the frames then end elsewhere."""
     right = rows(folder, conversation(with_tag(8)), "-o", "uavlink.tag:8 bytes")[3]
     assert (right["tag_bytes"], right["mode"], right["frame.msgid"]) == ("8", "authenticated", "0")
-    wrong = rows(folder, conversation(with_tag(16)), "-o", "uavlink.tag:32 bytes")[3]
-    assert wrong["tag_bytes"] == "32"
+    wrong = rows(folder, conversation(with_tag(8)), "-o", "uavlink.tag:16 bytes")[3]
+    assert wrong["tag_bytes"] == "16"
     assert "frame.msgid" not in wrong
 
 

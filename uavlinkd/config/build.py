@@ -180,7 +180,6 @@ def link_of(keys: LinkSection) -> Link:
         suites=tuple(keys.suites),
         confidential=keys.confidential,
         tag_bytes=tag_bytes,
-        mac_key_bits=keys.mac_key_bits,
         max_envelope=keys.max_envelope_bytes,
         timers=Timers(
             rekey_after_s=keys.rekey_after_s,

@@ -257,6 +257,7 @@ _REMOVED = {
     ),
     **dict.fromkeys(("deny_in", "deny_out"), INSTEAD_OF_DENIAL),
     "recording": "run `uavlinkd record URL FILE` beside the daemon",
+    "mac_key_bits": "delete the line: every HMAC key has 256 bits, and a longer one was no stronger",
     "metrics": "delete [metrics]; `uavlinkd web` serves http://127.0.0.1:8790/metrics",
 }
 """Keys and sections that files of earlier versions may have."""

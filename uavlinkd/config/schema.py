@@ -265,8 +265,7 @@ class LinkSection(Section):
 
     suites: Suites = Field(default=[X25519], examples=['["x25519"]'])
     confidential: bool = False
-    tag_bits: Literal[64, 96, 128, 256] = 128
-    mac_key_bits: Literal[256, 512, 1024, 2048] = 256
+    tag_bits: Literal[64, 96, 128] = 128
     max_envelope_bytes: int = Field(
         default=c.DEFAULT_ENVELOPE_LIMIT, ge=c.MIN_ENVELOPE_LIMIT, le=c.MAX_ENVELOPE_LIMIT
     )

@@ -344,7 +344,7 @@ more than 2,000 frames a second share envelopes."""
 REPLAY_WINDOW = 8192
 """Envelopes that may overtake one another: 0.8 s at 10,000 a second, for paths that differ by half of that."""
 MIN_ENVELOPE_LIMIT = 320
-"""Smallest limit on an envelope: the largest MAVLink frame is 280 bytes, header and tag at most 39."""
+"""Smallest limit on an envelope: the largest MAVLink frame is 280 bytes, header and tag at most 23."""
 MAX_ENVELOPE_LIMIT = 65000
 """Largest limit on an envelope: under what a UDP datagram over IPv4 holds (65,507)."""
 DEFAULT_ENVELOPE_LIMIT = 1232

@@ -52,7 +52,7 @@ class Keys:
 
 def parameters_of(link: Link, generation: int) -> Parameters:
     """What this side asks of a session."""
-    least = link.confidential, link.tag_bytes, link.mac_key_bits, link.max_envelope
+    least = link.confidential, link.tag_bytes, link.max_envelope
     return Parameters(generation, *least, link.features)
 
 

@@ -20,20 +20,20 @@ EnvelopeKey = MacKey | AeadKey
 _DIRECTIONS = b" initiator to responder", b" responder to initiator"
 
 
-def _derived(keys: Keys, purpose: bytes, length: int) -> list[bytes]:
+def _derived(keys: Keys, purpose: bytes) -> list[bytes]:
     """A key for the initiator's envelopes and one for the responder's, each from its own key of Noise ``Split()``.
 
     The label names purpose and direction; the transcript hash behind it ties the key to every byte of the handshake.
     """
     labels = (c.PROTOCOL_NAME + purpose + direction + keys.handshake_hash for direction in _DIRECTIONS)
-    return [hkdf_expand(key.reveal(), label, length) for key, label in zip(keys.transport, labels, strict=True)]
+    return [hkdf_expand(key.reveal(), label, c.KEY_BYTES) for key, label in zip(keys.transport, labels, strict=True)]
 
 
 def envelope_keys(keys: Keys) -> list[EnvelopeKey]:
     """Those of the initiator and of the responder."""
     if keys.parameters.confidential:
-        return [AeadKey(key) for key in _derived(keys, b" confidential", c.KEY_BYTES)]
-    return [MacKey(key) for key in _derived(keys, b" authenticated", keys.parameters.mac_key_bits // 8)]
+        return [AeadKey(key) for key in _derived(keys, b" confidential")]
+    return [MacKey(key) for key in _derived(keys, b" authenticated")]
 
 
 class Session:
@@ -56,7 +56,7 @@ class Session:
         self._send, self._receive = envelope_keys(keys)[::order]
         self._record_keys: list[AeadKey] | None = None  # to the peer, and from it
         if keys.parameters.features & c.FEATURE_RECORDS:
-            self._record_keys = [AeadKey(key) for key in _derived(keys, b" records", c.KEY_BYTES)][::order]
+            self._record_keys = [AeadKey(key) for key in _derived(keys, b" records")][::order]
         self.suite = keys.suite
         self.parameters = keys.parameters
         self.is_initiator = is_initiator

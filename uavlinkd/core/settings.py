@@ -57,13 +57,12 @@ class Timers:
 class Link:
     """How one peer is spoken to. ``suites`` are accepted, the first is offered.
 
-    Tag length, key length and confidentiality are the least this side takes: the stronger of both ends' counts.
+    Tag length and confidentiality are the least this side takes: the stronger of both ends' counts.
     """
 
     suites: tuple[Suite, ...] = (X25519,)
     confidential: bool = False
     tag_bytes: int = 16
-    mac_key_bits: int = 256
     max_envelope: int = c.DEFAULT_ENVELOPE_LIMIT
     timers: Timers = field(default_factory=Timers)
     features: int = c.FEATURE_REFUSALS | c.FEATURE_PROBLEMS

@@ -33,8 +33,9 @@ LONG_HEADER_BYTES = _LONG_HEADER.size
 
 # Parameters and handshake payloads.
 
-TAG_LENGTHS = (8, 12, 16, 32)
-MAC_KEY_LENGTHS = (256, 512, 1024, 2048)
+TAG_LENGTHS = (8, 12, 16)
+_MAC_KEY_BITS = 8 * c.KEY_BYTES
+"""The only length of an HMAC key. Its field stays in the parameters, and a peer that asks for another is refused."""
 _PARAMETERS = struct.Struct(">IHBBHH")
 _CONFIDENTIAL = 1
 
@@ -46,7 +47,6 @@ class Parameters:
     generation: int  # of the session on which the sender sends to the peer, or 0
     confidential: bool
     tag_bytes: int
-    mac_key_bits: int
     max_envelope: int
     features: int = 0
 
@@ -55,7 +55,7 @@ class Parameters:
     def encode(self) -> bytes:
         """Twelve bytes."""
         flags = _CONFIDENTIAL if self.confidential else 0
-        sizes = self.tag_bytes, self.mac_key_bits, self.max_envelope
+        sizes = self.tag_bytes, _MAC_KEY_BITS, self.max_envelope
         return _PARAMETERS.pack(self.generation, self.features, flags, *sizes)
 
     def stronger(self, other: Parameters) -> Parameters:
@@ -67,7 +67,6 @@ class Parameters:
             generation=min(max(self.generation, other.generation) + 1, 2**32 - 1),
             confidential=self.confidential or other.confidential,
             tag_bytes=max(self.tag_bytes, other.tag_bytes),
-            mac_key_bits=max(self.mac_key_bits, other.mac_key_bits),
             max_envelope=min(self.max_envelope, other.max_envelope),
             features=self.features & other.features,
         )
@@ -79,10 +78,10 @@ def parse_parameters(data: bytes) -> Parameters:
     Raises ``BAD_PARAMETERS`` for values outside the protocol.
     """
     generation, features, flags, tag_bytes, mac_key_bits, max_envelope = _PARAMETERS.unpack(data)
-    if tag_bytes not in TAG_LENGTHS or mac_key_bits not in MAC_KEY_LENGTHS or max_envelope < c.MIN_ENVELOPE_LIMIT:
+    if tag_bytes not in TAG_LENGTHS or mac_key_bits != _MAC_KEY_BITS or max_envelope < c.MIN_ENVELOPE_LIMIT:
         raise Drop(DropReason.BAD_PARAMETERS)
     known = features & c.KNOWN_FEATURES
-    return Parameters(generation, bool(flags & _CONFIDENTIAL), tag_bytes, mac_key_bits, max_envelope, known)
+    return Parameters(generation, bool(flags & _CONFIDENTIAL), tag_bytes, max_envelope, known)
 
 
 # Handshake messages.

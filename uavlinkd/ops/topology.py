@@ -18,7 +18,6 @@ from uavlinkd.config.keys import encode_key, looks_private
 from uavlinkd.config.model import Config, EndpointConfig, FleetConfig, PeerConfig, PolicyData, RelayConfig
 from uavlinkd.config.network_rules import used_networks
 from uavlinkd.core.certificates import parse_bulletin
-from uavlinkd.core.settings import Link
 from uavlinkd.mavlink import dialect
 from uavlinkd.mavlink.policy.compilation import Policy, PolicyRow
 from uavlinkd.mavlink.policy.roles import ROLES
@@ -182,8 +181,7 @@ def _peer(peer: PeerConfig) -> tuple[str, ...]:
     link = peer.settings.link
     mode = "encrypted"
     if not link.confidential:
-        key = "" if link.mac_key_bits == Link().mac_key_bits else f", {link.mac_key_bits}-bit key"
-        mode = f"authentic, {8 * link.tag_bytes}-bit tag{key}"
+        mode = f"authentic, {8 * link.tag_bytes}-bit tag"
     return (
         peer.name,
         "\n".join([*map(str, peer.addresses), *(f"relayed via {name}" for name in peer.relays)]) or "(it connects)",

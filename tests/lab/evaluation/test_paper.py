@@ -32,7 +32,7 @@ def test_an_altered_tag_does_not_verify(ends: tuple[socket.socket, socket.socket
     responder = threading.Thread(target=lambda: reported.update(paper.respond(ends[1])))
     responder.start()
     key = paper.GroupKey(paper.load_parameters(ffdhe_prime(2048)))
-    ends[0].send(paper._pack(ffdhe_prime(2048), 512, key.public))
+    ends[0].send(paper._pack(ffdhe_prime(2048), key.public))
     ends[0].recv(65536)
     ends[0].send(b"data" + bytes(paper.TAG_BYTES))
     responder.join()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,14 +11,14 @@ import pytest
 from tests.lab.evaluation.quick_runs import run_quickly
 from uavlinkd.core.suites import SUITES, X25519
 from uavlinkd.lab.evaluation.records import Status, Value
-from uavlinkd.lab.evaluation.timing_daemons import LinkChoice, measured, time_handshake
+from uavlinkd.lab.evaluation.timing_daemons import measured, time_handshake
 from uavlinkd.lab.evaluation.timing_report import TimingFindings, timing_problems
 from uavlinkd.lab.evaluation.timing_run import TIMING, measure_paper, paper_points
 
 
 async def test_handshake_of_daemons_is_timed() -> None:
     """From the initiation to the delivered frame."""
-    handshake = await time_handshake(LinkChoice(X25519, 512))
+    handshake = await time_handshake(X25519)
     assert handshake["total_s"] > 0
     assert min(handshake["cpu_initiator_s"], handshake["cpu_responder_s"]) > 0
     assert handshake["bytes"] > [200, 100]
@@ -25,15 +26,15 @@ async def test_handshake_of_daemons_is_timed() -> None:
 
 
 async def test_failed_measurement_is_a_record_with_its_reason() -> None:
-    """And a problem of the run. Here a length that the daemon refuses: the log of the process names the key."""
-    record = await measured("handshake", {}, time_handshake(LinkChoice(X25519, 257)))
+    """And a problem of the run. Here a suite that the daemon refuses: the log of the process names the key."""
+    record = await measured("handshake", {}, time_handshake(replace(X25519, name="x448")))
     assert (record.status, record.values) == (Status.FAILED, {})
-    assert "mac_key_bits" in record.reason
+    assert "suites" in record.reason
     assert timing_problems(TimingFindings({}, [record])) == [f"handshake, : {record.reason}"]
 
 
 def point(dh_bits: int, group: str = "made") -> dict[str, Value]:
-    return {"dh_bits": dh_bits, "mac_key_bits": 512, "group": group}
+    return {"dh_bits": dh_bits, "group": group}
 
 
 async def test_exchange_of_the_paper_is_measured_between_two_processes(capfd: pytest.CaptureFixture[str]) -> None:
@@ -60,6 +61,6 @@ async def test_quick_run(tmp_path: Path) -> None:
     assert all(record.is_ok or record.reason for record in findings.records)
     linked = {record.point["suite"] for record in findings.of("handshake") if record.is_ok}
     assert linked == {suite.name for suite in SUITES.values()}
-    assert {record.kind for record in findings.records if record.is_ok} >= {"paper", "handshake", "core", "mac"}
+    assert {record.kind for record in findings.records if record.is_ok} >= {"paper", "handshake", "core"}
     assert "(scatter.svg)" in (tmp_path / "timing.md").read_text()
     assert (tmp_path / "scatter.svg").exists()

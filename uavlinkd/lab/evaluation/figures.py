@@ -15,12 +15,10 @@ from matplotlib.patches import Patch
 
 from uavlinkd.lab.evaluation.flight_plan import ATTACKS, LINK_NAMES, PAIR, AttackPhase, LinkKind
 from uavlinkd.lab.evaluation.flight_report import FlightFindings
-from uavlinkd.lab.evaluation.records import Record, Value
+from uavlinkd.lab.evaluation.records import Record
 from uavlinkd.lab.evaluation.timing_report import TimingFindings
 
 F = TypeVar("F")
-Series = list[tuple[str, dict[Value, list[float]]]]
-"""Name, and times by the length of the HMAC key."""
 
 COLOURS: Final = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#d55e00", "#56b4e9", "#7f7f7f", "#000000")
 """The palette of Okabe and Ito, for colour-blind readers too."""
@@ -63,42 +61,25 @@ def to_svg(draw: Callable[[F], dict[str, Figure]], findings: F) -> dict[str, byt
 
 
 def draw_timing(findings: TimingFindings) -> dict[str, Figure]:
-    """The paper's figure 6, for both methods. Its method takes seconds and ours milliseconds: two panels."""
-    scatter = Figure(figsize=(9.6, 4.6), layout="constrained")
-    for place, series in enumerate(_series(findings)):
-        title, factor, unit = (("the paper's method", 1.0, "s"), ("uavlinkd", 1e3, "ms"))[place]
-        axes = scatter.add_subplot(1, 2, place + 1)
-        lengths = list(dict.fromkeys(length for _, times in series for length in times))
-        for number, (name, times) in enumerate(series):
-            shift = (number - (len(series) - 1) / 2) * 0.8 / max(1, len(series))
-            points = [(lengths.index(length) + shift, y * factor) for length, ys in times.items() for y in ys]
-            marker, colour = "osD^vP*X"[number % 8], COLOURS[number % len(COLOURS)]
-            axes.scatter(*_split(points), s=22, alpha=0.7, color=colour, marker=marker, linewidths=0, label=name)
-        axes.set_xticks(range(len(lengths)), [str(length) for length in lengths])
-        axes.set_xlim(-0.6, max(1, len(lengths)) - 0.4)
-        axes.grid(visible=False, axis="x")
-        axes.set_ylim(bottom=0)
-        axes.set_xlabel("HMAC key (bits)")
-        axes.set_ylabel(f"time from start to verified data ({unit})")
-        axes.set_title(title, loc="left")
-        if series:
-            axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=3)  # outside the points
-    return {"scatter": scatter}
-
-
-def _series(findings: TimingFindings) -> tuple[Series, Series]:
-    lengths = findings.values("paper", "mac_key_bits")
-    paper: Series = []
+    """Each exchange of the paper's method by the size of its group, and each handshake of ours by its suite."""
+    paper: dict[str, list[float]] = {}
     for bits in findings.values("paper", "dh_bits"):
         late = findings.paper_late("made", dh_bits=bits)
-        name = f"{bits} bits" + (f": {len(late)} not finished\nin {late[0]:g} s" if late else "")
-        times = {n: findings.paper_times("made", dh_bits=bits, mac_key_bits=n) for n in lengths}
-        paper.append((name, times))
-    lengths = findings.values("handshake", "mac_key_bits")
-    ours = [
-        (suite, {n: findings.daemon_times(suite, mac_key_bits=n) for n in lengths}) for suite in findings.suites()
-    ]
-    return paper, ours
+        unfinished = f"\n{len(late)} not finished in {late[0]:g} s" if late else ""
+        paper[f"{bits} bits{unfinished}"] = findings.paper_times("made", dh_bits=bits)
+    ours = {suite: findings.daemon_times(suite) for suite in findings.suites()}
+    figure = Figure(figsize=(9.6, 4.6), layout="constrained")
+    panels: Sequence[Axes] = figure.subplots(1, 2, sharey=True)
+    for axes, title, groups in zip(panels, ("the paper's method", "uavlinkd"), (paper, ours), strict=True):
+        points = [(float(number), y) for number, times in enumerate(groups.values()) for y in times]
+        axes.scatter(*_split(points), s=22, alpha=0.5, color=_BLUE, linewidths=0)
+        axes.set_xticks(range(len(groups)), list(groups), rotation=30, ha="right")
+        axes.set_xlim(-0.6, max(1, len(groups)) - 0.4)
+        axes.grid(visible=False, axis="x")
+        axes.set_yscale("log")
+        axes.set_title(title, loc="left")
+    panels[0].set_ylabel("time from start to verified data (s)")
+    return {"scatter": figure}
 
 
 def _split(points: Sequence[tuple[float, float]]) -> tuple[list[float], list[float]]:

@@ -35,6 +35,7 @@ from uavlinkd.core.kem import ffdhe_prime
 
 GENERATOR = 2
 TAG_BYTES = 32
+MAC_KEY_BYTES = 32
 Parameters: TypeAlias = "dh.DHParameters"
 _LABEL = b"evaluation of the paper: HMAC key"
 _WAIT_S = 30.0
@@ -68,9 +69,9 @@ def load_parameters(prime: int) -> Parameters:
     return dh.DHParameterNumbers(prime, GENERATOR).parameters()
 
 
-def mac_key(secret: bytes, bits: int) -> bytes:
-    """An HMAC key of ``bits`` bits, derived from the shared secret."""
-    return hkdf_expand(sha256(secret), _LABEL, bits // 8)
+def mac_key(secret: bytes) -> bytes:
+    """An HMAC key, derived from the shared secret."""
+    return hkdf_expand(sha256(secret), _LABEL, MAC_KEY_BYTES)
 
 
 # One end. Integers are sent as u16 length and big-endian bytes.
@@ -90,30 +91,30 @@ def _unpack(data: bytes) -> list[int]:
     return numbers
 
 
-def initiate(sock: socket.socket, bits: int, mac_bits: int, data: bytes, *, standard: bool) -> dict[str, float]:
+def initiate(sock: socket.socket, bits: int, data: bytes, *, standard: bool) -> dict[str, float]:
     """The initiator's part of one exchange. Return its start (monotonic), and the seconds to make the parameters."""
     started_at = time.monotonic()
     parameters = make_parameters(bits, standard=standard)
     parameters_s = time.monotonic() - started_at
     key = GroupKey(parameters)
-    sock.send(_pack(parameters.parameter_numbers().p, mac_bits, key.public))
+    sock.send(_pack(parameters.parameter_numbers().p, key.public))
     (public,) = _unpack(sock.recv(_DATAGRAM_BYTES))
     secret = key.secret(public)
-    sock.send(data + hmac_sha256(mac_key(secret, mac_bits), data))
+    sock.send(data + hmac_sha256(mac_key(secret), data))
     return {"started_at": started_at, "parameters_s": parameters_s}
 
 
 def respond(sock: socket.socket) -> dict[str, float | bool]:
     """The responder's part of one exchange. Return whether the tag is valid, and when (monotonic)."""
     hello, initiator = sock.recvfrom(_DATAGRAM_BYTES)
-    prime, mac_bits, public = _unpack(hello)
+    prime, public = _unpack(hello)
     key = GroupKey(load_parameters(prime))
     sock.sendto(_pack(key.public), initiator)
     secret = key.secret(public)
     sock.settimeout(_WAIT_S)
     last = sock.recv(_DATAGRAM_BYTES)
     data, tag = last[:-TAG_BYTES], last[-TAG_BYTES:]
-    verified = hmac.compare_digest(hmac_sha256(mac_key(secret, mac_bits), data), tag)
+    verified = hmac.compare_digest(hmac_sha256(mac_key(secret), data), tag)
     return {"verified": verified, "verified_at": time.monotonic()}
 
 
@@ -131,7 +132,7 @@ def main(arguments: Sequence[str]) -> int:
         sock.connect(("127.0.0.1", request["port"]))
         sock.settimeout(_WAIT_S)
         data = bytes.fromhex(request["data"])
-        _say(initiate(sock, request["bits"], request["mac_bits"], data, standard=request["standard"]))
+        _say(initiate(sock, request["bits"], data, standard=request["standard"]))
     return 0
 
 

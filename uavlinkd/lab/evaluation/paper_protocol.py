@@ -36,7 +36,6 @@ from uavlinkd.lab.mitm.proxy import received
 HELLO, ANSWER = 1, 2
 GROUP_BITS = 2048
 KEY_BYTES = GROUP_BITS // 8
-MAC_KEY_BITS = 256
 TAG_BYTES = 32
 RENEW_S = 0.25
 
@@ -55,7 +54,7 @@ class PaperKey:
     def mac_key(self, public: bytes) -> bytes:
         """The HMAC key shared with the owner of ``public``. Raises ValueError if the library refuses the key."""
         with _ffdh():
-            return mac_key(self._key.secret(int.from_bytes(public, "big")), MAC_KEY_BITS)
+            return mac_key(self._key.secret(int.from_bytes(public, "big")))
 
 
 @contextmanager

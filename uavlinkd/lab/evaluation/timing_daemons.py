@@ -1,13 +1,10 @@
-"""Times tags and the initiation in this process, and handshakes of two real daemons, each a process.
+"""Times the initiation in this process, and handshakes of two real daemons, each a process.
 
 A proxy between the daemons sees each datagram. For a handshake it first drops all of them, until both processes are
 idle and the initiator waits for its retry. Then it passes them. The time starts when the next initiation reaches the
 proxy. It ends when the responder delivers the first frame, which is sent when the initiator has confirmed. So the
 start of the processes (about 0.5 s) is not included, and the computation before the initiation is only in the
 initiator's processor time. The proxy adds about 0.2 ms for each of the four datagrams.
-
-RFC 2104, section 2: a key longer than the hash's block (64 bytes for SHA-256) is hashed first, and its hash is the
-key. The daemon prepares two hash states per session, so that it computes a tag without the key.
 """
 
 from __future__ import annotations
@@ -20,13 +17,12 @@ import time
 from collections import Counter
 from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack, suppress
-from dataclasses import dataclass
 from time import monotonic
 from typing import Any
 
 from uavlinkd.config.keys import generate_psk
 from uavlinkd.core import wire
-from uavlinkd.core.crypto import KeyPair, MacKey, Secret
+from uavlinkd.core.crypto import KeyPair, Secret
 from uavlinkd.core.node import Node
 from uavlinkd.core.path import Path as PeerPath
 from uavlinkd.core.settings import Link, PeerSettings
@@ -41,51 +37,18 @@ from uavlinkd.lab.sim.drone_process import DroneError, DroneProcess
 from uavlinkd.lab.sim.loopback_ports import free_ports
 from uavlinkd.mavlink.frames import SplitCounters, split_datagram
 
-TAG_KEY_BITS = (256, 512, 520, 1024, 2048)
-"""The lengths of the paper and of the daemon; 520 is one byte more than a block."""
-MESSAGE_BYTES = (45, 280)
-"""An ATTITUDE with the header of its envelope, and the largest frame."""
-_BATCHES = 15
 _THERE = PeerPath(0, ("127.0.0.1", 2))
 
 
-@dataclass(frozen=True, slots=True)
-class LinkChoice:
-    """The settings of a measured link."""
-
-    suite: Suite
-    mac_key_bits: int = 256
-
-    @property
-    def point(self) -> dict[str, Value]:
-        return {"suite": self.suite.name, "mac_key_bits": self.mac_key_bits}
-
-
-def measure_tags(tags: int) -> list[Record]:
-    """Measure the seconds per tag in batches of ``tags``, for every length of key and message."""
-    times: dict[tuple[int, int], list[float]] = {(bits, size): [] for size in MESSAGE_BYTES for bits in TAG_KEY_BITS}
-    for _ in range(_BATCHES):  # the lengths alternate, so that load affects all of them equally
-        for (bits, size), batch in times.items():
-            key, message = MacKey(os.urandom(bits // 8)), os.urandom(size)
-            before = time.perf_counter()
-            for _ in range(tags):
-                key.tag(message)
-            batch.append((time.perf_counter() - before) / tags)
-    return [
-        Record("mac", {"mac_key_bits": bits, "message_bytes": size}, {"tag_least_s": min(batch)})
-        for (bits, size), batch in times.items()
-    ]
-
-
-def measure_initiation(choice: LinkChoice) -> Record:
+def measure_initiation(suite: Suite) -> Record:
     """The computation of an initiation in a new node: cryptography and protocol, no sockets."""
-    link = Link(suites=(choice.suite,), mac_key_bits=choice.mac_key_bits)
+    link = Link(suites=(suite,))
     node = Node(Secret(os.urandom(32)), os.urandom, 0.0)
     settings = PeerSettings("peer", KeyPair(os.urandom(32)).public, Secret(os.urandom(32)), link)
     node.set_paths(node.add_peer(settings, 0.0), [_THERE], 0.0)
     before = time.perf_counter()
     node.handle_timeout(0.0)
-    return Record("core", choice.point, {"initiate_s": time.perf_counter() - before})
+    return Record("core", {"suite": suite.name}, {"initiate_s": time.perf_counter() - before})
 
 
 HANDSHAKE_LIMIT_S = 20.0
@@ -128,11 +91,11 @@ class Watch(PassiveAttack):
 class Pair:
     """Two daemons, a client of each, and the proxy between them."""
 
-    def __init__(self, choice: LinkChoice) -> None:
+    def __init__(self, suite: Suite) -> None:
         self.watch = Watch()
         self.arrived_at: float | None = None
         """When the first frame arrived at the responder's client."""
-        self._link: dict[str, object] = {"suites": [choice.suite.name], "mac_key_bits": choice.mac_key_bits}
+        self._link: dict[str, object] = {"suites": [suite.name]}
         self._clients: dict[str, socket.socket] = {}
         self._number = 0
         self._delivered = asyncio.Event()
@@ -205,10 +168,10 @@ async def measured(kind: str, point: dict[str, Value], measure: Awaitable[dict[s
         return Record(kind, point, {}, Status.FAILED, str(error))
 
 
-async def time_handshake(choice: LinkChoice) -> dict[str, Any]:
+async def time_handshake(suite: Suite) -> dict[str, Any]:
     """One handshake between two new processes with new keys."""
     async with AsyncExitStack() as stack:
-        pair = Pair(choice)
+        pair = Pair(suite)
         await pair.open(stack)
         watch = pair.watch
 

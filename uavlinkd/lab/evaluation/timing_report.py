@@ -67,8 +67,7 @@ def _median(times: Sequence[float]) -> float | None:
 def sections(findings: TimingFindings) -> list[ReportSection]:
     return [
         ReportSection("At equal size of the group", [comparison(findings)]),
-        ReportSection("Time over the length of the HMAC key (the paper's Fig. 6)", [], "scatter"),
-        ReportSection("Does the length of the HMAC key matter?", [tag_times(findings)]),
+        ReportSection("Time over the size of the group (the paper's Fig. 6)", [], "scatter"),
         ReportSection("The suites", [suites(findings)]),
     ]
 
@@ -111,16 +110,6 @@ def _missing(findings: TimingFindings, **point: Value) -> str:
     return "; ".join(f"{reason} ({count})" for reason, count in reasons.items()) or NOTHING
 
 
-def tag_times(findings: TimingFindings) -> Table:
-    """The time of a tag by the length of its key."""
-    lengths = findings.values("mac", "mac_key_bits")
-    rows = []
-    for message in findings.values("mac", "message_bytes"):
-        times = [findings.numbers("mac", "tag_least_s", mac_key_bits=bits, message_bytes=message) for bits in lengths]
-        rows.append([f"{message} bytes", *(duration(min(t)) if t else NOTHING for t in times)])
-    return Table(["message", *(f"key of {bits} bits" for bits in lengths)], rows)
-
-
 def suites(findings: TimingFindings) -> Table:
     rows = []
     for suite in findings.suites():
@@ -138,5 +127,5 @@ def suites(findings: TimingFindings) -> Table:
                 *(most[0][0] if most else NOTHING for most in wire),
             ]
         )
-    head = ["suite", "handshake, all HMAC keys", "CPU, initiator", "CPU, responder"]
+    head = ["suite", "handshake", "CPU, initiator", "CPU, responder"]
     return Table([*head, "bytes sent + received", "datagrams"], rows)

@@ -12,26 +12,17 @@ from collections.abc import Iterable
 from contextlib import AsyncExitStack, suppress
 from typing import Any, TypeVar
 
-from uavlinkd.core.suites import SUITES, X25519
+from uavlinkd.core.suites import SUITES, X25519, Suite
 from uavlinkd.lab.child_processes import end_with_parent
 from uavlinkd.lab.evaluation.frame import Evaluation, EvaluationSettings, Work
 from uavlinkd.lab.evaluation.records import EvaluationError, Record, Status, Value
-from uavlinkd.lab.evaluation.timing_daemons import (
-    LinkChoice,
-    measure_initiation,
-    measure_tags,
-    measured,
-    time_handshake,
-)
+from uavlinkd.lab.evaluation.timing_daemons import measure_initiation, measured, time_handshake
 from uavlinkd.lab.evaluation.timing_report import TimingFindings, sections, summary, timing_problems
 
 T = TypeVar("T")
 
-MAC_KEY_BITS = (256, 512, 1024, 2048)
-"""The lengths that a configuration may have."""
 PAPER_DH_BITS = (512, 1024, 2048, 4096)
 """The paper's sizes, but for 256; its text has 2028 for 2048 in one place."""
-PAPER_MAC_KEY_BITS = (512, 1024, 2048)
 STANDARD_BITS = (2048, 4096)
 """The sizes of the paper for which RFC 7919 has a group."""
 DATA_BYTES = 280
@@ -39,33 +30,23 @@ DATA_BYTES = 280
 _ANSWER_S = 60.0
 """How long an end of the paper's method may take to start, or to verify."""
 _REPEATS = 30
+_LARGEST_REPEATS = 3
 _LIMIT_S, _QUICK_LIMIT_S = 600.0, 2.0
 """The time limit of one exchange of the paper's method: ten minutes, as in the paper."""
-
-
-def grid() -> list[LinkChoice]:
-    """Every suite with every length of the HMAC key."""
-    return [LinkChoice(suite, bits) for suite in SUITES.values() for bits in MAC_KEY_BITS]
 
 
 def paper_points() -> list[dict[str, Value]]:
     """The paper's grid, then the same method in standard groups, which need no generated parameters."""
     groups = [("made", bits) for bits in PAPER_DH_BITS] + [("standard", bits) for bits in STANDARD_BITS]
-    return [
-        {"dh_bits": bits, "mac_key_bits": mac_bits, "group": group}
-        for group, bits in groups
-        for mac_bits in PAPER_MAC_KEY_BITS
-    ]
+    return [{"dh_bits": bits, "group": group} for group, bits in groups]
 
 
 async def run_timing(work: Work[EvaluationSettings]) -> dict[str, Any]:
     run = _Run(work)
-    work.show("tags, and initiations in the core")
-    for record in measure_tags(500 if work.settings.quick else 20_000):
-        work.add(record)
-    measure_initiation(LinkChoice(X25519))  # the first use is slow
-    for choice in run.shuffled(grid()):
-        work.add(measure_initiation(choice))
+    work.show("initiations in the core")
+    measure_initiation(X25519)  # the first use is slow
+    for suite in run.shuffled(SUITES.values()):
+        work.add(measure_initiation(suite))
     await run.exchanges()
     return {}
 
@@ -86,19 +67,18 @@ class _Run:
     async def exchanges(self) -> None:
         """Measure the daemons and the paper's method in random order, so that load affects both equally."""
         is_quick = self._settings.quick
-        chosen = [choice for choice in grid() if not is_quick or choice.mac_key_bits == MAC_KEY_BITS[0]]
-        # Each exchange at the largest size takes up to the limit: these points run once and last.
+        # Each exchange at the largest size takes up to the limit: these run last, and few times.
         last = [point for point in paper_points() if (point["dh_bits"], point["group"]) == (4096, "made")]
-        work: list[LinkChoice | dict[str, Value]] = [
-            *chosen,
+        work: list[Suite | dict[str, Value]] = [
+            *SUITES.values(),
             *(point for point in paper_points() if point not in last),
         ]
-        work = [*self.shuffled(work), *last]
+        work = [*self.shuffled(work), *last * (1 if is_quick else _LARGEST_REPEATS)]
         limit_s = _QUICK_LIMIT_S if is_quick else _LIMIT_S
         for number, item in enumerate(work, 1):
-            if isinstance(item, LinkChoice):
-                self._work.show(f"{number} of {len(work)}: {item.suite.name}, HMAC key of {item.mac_key_bits} bits")
-                self._work.add(await measured("handshake", item.point, time_handshake(item)))
+            if isinstance(item, Suite):
+                self._work.show(f"{number} of {len(work)}: {item.name}")
+                self._work.add(await measured("handshake", {"suite": item.name}, time_handshake(item)))
             else:
                 self._work.show(f"{number} of {len(work)}: the paper's method, {item['dh_bits']} bits")
                 self._work.add(await measure_paper(item, limit_s, self._random.randbytes(DATA_BYTES)))
@@ -113,7 +93,6 @@ async def measure_paper(point: dict[str, Value], limit_s: float, data: bytes) ->
             request = {
                 "port": ports[0],
                 "bits": point["dh_bits"],
-                "mac_bits": point["mac_key_bits"],
                 "standard": point["group"] == "standard",
                 "data": data.hex(),
             }
