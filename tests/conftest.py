@@ -17,7 +17,7 @@ from tests.traces import END_S, no_trace, open_once
 from uavlinkd.system import core_dumps
 
 WORKERS_PER_CORE = 2
-"""Most tests wait for daemons, clients and containers."""
+"""Most long tests wait for daemons, clients and containers."""
 SLOWEST = (
     "mitm",
     "packages",
@@ -33,8 +33,8 @@ SLOWEST = (
 """Folders, the slowest tests first."""
 ALONE = ("pressure", "faults", "daemon", "link")
 """Folders whose tests measure delays, losses and processor time of real daemons: marked ``alone``."""
-LONG = ("natlab", "faults", "modem", "compose")
-"""Folders of machines: routers, modems, containers, broken networks. Marked ``long``; most of them need root."""
+LONG = ("natlab", "faults", "modem", "compose", "daemon")
+"""Folders of machines and of real daemons. Marked ``long``, except tests with the marker ``short``."""
 
 settings.register_profile("busy machine", settings(), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("busy machine")
@@ -64,7 +64,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if set(ALONE) & _folders(item):
             item.add_marker("alone")
-        if set(LONG) & _folders(item):
+        starts_daemons = "stage" in getattr(item, "fixturenames", ())
+        if (starts_daemons or set(LONG) & _folders(item)) and not item.get_closest_marker("short"):
             item.add_marker("long")
         if "shared_data" in getattr(item, "fixturenames", ()):
             item.add_marker("recorded")

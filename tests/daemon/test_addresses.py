@@ -51,7 +51,6 @@ async def test_endpoints_over_ipv6(stage: Stage) -> None:
     assert list((await a.status())["endpoints"]["autopilot"]["clients"]) == [str(autopilot)]
 
 
-@pytest.mark.long
 async def test_broadcast_address_is_named_as_the_cause(stage: Stage) -> None:
     """Its network may come up after ``check``."""
     a, b = stage.pair()

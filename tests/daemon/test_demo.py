@@ -9,13 +9,10 @@ import os
 import signal
 import subprocess
 import sys
-import termios
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from typing import Any
-
-import pytest
 
 from tests.needs import need
 from tests.waiting import until
@@ -68,22 +65,6 @@ async def summary_of(*arguments: str, folder: Path) -> tuple[dict[str, Any], int
         return summary, process.returncode
 
 
-async def test_every_frame_is_accounted_for(short_folder: Path) -> None:
-    """No frame is altered, new keys are made; each lost frame has a counted reason.
-
-    A daemon that a busy machine stops for a moment drops the frames that waited meanwhile.
-    """
-    summary, status = await summary_of("--seconds", "5", folder=short_folder)
-    lost = summary["frames_sent"] - summary["frames_delivered"]
-    assert summary["frames_delivered"] > 100
-    assert lost == 0 or summary["drops"]
-    assert lost > 0 or "no_session" not in summary["drops"], "frames from before the link do not count"
-    assert status == (1 if lost else 0)
-    assert summary["frames_altered"] == 0
-    assert summary["handshakes"] >= 2
-    assert 0 < summary["rtt_ms"] < 1000
-
-
 async def test_an_attack_is_shown_and_nothing_false_comes_out(short_folder: Path) -> None:
     """The summary says how often it struck and what the drones counted; status 0 although frames were lost."""
     summary, status = await summary_of("--attack", "alter-frame,share=0.5", "--seconds", "3", folder=short_folder)
@@ -96,37 +77,21 @@ async def test_an_attack_is_shown_and_nothing_false_comes_out(short_folder: Path
     assert summary["is_recovered"] is True
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.long)])
-async def test_interrupted_it_cleans_up_and_leaves_its_screen(short_folder: Path, number: signal.Signals) -> None:
-    """Ctrl-C and signals end the demo, its daemons and its files. The last numbers remain readable on a terminal."""
+async def test_interrupted_it_cleans_up_and_leaves_its_screen(short_folder: Path) -> None:
+    """Ctrl-C ends the demo, its daemons and its files. The last numbers remain readable on a terminal."""
     master, slave = os.openpty()
     async with demo("--seconds", "600", folder=short_folder, terminal=slave) as process:
         os.close(slave)
         reading = asyncio.create_task(asyncio.to_thread(read_all, master))
         await until(lambda: linked(short_folder))
         pids = [daemon_pid(process.pid, name) for name in ("drone0", "drone1")]
-        process.send_signal(number)
+        process.send_signal(signal.SIGINT)
         await asyncio.wait_for(process.wait(), ENDED_S)
-        assert process.returncode == (1 if number == signal.SIGINT else -number)
+        assert process.returncode == 1
         assert list(short_folder.iterdir()) == []
         assert not any(is_running(pid) for pid in pids)
         _, _, left = (await reading).rpartition(b"every frame, byte for byte")
         assert b"\x1b[2K" not in left, "erased"
-
-
-@pytest.mark.long
-async def test_q_ends_it_with_its_summary(short_folder: Path) -> None:
-    """As if its time were over. The terminal echoes again afterwards."""
-    master, slave = os.openpty()
-    async with demo("--seconds", "600", folder=short_folder, login=slave) as process:
-        reading = asyncio.create_task(asyncio.to_thread(read_all, master))
-        await until(lambda: linked(short_folder))
-        os.write(master, b"q")
-        await asyncio.wait_for(process.wait(), ENDED_S)
-        assert termios.tcgetattr(slave)[3] & termios.ECHO
-        os.close(slave)
-        assert b"frames delivered" in await reading
-        assert process.returncode == 0
 
 
 def read_all(terminal: int) -> bytes:

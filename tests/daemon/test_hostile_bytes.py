@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 from collections import Counter
 
+import pytest
+
 from tests.daemon.frames import frame, heartbeat
 from tests.daemon.harness import Stage
 from tests.daemon.process import DaemonProcess, Status
@@ -29,6 +31,7 @@ async def linked_with_clients(stage: Stage) -> tuple[DaemonProcess, Sockaddr, Cl
     return a, into, autopilot, ground
 
 
+@pytest.mark.short
 async def test_only_genuine_frames_of_a_client_cross_and_the_rest_is_counted(stage: Stage) -> None:
     """Empty datagrams, large ones, noise, cut and altered frames; a frame ends each case."""
     a, into, autopilot, ground = await linked_with_clients(stage)

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import pytest
 
-from tests.daemon.frames import frame, ground_heartbeat, sender_of
 from tests.daemon.harness import Stage
 from tests.daemon.members import Swarm, is_up, start_swarm
 from tests.daemon.process import DaemonProcess, Status
@@ -44,33 +40,6 @@ async def test_names_and_keys_in_the_file_win(fleet: Swarm) -> None:
     await ground.until(lambda status: is_up(status, "v1", "v2") and len(status["relay"]["members"]) == 2)
 
 
-def edit_policy(config: dict[str, Any]) -> None:
-    config["fleet"]["operator"], config["fleet"]["call"] = "pinned", ["vehicle"]
-
-
-def edit_link(config: dict[str, Any]) -> None:
-    config["link"]["confidential"] = True
-
-
-def edit_contacts(config: dict[str, Any]) -> None:
-    config["contact"] = []
-
-
-@pytest.mark.parametrize(("edit", "left"), [(edit_policy, {"v2"}), (edit_link, {"ground"}), (edit_contacts, {"v2"})])
-async def test_rules_of_the_fleet_change(
-    fleet: Swarm, edit: Callable[[dict[str, Any]], None], left: set[str]
-) -> None:
-    """No certificate makes an operator; other settings of links; no contact. Then everything is as before."""
-    _, _, one, _ = fleet
-    before = {section: {**one.config[section]} for section in ("fleet", "link")}, list(one.config["contact"])
-    edit(one.config)
-    assert set((await reload(one))["peers"]) == left
-    one.config |= before[0]
-    one.config["contact"] = before[1]
-    await reload(one)
-    await one.until(lambda status: is_up(status, "ground", "v2"))
-
-
 async def test_member_becomes_a_contact(fleet: Swarm) -> None:
     """A member that was introduced gets its address from the file. A bulletin revokes it, then it leaves the file."""
     signed, ground, one, two = fleet
@@ -98,26 +67,3 @@ async def test_contact_is_revoked_and_signed_again(fleet: Swarm) -> None:
     ground.config["fleet"]["bulletin"] = to_base64(signed.bulletin)
     await reload(ground)
     await one.until(lambda status: is_up(status, "ground") and status["relays"]["ground"]["state"] == "up")
-
-
-async def test_a_revoked_member_is_cut_off_and_the_others_go_on(fleet: Swarm, stage: Stage) -> None:
-    """The station's client receives frames of the others only. The revoked member is no problem of the station."""
-    signed, ground, one, two = fleet
-    screen = await stage.client()
-    port = ground.config["endpoint"][0]["url"].rpartition(":")[2]
-    screen.send(ground_heartbeat(), ("127.0.0.1", int(port)))
-    clients = {vehicle: await stage.client() for vehicle in (one, two)}
-
-    async def fly(number: int, *vehicles: DaemonProcess) -> None:
-        for vehicle in vehicles:
-            port = vehicle.config["endpoint"][0]["url"].rpartition(":")[2]
-            clients[vehicle].send(frame(number, int(vehicle.name[1:])), ("127.0.0.1", int(port)))
-
-    await fly(1, one, two)
-    await screen.until(lambda: {sender_of(raw) for raw in screen.frames} == {1, 2})
-    await ground.ask(signed.revoke("v1"))
-    screen.clear()
-    await fly(2, one, two)
-    await screen.until_received(frame(2, 2))
-    assert {sender_of(raw) for raw in screen.frames} == {2}
-    assert not [line for line in ground.events("problem_began") if line["name"] == "v1"]

@@ -13,7 +13,6 @@ from tests.daemon.two_hosts import ONLY, PORT, TwoHosts, address_of, interface_o
 from tests.namespaces import need_namespaces, udp_socket_in
 from tests.waiting import until
 
-pytestmark = pytest.mark.long
 CLIENTS_PORT = 14550
 FIREWALL = """
 table inet firewall {

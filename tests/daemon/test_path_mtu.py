@@ -16,7 +16,6 @@ from tests.samples import pack
 from tests.waiting import until
 from uavlinkd.lab.sim.loopback_ports import free_port
 
-pytestmark = pytest.mark.long
 PORT = 5790
 VEHICLE, STATION = "10.213.78.2", "10.213.79.2"
 BURST = 12

@@ -13,8 +13,6 @@ import tty
 from collections.abc import Callable
 from contextlib import suppress
 
-import pytest
-
 from tests.daemon.frames import frame
 from tests.daemon.harness import Stage
 from tests.daemon.process import DaemonProcess
@@ -26,7 +24,6 @@ from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.mavlink.frames import MAX_GAP_S
 from uavlinkd.system.stall import STALL_S
 
-pytestmark = pytest.mark.long
 PAUSED_S = STALL_S + 0.5
 FRESH = 10_000
 """Frames from this number on are sent after the pause."""

@@ -7,8 +7,6 @@ import asyncio
 from base64 import b64encode
 from pathlib import Path
 
-import pytest
-
 from tests.daemon.frames import frame
 from tests.daemon.harness import Stage, secret_forms
 from tests.daemon.test_life import run
@@ -33,7 +31,6 @@ def test_search_finds_what_is_there() -> None:
     assert not reported(b"nothing of it", [KEY])
 
 
-@pytest.mark.long
 async def test_nothing_that_a_daemon_gives_away_holds_a_key(stage: Stage) -> None:
     """Log at its most talkative, status, what /proc shows, and what its commands print."""
     a, b = stage.pair(confidential=True)

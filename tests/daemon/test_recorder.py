@@ -24,14 +24,7 @@ from uavlinkd.system.clock import monotonic
 from uavlinkd.system.terminal import FAILED, WRONG
 
 
-@pytest.mark.parametrize(
-    ("endpoint", "url"),
-    [
-        ("udpin", "udpout"),
-        pytest.param("udpout", "udpin", marks=pytest.mark.long),
-        pytest.param("tcpin", "tcp", marks=pytest.mark.long),
-    ],
-)
+@pytest.mark.parametrize(("endpoint", "url"), [("udpin", "udpout"), ("tcpin", "tcp")])
 async def test_a_client_records_until_it_is_interrupted(stage: Stage, endpoint: str, url: str) -> None:
     """pymavlink reads the private file. The peer's clients see a logging component, and no ground station."""
     a, b = stage.pair()

@@ -69,23 +69,10 @@ async def test_one_member_by_tls_and_another_by_udp(stage: Stage) -> None:
     assert await scene.connections() == 1
 
 
-async def test_both_by_tls_because_udp_is_silent(stage: Stage) -> None:
-    """The address for UDP comes first, and no process answers there."""
-    scene = Scene(stage)
-    silent = f"127.0.0.1:{free_port()}"
-    await scene.start([silent, scene.url], [silent, scene.url])
-    await scene.talk()
-    assert await scene.connections() == 2
-    connected = scene.drone.events("relay_connected")
-    assert [line["address"] for line in connected] == [scene.url]
-
-
-@pytest.mark.parametrize("is_by_tls", [False, True], ids=["udp", "tls"])
-async def test_signed_frames_arrive_in_the_order_of_their_sender(stage: Stage, *, is_by_tls: bool) -> None:
+async def test_signed_frames_arrive_in_the_order_of_their_sender(stage: Stage) -> None:
     """Through the relay, with bursts of frames of all classes: no gap in their numbers, no signature is rejected."""
     scene = Scene(stage)
-    address = scene.url if is_by_tls else scene.relay.address
-    await scene.start([address], [address])
+    await scene.start([scene.url], [scene.url])
     autopilot, client = Autopilot(), await stage.client()
     for _ in range(50):
         client.send(b"".join(frame.raw for frame in autopilot.burst()), scene.into)
@@ -94,16 +81,6 @@ async def test_signed_frames_arrive_in_the_order_of_their_sender(stage: Stage, *
     assert (station.packet_loss(), station.rejected) == (0, 0)
 
 
-async def test_udp_comes_first(stage: Stage) -> None:
-    """While the relay answers by UDP, nothing connects to it."""
-    scene = Scene(stage)
-    await scene.start([scene.relay.address, scene.url], [scene.url, scene.relay.address])
-    await scene.talk()
-    assert await scene.connections() == 0
-    assert scene.drone.events("relay_connected") == []
-
-
-@pytest.mark.long
 async def test_relay_that_restarts(stage: Stage) -> None:
     """Its members connect again, and the link is back."""
     scene = Scene(stage)

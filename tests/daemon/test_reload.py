@@ -8,7 +8,6 @@ import signal
 import sys
 from pathlib import Path
 from time import monotonic
-from unittest.mock import Mock
 
 import pytest
 
@@ -17,11 +16,9 @@ from tests.daemon.harness import Stage
 from tests.daemon.process import DaemonProcess
 from tests.daemon.toml import to_toml
 from tests.daemon.udp import Client, Sockaddr, assert_same
-from tests.waiting import PATIENCE_S, until
+from tests.waiting import PATIENCE_S
 from uavlinkd.core.constants import REKEY_AFTER_S
-from uavlinkd.link.daemon import Daemon
 from uavlinkd.ops.control import ask
-from uavlinkd.ops.sdnotify import Supervisor
 
 COUNT = 200
 """Frames in each direction between two reloads, and during each."""
@@ -218,32 +215,6 @@ async def write_to(fifo: Path, text: str, before_the_end: DaemonProcess | None =
         assert (await before_the_end.status())["peers"]
     await asyncio.to_thread(os.write, writer, text.encode())
     os.close(writer)
-
-
-async def test_many_hangups_are_two_reloads() -> None:
-    """One that reads and one that waits, which reads the last file, however many signals came."""
-    may_end, reloads_begun = asyncio.Event(), 0
-
-    class Waiting(Daemon):
-        """Waits instead of reading its file."""
-
-        def __init__(self) -> None:
-            self._loop, self._reload_lock = asyncio.get_running_loop(), asyncio.Lock()
-            self._hangups, self._supervisor = set(), Mock(spec=Supervisor)
-
-        async def _apply_file(self) -> None:
-            nonlocal reloads_begun
-            reloads_begun += 1
-            await may_end.wait()
-
-    daemon = Waiting()
-    for _ in range(20):
-        daemon.on_hangup()
-        await asyncio.sleep(0)
-    assert reloads_begun == 1
-    may_end.set()
-    await until(lambda: not daemon._hangups)
-    assert reloads_begun == 2
 
 
 STUCK = """

@@ -4,13 +4,9 @@ from __future__ import annotations
 
 from time import monotonic
 
-import pytest
-
 from tests.daemon.harness import Stage
 from tests.daemon.two_hosts import LTE, MESH, TwoHosts, interface_of
 from tests.namespaces import need_namespaces
-
-pytestmark = pytest.mark.long
 
 
 async def test_interface_that_is_removed_and_plugged_in_again(stage: Stage) -> None:

@@ -10,13 +10,12 @@ from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager, suppress
 from typing import Any
 
-import pytest
 from websockets.asyncio.client import ClientConnection, connect
 
 from tests.daemon.harness import Stage
 from tests.daemon.process import DaemonProcess
 from tests.tls_files import CERTIFICATE, TLS_KEY, write_tls_files
-from tests.waiting import Stopwatch, until
+from tests.waiting import Stopwatch
 from uavlinkd.config import keys
 from uavlinkd.core import constants as c
 from uavlinkd.core.crypto import Secret
@@ -27,7 +26,7 @@ from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.core.suites import X25519
 from uavlinkd.core.wire import response_bytes
 from uavlinkd.lab.sim.loopback_ports import free_port
-from uavlinkd.link.web_listener import STRANGER_S, STRANGERS_OF_PREFIX
+from uavlinkd.link.web_listener import STRANGER_S
 from uavlinkd.system.clock import monotonic
 
 _AT = Path(0, ("192.0.2.1", 443))
@@ -109,14 +108,6 @@ def _https(status: Mapping[str, Any]) -> dict[str, Any]:
     return https
 
 
-def _hello() -> bytes:
-    """What a client of TLS sends first."""
-    outgoing = ssl.MemoryBIO()
-    with suppress(ssl.SSLWantReadError):
-        unverified().wrap_bio(ssl.MemoryBIO(), outgoing).do_handshake()
-    return outgoing.read()
-
-
 async def _ask(port: int, request: str) -> bytes:
     """The whole answer of the relay to a request of HTTP by TLS."""
     reader, writer = await asyncio.open_connection("127.0.0.1", port, ssl=unverified())
@@ -128,7 +119,6 @@ async def _ask(port: int, request: str) -> bytes:
     return answer
 
 
-@pytest.mark.long
 async def test_member_talks_in_messages_of_a_websocket(stage: Stage) -> None:
     """The first message is an initiation, the first answer its response. The connection stays while it is proved."""
     relay, member, port = _relay(stage)
@@ -149,7 +139,6 @@ async def test_member_talks_in_messages_of_a_websocket(stage: Stage) -> None:
     assert relay.events("sends_failed") == []
 
 
-@pytest.mark.long
 async def test_strangers_get_a_page_and_no_more(stage: Stage) -> None:
     """Without messages of a member, a connection ends after 5 s."""
     relay, _, port = _relay(stage)
@@ -166,27 +155,6 @@ async def test_strangers_get_a_page_and_no_more(stage: Stage) -> None:
     assert _https(status)["connections"] == 0
 
 
-async def test_strangers_are_few(stage: Stage) -> None:
-    """No more of one network, while others wait for nothing. A member that comes later gets in."""
-    relay, member, port = _relay(stage)
-    await stage.start(relay)
-    count, most = STRANGERS_OF_PREFIX + 8, 0
-    opened = await asyncio.gather(*[asyncio.open_connection("127.0.0.1", port) for _ in range(count)])
-    for _, writer in opened:
-        writer.write(_hello())
-    while sum((https := _https(await relay.status()))["refused"].values()) < count:
-        most = max(most, https["strangers"])
-        await asyncio.sleep(0.02)
-    assert most <= STRANGERS_OF_PREFIX
-    assert https["refused"].keys() <= {"prefix_full", "displaced", "slow_handshake", "unproven"}
-    assert https["refused"].keys() & {"prefix_full", "displaced"}
-    assert await relay.until_logged("connections_failed")
-    for _, writer in opened:
-        writer.close()
-    async with _websocket(port) as socket, member.over(socket):
-        await relay.until(lambda status: bool(status["relay"]["members"]["drone1"]["addresses"]))
-
-
 async def test_web_server_here_says_who_connects(stage: Stage) -> None:
     """What it appended to the header counts, and not what the client wrote before it."""
     relay, member, port = _relay(stage, is_plain=True)
@@ -201,23 +169,3 @@ async def test_web_server_here_says_who_connects(stage: Stage) -> None:
         await socket.wait_closed()
     status = await relay.until(lambda status: _https(status)["connections"] == 0)
     assert _https(status)["refused"] == {"forwarded_for": 1}
-
-
-async def test_members_hear_of_the_end(stage: Stage) -> None:
-    """The close of the session leaves before the connection ends."""
-    relay, member, port = _relay(stage)
-    await stage.start(relay)
-    async with _websocket(port) as socket, member.over(socket):
-        await relay.until(lambda status: bool(status["relay"]["members"]["drone1"]["addresses"]))
-        await relay.stop()
-        await until(lambda: member.is_closed)
-
-
-async def test_port_of_another_process_is_named(stage: Stage) -> None:
-    """With the key of the file."""
-    relay, _, port = _relay(stage)
-    other = await asyncio.start_server(lambda reader, writer: None, "127.0.0.1", port)
-    await relay.start()
-    assert await relay.ended() == 1
-    assert f"relay_server.https: cannot listen on 127.0.0.1:{port}" in "\n".join(relay.lines)
-    other.close()

@@ -7,17 +7,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from websockets.asyncio.client import connect
 
 from tests.daemon.frames import GROUND_SYSTEM, heartbeat
 from tests.daemon.harness import Stage
 from tests.daemon.test_relay_by_tls import Scene, carrying
-from tests.daemon.test_web_listener import RawMember, unverified
 from tests.daemon.web_servers import PASSWORD, USER, WebServer, caddy, nginx, running, squid, tinyproxy
 from tests.waiting import PATIENCE_S
 from uavlinkd.lab.sim.loopback_ports import free_port
-
-pytestmark = pytest.mark.long
 
 Make = Callable[[Path, int], WebServer]
 
@@ -60,30 +56,12 @@ async def test_members_through_a_web_server(stage: Stage, make: Make) -> None:
         await check_restart(scene, server)
 
 
-@pytest.mark.parametrize("make", [nginx, caddy])
-async def test_web_server_says_who_connects(stage: Stage, make: Make) -> None:
-    """What the member writes into the header does not count."""
-    relay, port = stage.daemon("relay"), free_port()
-    relay.config["relay_server"] = {"https": {"listen": f"127.0.0.1:{port}"}}
-    member = RawMember(relay)
-    relay.config["member"] = [{"name": "drone1", "public_key": member.public_key}]
-    await stage.start(relay)
-    async with running(make, stage.folder / "web", port) as server:
-        url, headers = f"wss://127.0.0.1:{server.port}/uavlink", {"X-Forwarded-For": "192.0.2.9"}
-        websocket = connect(url, ssl=unverified(), compression=None, additional_headers=headers, proxy=None)
-        async with websocket as connected, member.over(connected):
-            status = await relay.until(lambda status: bool(status["relay"]["members"]["drone1"]["addresses"]))
-    (address,) = status["relay"]["members"]["drone1"]["addresses"]
-    assert address.startswith("127.0.0.1:")
-
-
-@pytest.mark.parametrize("make", [tinyproxy, squid])
-async def test_member_through_a_proxy(stage: Stage, make: Make) -> None:
-    """That the environment of the member names; one of them wants a password."""
+async def test_member_through_a_proxy(stage: Stage) -> None:
+    """The environment of the member names the proxy, which asks for a password."""
     scene = Scene(stage)
     port = int(scene.url.rpartition(":")[2].partition("/")[0])
-    async with running(make, stage.folder / "proxy", port) as server:
-        user = f"{USER}:{PASSWORD}@" if make is tinyproxy else ""
+    async with running(tinyproxy, stage.folder / "proxy", port) as server:
+        user = f"{USER}:{PASSWORD}@"
         for member in (scene.drone, scene.ground):
             member.environ = {"HTTPS_PROXY": f"http://{user}127.0.0.1:{server.port}", "NO_PROXY": ""}
         await scene.start([scene.url], [scene.url])
@@ -92,14 +70,12 @@ async def test_member_through_a_proxy(stage: Stage, make: Make) -> None:
         await check_restart(scene, server)
 
 
-@pytest.mark.parametrize("make", [tinyproxy, squid])
-async def test_proxy_that_refuses(stage: Stage, make: Make) -> None:
+async def test_proxy_that_refuses(stage: Stage) -> None:
     """The log of the member has the status of the proxy."""
     scene = Scene(stage)
-    reason = "proxy_407" if make is tinyproxy else "proxy_403"
-    async with running(make, stage.folder / "proxy", free_port()) as server:
+    async with running(squid, stage.folder / "proxy", free_port()) as server:
         scene.drone.environ = {"HTTPS_PROXY": f"http://127.0.0.1:{server.port}", "NO_PROXY": ""}
         scene.drone.config["relay"][0]["addresses"] = [scene.url]
         await stage.start(scene.relay, scene.drone, linked=False)
-        await scene.drone.until_logged("relay_not_connected", reason=reason)
+        await scene.drone.until_logged("relay_not_connected", reason="proxy_403")
     assert await scene.connections() == 0

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import pytest
+
 from tests.daemon.frames import frame
 from tests.daemon.harness import Stage
 from tests.daemon.members import CertifiedFleet
@@ -177,6 +179,7 @@ def _check_counts(value: Any, levels: int, path: str) -> None:
             _check_counts(item, levels - 1, path)
 
 
+@pytest.mark.long
 async def test_status_has_the_declared_names() -> None:
     """Of real daemons: one alone, and one with a peer and clients."""
     names = await observed()

@@ -62,6 +62,7 @@ def member_of(status: Status, name: str) -> dict[str, Any]:
     return member
 
 
+@pytest.mark.short
 async def test_members_reach_each_other_through_the_relay(relay: DaemonProcess, make_member: MakeMember) -> None:
     """Handles, data in both directions, the addresses that the relay sees, and its counters."""
     drone, station = make_member("drone1"), make_member("station")
