@@ -272,7 +272,7 @@ PROVOKED: dict[DropReason, Provoke] = {
 }
 OUTSIDE = {
     *(DropReason.FRAMES_NOT_ALLOWED, DropReason.RELAY_MALFORMED, DropReason.RELAY_UNKNOWN_HANDLE),
-    *(DropReason.RELAY_OVER_LIMIT, DropReason.RELAY_UNEXPECTED_TOKEN, DropReason.RECORD_OVER_LIMIT),
+    *(DropReason.RELAY_OVER_LIMIT, DropReason.RECORD_OVER_LIMIT),
     *(DropReason.UNEXPECTED_RECORD, DropReason.OLD_RECORD),
     *(DropReason.BAD_CERTIFICATE, DropReason.CERTIFICATE_REVOKED, DropReason.MEMBER_CONFLICT),
     *(DropReason.ROLE_NOT_ACCEPTED, DropReason.BULLETIN_AWAITED, DropReason.TOO_MANY_MEMBERS),

@@ -17,22 +17,17 @@ from uavlinkd.core.relay_records import (
     Bind,
     Bound,
     Candidates,
-    FilterTest,
-    FilterTested,
     Record,
     binds_of,
     bounds_of,
     handle_of,
     parse_record,
-    token_datagram,
-    token_of,
     wrap,
 )
 
 KEYS = [bytes([number]) * c.KEY_BYTES for number in range(1, 41)]
 BIND = Bind((KEYS[0], KEYS[1]))
 BOUND = Bound("203.0.113.7", 5790, ((KEYS[0], 0x1234), (KEYS[1], WAITING)))
-TOKEN = bytes(range(16))
 LINK = quiet(features=c.FEATURE_RECORDS)
 MAPPED = bytes(10) + b"\xff\xff\xcb\x00\x71\x07" + b"\x16\x9e"
 
@@ -49,42 +44,12 @@ MAPPED = bytes(10) + b"\xff\xff\xcb\x00\x71\x07" + b"\x16\x9e"
             Candidates((("203.0.113.7", 5790), ("2001:db8::1", 1))),
             b"\x03" + MAPPED + bytes.fromhex("20010db8" + 22 * "0" + "01" + "0001"),
         ),
-        (FilterTest(TOKEN), b"\x04" + TOKEN + bytes(79)),
-        (FilterTested(TOKEN), b"\x05" + TOKEN),
     ],
 )
 def test_encodings_are_the_documented_ones(record: Record, encoded: bytes) -> None:
     """Byte by byte, as the specification draws them, and back."""
     assert record.encode() == encoded
     assert parse_record(encoded) == record
-
-
-@pytest.mark.parametrize(
-    "data",
-    [
-        FilterTest(TOKEN).encode()[:-1],
-        FilterTest(TOKEN).encode() + b"\0",
-        FilterTest(TOKEN).encode()[:-1] + b"\1",
-        FilterTested(TOKEN).encode()[:-1],
-        FilterTested(TOKEN).encode() + b"\0",
-    ],
-)
-def test_filter_test_of_another_form_is_dropped(data: bytes) -> None:
-    """Each has one length, and the padding is zero."""
-    with pytest.raises(Drop):
-        parse_record(data)
-
-
-@pytest.mark.parametrize("counter", [0, c.SHORT_COUNTER_LIMIT], ids=["short", "long"])
-def test_filter_test_is_not_shorter_than_what_a_relay_sends_for_it(counter: int) -> None:
-    """The token, with IP and UDP header of its own, and the record, whose envelope may have the longer header."""
-    session = Pair(LINK, LINK).establish().a.session
-    session.send_counter = 0
-    asked = session.seal(session.sealed_record(FilterTest(TOKEN).encode()), 0.0)
-    session.send_counter = counter
-    answer = session.seal(session.sealed_record(FilterTested(TOKEN).encode()), 0.0)
-    ipv6_and_udp = 40 + 8
-    assert len(asked) >= len(answer) + len(token_datagram(TOKEN)) + ipv6_and_udp
 
 
 @given(st.sampled_from((1, 2, 3)), st.integers(0, 1300))
@@ -104,15 +69,12 @@ def test_only_whole_entries_within_the_limits_are_valid(kind: int, size: int) ->
             parse_record(data)
 
 
-def test_data_and_tokens_have_one_form() -> None:
+def test_data_has_one_form() -> None:
     """Handshake messages, cookie replies and envelopes may be inside data, no relay inside a relay, no bare frame."""
     assert wrap(0x1234, b"\x40abc") == b"\x50\x12\x34\x40abc"
     assert [handle_of(wrap(9, bytes([inner]))) for inner in (1, 2, 3, 0x40, 0x41)] == [9] * 5
     malformed = [b"\x50", wrap(9, b""), wrap(9, b"\x50\x00\x09\x40"), wrap(9, b"\xfd")]
     assert [handle_of(data) for data in malformed] == [0] * 4
-    token = token_datagram(TOKEN)
-    assert token == b"\x51" + TOKEN
-    assert [token_of(data) for data in (token, token + b"\0", token[:-1], b"\x51")] == [TOKEN, b"", b"", b""]
 
 
 def test_few_records_hold_many_keys_and_handles() -> None:

@@ -1,9 +1,7 @@
 """A member of a hostile relay, which holds its keys and assigns any handles.
 
 It does all that :mod:`tests.fuzz.insiders` does. Besides, the member accepts data only from an address of the relay,
-with a handle that a record assigned there for a peer that the member asked for. While the member tests filters, it
-accepts its token only from the relay's host, from a port to which it has no path. Tests end soon, whatever the relay
-says.
+with a handle that a record assigned there for a peer that the member asked for.
 """
 
 from __future__ import annotations
@@ -13,22 +11,20 @@ from typing import Final
 from tests.core.harness import AT_A, ELSEWHERE, KEY_A, KEY_C, quiet
 from tests.fuzz.engine import Run, Script, play
 from tests.fuzz.insiders import Insider
-from tests.fuzz.stages import NOW, SeededEntropy, copier, pair_of
+from tests.fuzz.stages import NOW, copier, pair_of
 from uavlinkd.config.model import PeerAddress, RelayConfig
 from uavlinkd.core import constants as c
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.outputs import Event, Output, RecordReceived
 from uavlinkd.core.path import Path, relayed
-from uavlinkd.core.relay_records import Bound, FilterTested, token_datagram, wrap
+from uavlinkd.core.relay_records import Bound, wrap
 from uavlinkd.core.settings import Link, PeerSettings, Timers
 from uavlinkd.link.relay_link import RelayHandles, RelayLink
-from uavlinkd.link.relays import FilterTests
 from uavlinkd.system.addresses import Address
 
 WANTED: Final = (KEY_C.public, bytes([5]) * c.KEY_BYTES)
 OTHERS: Final = (KEY_A.public, bytes(c.KEY_BYTES))
 """Keys that the member did not ask for: the relay's own among them."""
-OTHER_PORT: Final = Path(AT_A.socket, (AT_A.host, 50_000))
 HANDLES: Final = 64
 """Those that a script assigns."""
 
@@ -51,7 +47,6 @@ class Stage:
         self.relay = RelayLink(config, pair.b.node, self.handles, _ignore, NOW)
         self.relay.set_paths([AT_A], NOW)
         self.relay.follow(WANTED)
-        self.tests = FilterTests(pair.b.node, SeededEntropy(5))
         pair.establish(NOW)
 
 
@@ -60,7 +55,7 @@ class Assigned(Insider):
 
     def __init__(self, stage: Stage) -> None:
         super().__init__(stage.pair, stage.link)
-        self._relay, self._handles, self._tests = stage.relay, stage.handles, stage.tests
+        self._relay, self._handles = stage.relay, stage.handles
         self._assigned: set[int] = set()
 
     def step(self, script: Script) -> None:
@@ -68,9 +63,6 @@ class Assigned(Insider):
         first = script.byte()
         if first & 3 == 0:
             super().step(script)
-            return
-        if first & 7 == 7:
-            self._test(script)
             return
         what = script.byte()
         entries = []
@@ -84,26 +76,8 @@ class Assigned(Insider):
         self._offer(self.sessions[-1].seal(self.sessions[-1].sealed_record(record.encode()), self.now), what)
         self._pass(0.01)
 
-    def _test(self, script: Script) -> None:
-        """The member tests filters, or the relay answers: with the token or another one, from anywhere."""
-        how = script.byte()
-        if not how & 3:
-            self._tests.begin([self._relay], self.now)
-            self._take(self._tests.do_due(self.now), None)
-            return
-        true = list(self._tests._tests)
-        token = true[0] if true and how & 8 else script.take(how & 31)
-        if how & 3 == 1:
-            record = FilterTested(token).encode()
-            self._offer(self.sessions[-1].seal(self.sessions[-1].sealed_record(record), self.now), how)
-            return
-        path = (AT_A, OTHER_PORT, ELSEWHERE, Path(1, OTHER_PORT.address))[how >> 4 & 3]
-        may_be_taken = token in true and path == OTHER_PORT and self.peer.paths.find(path) is None
-        assert self._tests.take_token(token_datagram(token), path) == may_be_taken, "a token that shows nothing"
-
     def _pass(self, seconds: float) -> None:
         super()._pass(seconds)
-        self._take(self._tests.do_due(self.now), None)
         if self._relay.next_at <= self.now:
             self._take(self._relay.do_due(self.now), None)
         self._relay.do_housekeeping(self.now)
@@ -113,15 +87,12 @@ class Assigned(Insider):
         for output in outputs:
             if isinstance(output, RecordReceived):
                 self._relay.on_record(output, self.now)
-                self._tests.on_record(output)
             elif isinstance(output, Event):
                 self._relay.on_event(output, self.now)
 
     def check_bounds(self) -> None:
         """Those of every peer, and of the handles; and which data is accepted."""
         super().check_bounds()
-        assert all(test.tries <= c.FILTER_TRIES for test in self._tests._tests.values()), "too many tries"
-        assert len({test.path.socket for test in self._tests._tests.values()}) == len(self._tests._tests)
         most = len(self.peer.paths.states) * len(WANTED) * c.HANDLES_PER_PAIR
         assert len(self._handles._inward) <= most, "too many handles"
         assert len(self._handles._outward) <= most, "handles in one direction only"

@@ -19,7 +19,7 @@ from uavlinkd.core.outputs import Transmit
 from uavlinkd.endpoints import line_framing, web_stream
 from uavlinkd.lab.mitm import anatomy
 from uavlinkd.lab.mitm import proxy_settings as mitm_settings
-from uavlinkd.link import direct_search, relays
+from uavlinkd.link import direct_search, relay_link
 from uavlinkd.mavlink import frames, routing
 from uavlinkd.mavlink.policy import gate
 from uavlinkd.ops import control
@@ -129,6 +129,15 @@ def _forwards_by_handle(right: Any) -> Any:
     return take
 
 
+def _unwraps_by_handle(right: Any) -> Any:
+    def unwrap(self: Any, socket: int, data: bytes, source: Any) -> Any:
+        places = {handle: (number, address) for number, address, handle in self._inward}
+        number, address = places.get(int.from_bytes(data[1:3], "big"), (socket, source))
+        return right(self, number, data, address)
+
+    return unwrap
+
+
 def _reports_at_once(right: Any) -> Any:
     def on_record(self: Any, received: Any, now: float) -> None:
         right(self, received, now)
@@ -175,7 +184,7 @@ PLANTS: Final = {
     "more bytes to an unproven address than received": Plant("sealed", path_state.PathState, "allows", _always(True)),
     "a relay's handle is valid at any address": Plant("relay", forwarding.Forwarding, "take", _forwards_by_handle),
     "a relay answers an unproven path": Plant("relay", service.RelayService, "on_record", _reports_at_once),
-    "a token counts from anywhere": Plant("handles", relays.FilterTests, "take_token", _always(True)),
+    "a handle is valid from any address": Plant("handles", relay_link.RelayHandles, "unwrap", _unwraps_by_handle),
     "special addresses are asked": Plant("candidates", direct_search, "may_be_asked", _always(True)),
     "the header in clear may lie": Plant(
         "handshakes",

@@ -2,10 +2,9 @@
 
 The members are nodes of the core with three addresses each. A script lets them bind any keys, seal any payload,
 restart and roam; it changes the relay's members, and lets time pass. After each datagram these properties hold. A
-stranger gets no byte. A token goes once for each filter test, along a validated path, within the limits. No datagram
-that is forwarded is longer than the one that came, and it goes from one address of a connection to the other. A
-datagram with the header 0x50 that is not forwarded is counted once. Tables stay within their bounds. Afterwards two
-honest members connect.
+stranger gets no byte. No datagram that is forwarded is longer than the one that came, and it goes from one address of
+a connection to the other. A datagram with the header 0x50 that is not forwarded is counted once. Tables stay within
+their bounds. Afterwards two honest members connect.
 """
 
 from __future__ import annotations
@@ -28,10 +27,7 @@ from uavlinkd.core.relay_records import (
     Bind,
     Bound,
     Candidates,
-    FilterTest,
-    FilterTested,
     Record,
-    token_of,
     wrap,
 )
 from uavlinkd.core.settings import PeerSettings
@@ -107,14 +103,11 @@ class FuzzedRelay:
         entropy = SeededEntropy(9)
         self.node = Node(Secret(PRIVATE[0]), entropy, NOW)
         self.forwarded: list[tuple[bytes, Path]] = []
-        shell = RelayShell(entropy, self.clock, self.perform, self.forward, self.send_token, self.on_event)
+        shell = RelayShell(entropy, self.clock, self.perform, self.forward, self.on_event)
         self.service = RelayService(self.node, TOTAL, shell)
         self.members = [_Member(number) for number in range(3)]
         self.credit: Counter[Path] = Counter()
         """Bytes that came from an address and were not answered with as many."""
-        self._changes = 0
-        self.tokens_sent = 0
-        self._asked = Counter[tuple[bytes, Path]]()
         self._restarts = 0
         self._wire: list[tuple[bytes, Path]] = []  # from the relay
         self.most_peers = 1
@@ -131,16 +124,6 @@ class FuzzedRelay:
         """The relay forwards."""
         self.forwarded.append((datagram, path))
 
-    def send_token(self, datagram: bytes, path: Path) -> bool:
-        """The relay sends a token: once for each test, along its path, which is validated."""
-        states = [peer.paths.find(path) for peer in self.node.peers.values()]
-        assert any(state is not None and state.is_validated for state in states), "a token to an unproven address"
-        token = token_of(datagram)
-        assert self._asked[token, path], "a token that no member asked for"
-        self._asked[token, path] -= 1
-        self.tokens_sent += 1
-        return True
-
     def on_event(self, event: Event, now: float) -> None:
         """An event of a member, for the log."""
 
@@ -151,8 +134,6 @@ class FuzzedRelay:
                 self._charge(output)
                 self._wire.append((output.datagram, output.path))
             elif isinstance(output, RecordReceived):
-                if isinstance(output.record, FilterTest):
-                    self._asked[output.record.token, output.path] += 1
                 self.service.on_record(output, self.now)
             elif isinstance(output, Event):
                 self.service.on_event(output, self.now)
@@ -246,7 +227,6 @@ class FuzzedRelay:
             if chosen >> number & 1
         }
         self.most_peers = max(self.most_peers, most_peers)
-        self._changes += 1
         self.service.set_members(members, {}, self.now)
         self._follow()
 
@@ -314,10 +294,6 @@ class FuzzedRelay:
             record = Candidates((("192.0.2.9", script.word()),))
         elif how & 0xF0 == 0xE0:
             record = Bound("192.0.2.9", script.word(), ((KEYS[1], script.word()),))
-        elif how & 0xF0 in (0xB0, 0xC0, 0xD0):
-            record = FilterTest(script.take(c.FILTER_TOKEN_BYTES).ljust(c.FILTER_TOKEN_BYTES))
-        elif how & 0xF0 == 0xA0:
-            record = FilterTested(script.take(c.FILTER_TOKEN_BYTES).ljust(c.FILTER_TOKEN_BYTES))
         path = member.homes[how >> 4 & 1] if how & 0x40 else self._source(script, is_member=True)
         self.arrive(session.seal(session.sealed_record(record.encode()), self.now), path)
         if how & 0x20:
@@ -339,10 +315,6 @@ class FuzzedRelay:
         slots = c.CONFIGURED_PATHS + c.LEARNED_PATHS
         assert all(len(asked) <= slots for asked in service._asked.values()), "too many binds wait"
         assert not service._due, "a report that is never sent"
-        assert not service._filter_tests, "a token that is never sent"
-        begun = len(self.members) * self._changes  # each has a bucket of its own
-        most = begun * c.FILTER_TESTS + len(self.members) * c.FILTER_TESTS_PER_S * (self.now - NOW)
-        assert self.tokens_sent <= most, "more tokens than the limits allow"
 
     def check_sequel(self) -> None:
         """Two honest members connect, whatever was before, and data passes in both directions."""

@@ -27,7 +27,6 @@ from uavlinkd.link.carrier import FrameCarrier
 from uavlinkd.link.parts import DaemonParts
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.relay_link import RELAYED_START, RelayHandles
-from uavlinkd.link.relays import TOKEN_START
 from uavlinkd.link.turns import (
     SHARED_BYTES,
     STARTS_OF_A_FRAME,
@@ -83,7 +82,6 @@ class Scene:
             peer_sockets=SimpleNamespace(budgets={}, handles=self.handles),
             relays=SimpleNamespace(
                 by_name={},
-                filter_tests=SimpleNamespace(take_token=lambda *_: False),
                 next_at=NEVER,
                 on_event=lambda *_: None,
             ),
@@ -146,7 +144,7 @@ async def test_data_along_a_relay_is_unwrapped_or_dropped() -> None:
     """The core gets the inner datagram with the relayed path; without relays it gets, and drops, all."""
     scene = Scene()
     scene.handles.assign("vps", AT_A, [7])
-    data = [wrap(7, ENVELOPE + b"rest"), wrap(8, ENVELOPE), RELAYED_START, TOKEN_START, ENVELOPE]
+    data = [wrap(7, ENVELOPE + b"rest"), wrap(8, ENVELOPE), RELAYED_START, ENVELOPE]
     scene.read(*data)
     assert scene.received == [(datagram, AT_A) for datagram in data]
     scene.received.clear()
@@ -159,7 +157,6 @@ async def test_data_along_a_relay_is_unwrapped_or_dropped() -> None:
     assert [reason for reason, *_ in scene.dropped] == [
         DropReason.RELAY_UNKNOWN_HANDLE,
         DropReason.RELAY_MALFORMED,
-        DropReason.RELAY_UNEXPECTED_TOKEN,
     ]
 
 

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import count
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.core.harness import AT_B, ELSEWHERE, KEY_B, KEY_C, Pair, quiet
+from tests.core.harness import AT_B, ELSEWHERE, KEY_B, Pair, quiet
 from uavlinkd.config.model import RelayConfig
 from uavlinkd.core import constants as c
 from uavlinkd.core import outputs as o
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.path import Path, relayed
-from uavlinkd.core.relay_records import WAITING, Bind, Bound, FilterTest, FilterTested, Record, token_datagram, wrap
+from uavlinkd.core.relay_records import WAITING, Bind, Bound, Record, wrap
 from uavlinkd.core.settings import PeerSettings
 from uavlinkd.link.relay_link import BIND_SOON_S, RelayHandles, RelayLink
-from uavlinkd.link.relays import FilterTests
 
 LINK = quiet(features=c.FEATURE_RECORDS)
 ONE, TWO = bytes([7]) * 32, bytes([8]) * 32
@@ -258,145 +256,3 @@ def test_malformed_data_is_dropped_before_its_handle_is_looked_up() -> None:
     paths.assign("vps", LTE, [7])
     for data in (wrap(7, b""), wrap(7, wrap(7, ENVELOPE)), b"\x50"):
         assert paths.unwrap(0, data, LTE.address) is DropReason.RELAY_MALFORMED
-
-
-# What a member asks its relays for when it tests filters, and which tokens it takes: with literal times.
-
-OTHER_PORT = Path(AT_B.socket, (AT_B.host, 50_000))
-
-
-class FilterTester(RelayMember):
-    """A member that tests filters."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        numbers = count()  # each token is another one
-        self.tests = FilterTests(self.pair.a.node, lambda size: bytes([next(numbers)]) * size)
-
-    def asked(self, now: float) -> list[bytes]:
-        """The tokens that the relay is asked for now."""
-        records = self.received(self.tests.do_due(now), now)
-        return [record.token for record in records if isinstance(record, FilterTest)]
-
-    def answer(self, token: bytes, path: Path = AT_B) -> None:
-        """The relay says that it sent a token."""
-        self.tests.on_record(o.RecordReceived(self.link.peer, path, FilterTested(token), 1))
-
-    def ask_all(self, *, answers: int) -> bytes:
-        """Ask in vain, with answers to the first tries. The token."""
-        asked = [self.asked(self.tests.next_at) for _ in range(c.FILTER_TRIES)]
-        ((token,),) = {tuple(one) for one in asked}
-        for _ in range(answers):
-            self.answer(token)
-        return token
-
-    @property
-    def passes(self) -> list[bool | None]:
-        """The results."""
-        return [result.passes for result in self.tests.results]
-
-
-@pytest.fixture
-def tester() -> FilterTester:
-    """A member with a session, which begins its tests."""
-    tester = FilterTester()
-    tester.tests.begin([tester.link], T)
-    return tester
-
-
-@pytest.mark.parametrize(("answers", "passes"), [(0, None), (1, None), (2, False), (3, False)])
-def test_answers_without_a_token_show_a_filter(answers: int, passes: bool | None, tester: FilterTester) -> None:
-    """Unless there is one answer only: the token may have been lost."""
-    tester.ask_all(answers=answers)
-    tester.asked(T + 9)
-    assert tester.passes == [passes]
-
-
-def test_token_and_its_answer_end_the_test(tester: FilterTester) -> None:
-    """Whichever comes first. A second copy of the token is not dropped; a later one is."""
-    (token,) = tester.asked(T)
-    assert tester.tests.take_token(token_datagram(token), OTHER_PORT)
-    assert tester.tests.take_token(token_datagram(token), OTHER_PORT)
-    assert tester.tests.next_at == T + c.FILTER_TRY_S
-    tester.answer(token)
-    assert tester.tests.next_at < T
-    assert not tester.asked(T + 0.01)
-    assert tester.tests.ended.is_set()
-    assert tester.passes == [True]
-    assert not tester.tests.take_token(token_datagram(token), OTHER_PORT)
-
-
-def test_token_after_its_answers_ends_the_test(tester: FilterTester) -> None:
-    """The network reordered them, or the first token was lost."""
-    (token,) = tester.asked(T)
-    tester.answer(token)
-    tester.asked(tester.tests.next_at)
-    tester.answer(token)
-    assert tester.tests.next_at > T
-    assert tester.tests.take_token(token_datagram(token), OTHER_PORT)
-    assert tester.tests.next_at < T
-    assert not tester.asked(T + 0.5)
-    assert tester.passes == [True]
-
-
-@pytest.mark.parametrize(
-    ("path", "change"),
-    [(AT_B, b""), (ELSEWHERE, b""), (Path(AT_B.socket + 1, OTHER_PORT.address), b""), (OTHER_PORT, b"\0")],
-    ids=["the relay's own port", "another host", "another socket", "another length"],
-)
-def test_other_datagrams_with_the_token_show_nothing(path: Path, change: bytes, tester: FilterTester) -> None:
-    """They are dropped, and the result is as without them."""
-    token = tester.ask_all(answers=3)
-    assert not tester.tests.take_token(token_datagram(token) + change, path)
-    assert not tester.tests.take_token(token_datagram(bytes(c.FILTER_TOKEN_BYTES)[1:] + b"\7"), OTHER_PORT)
-    tester.asked(T + 9)
-    assert tester.passes == [False]
-
-
-def test_token_from_a_port_of_another_peer_shows_nothing(tester: FilterTester) -> None:
-    """It shares the relay's host. This daemon sends there, so a NAT lets it in."""
-    other = tester.pair.a.node.add_peer(PeerSettings("other", KEY_C.public, None, LINK), T)
-    tester.pair.a.node.set_paths(other, [OTHER_PORT], T)
-    token = tester.ask_all(answers=3)
-    assert not tester.tests.take_token(token_datagram(token), OTHER_PORT)
-    tester.asked(T + 9)
-    assert tester.passes == [False]
-
-
-def test_answers_of_others_do_not_count(tester: FilterTester) -> None:
-    """Along another path, for another token, of another peer, and other records."""
-    token = tester.ask_all(answers=1)
-    tester.answer(token, ELSEWHERE)
-    tester.answer(bytes([9]) * c.FILTER_TOKEN_BYTES)
-    for peer, record in ((tester.pair.b.peer, FilterTested(token)), (tester.link.peer, Bind((KEY_B.public,)))):
-        received = o.RecordReceived(peer, AT_B, record, 1)
-        assert tester.tests.on_record(received) is DropReason.UNEXPECTED_RECORD
-    tester.asked(T + 9)
-    assert tester.passes == [None]
-
-
-def test_tests_that_run_are_not_begun_again(tester: FilterTester) -> None:
-    """Two people ask at the same time: both get the same results. Later tests have other tokens."""
-    tester.tests.begin([tester.link], T)
-    token = tester.ask_all(answers=2)
-    tester.tests.begin([tester.link], T + 1)
-    tester.asked(T + 9)
-    assert tester.passes == [False]
-    tester.tests.begin([tester.link], T + 10)
-    assert tester.passes == []
-    (other,) = tester.asked(T + 10)
-    assert other != token
-
-
-def test_best_path_from_each_socket_is_tested() -> None:
-    """Others of the same socket lead through the same NAT; serial and relayed ones through none."""
-    tester = FilterTester()
-    second, third = Path(0, ("192.0.2.8", 5790)), Path(1, AT_B.address)
-    tester.link.set_paths([AT_B, second, third], 0.0)
-    for path, srtt_s in ((AT_B, 0.2), (second, 0.1), (third, None)):
-        state = tester.link.peer.paths.find(path)
-        assert state is not None
-        state.srtt_s = srtt_s
-        state.set_usable(T)
-    tester.tests.begin([tester.link], T)
-    assert {(test.path, test.try_s) for test in tester.tests._tests.values()} == {(second, 0.3), (third, 0.3)}

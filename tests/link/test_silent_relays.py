@@ -18,7 +18,6 @@ from uavlinkd.core.path import Path, relayed
 from uavlinkd.core.path_state import PathCondition
 from uavlinkd.core.settings import PeerSettings
 from uavlinkd.link import diagnosis
-from uavlinkd.link.daemon import netcheck
 from uavlinkd.link.down_problems import silent_relays
 from uavlinkd.link.facts import Moment
 from uavlinkd.link.peer_link import LOSSES, NOT_ANSWERING_S, PeerLink
@@ -172,17 +171,6 @@ def test_an_answer_elsewhere_shows_that_it_is_this_relay(member: Member) -> None
     silent.set_paths([Path(0, ("192.168.1.9", 5790))], 0.0)
     other.set_paths([Path(0, ("192.168.1.10", 5790))], 0.0)
     assert all("UDP gets out here (drone1 at 192.168.1.7" in one.text for one in diagnosis.find(member.parts, LATER))
-
-
-def test_netcheck_names_a_peer_that_answers_as_far_away(member: Member) -> None:
-    """One in the local network does not show that UDP gets out to the relay, here as in ``status``."""
-    member.add_relay("one", FIRST)
-    member.parts.relays.places = lambda: ([], [])
-    member.parts.relays.filter_tests = SimpleNamespace(results=())
-    member.answers(member.link, ("192.168.1.7", 5790))
-    assert netcheck(member.parts, LATER)["other"] == ""
-    member.answers(member.link, SECOND)
-    assert netcheck(member.parts, LATER)["other"] == "drone1 at 203.0.113.2:5790"
 
 
 def test_an_answer_of_the_same_host_shows_that_it_is_the_port(member: Member) -> None:

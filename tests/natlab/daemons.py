@@ -13,7 +13,7 @@ from tests.daemon.harness import Stage
 from tests.daemon.process import DaemonProcess, Status
 from tests.daemon.tls import listen_for_tls
 from tests.faults.talk import Talk, Voice, prepare
-from tests.natlab.laboratory import Laboratory, Place
+from tests.natlab.laboratory import Place
 from tests.natlab.pairs import Pair
 
 NEVER_S: Final = 10.0
@@ -101,29 +101,6 @@ def make_member(stage: Stage, relay: DaemonProcess, name: str, listen: Sequence[
     daemon.config["relay"] = [{"name": RELAY, "public_key": relay.public_key, "addresses": addresses}]
     relay.config["member"].append({"name": name, "public_key": daemon.public_key})
     return daemon
-
-
-async def start_members(stage: Stage, laboratory: Laboratory, kinds: Sequence[str]) -> dict[str, DaemonProcess]:
-    """A daemon at a place of each kind. The relay has two ports at one address and one at another; each was reached.
-
-    Their only peer is absent. Behind ``no-udp`` the daemon has reached nothing.
-    """
-    public = laboratory.public()
-    relay = make_relay(stage, public)
-    relay.config["listen"] = [relay.address, f"{public.address}:{PORT + 1}", f"{public.second_address}:{PORT}"]
-    absent = stage.daemon("absent")
-    members = {}
-    for kind in kinds:
-        place = laboratory.place(kind)
-        daemon = make_member(stage, relay, kind, [f"{place.address}:{PORT}"], place)
-        daemon.config["relay"][0]["addresses"] = relay.config["listen"]
-        daemon.add_peer(absent, [], stage.psk())
-        members[kind] = daemon
-    await stage.start(relay, *members.values(), linked=False)
-    for kind, daemon in members.items():
-        if kind != "no-udp":
-            await daemon.until(lambda status: len(status["relays"][RELAY]["seen_as"]) == len(relay.config["listen"]))
-    return members
 
 
 def _addresses(place: Place, ipv4: str, ipv6: str, port: int) -> list[str]:

@@ -1,20 +1,16 @@
-"""Daemons behind NATs: relayed, direct over IPv6, what netcheck reports, and faults after which the link is back."""
+"""Daemons behind NATs: relayed, direct over IPv6, and faults after which the link is back."""
 
 from __future__ import annotations
 
 import asyncio
-from typing import Final
 
 import pytest
 
-from tests.daemon.harness import Stage
 from tests.natlab import daemons
 from tests.natlab.faults import FAULTS, Outcome, play
-from tests.natlab.kinds import PAIRED
 from tests.natlab.laboratory import Laboratory, need_laboratory
 from tests.natlab.pairs import make_ipv6_pairs, make_pairs
 from tests.waiting import Stopwatch
-from uavlinkd.ops.netcheck import ANY_PEER, FEW_PEERS, MOST_PEERS, Filtered, Mapped, behaviours, meaning
 
 pytestmark = [pytest.mark.alone, pytest.mark.usefixtures("_needs")]
 
@@ -25,22 +21,6 @@ AT_ONCE = 4
 BACK_S = 2.0
 MOVED_S = 4.0
 """A relay at another address is lost first; then its name is resolved, once a second."""
-OPEN, BY_PORT = Filtered.NOT_BY_PORT, Filtered.BY_PORT
-REPORTED: Final = {
-    "open": (Mapped.NO_NAT, OPEN, ANY_PEER),
-    "firewall": (Mapped.NO_NAT, BY_PORT, MOST_PEERS),
-    "full-cone": (Mapped.INDEPENDENT, OPEN, ANY_PEER),
-    "address-restricted": (Mapped.INDEPENDENT, OPEN, ANY_PEER),
-    "port-restricted": (Mapped.INDEPENDENT, BY_PORT, MOST_PEERS),
-    "address-dependent": (Mapped.BY_ADDRESS, OPEN, FEW_PEERS),
-    "symmetric": (Mapped.BY_PORT, BY_PORT, FEW_PEERS),
-    "linux": (Mapped.INDEPENDENT, BY_PORT, MOST_PEERS),
-    "linux-random": (Mapped.BY_PORT, BY_PORT, FEW_PEERS),
-    "carrier": (Mapped.INDEPENDENT, BY_PORT, MOST_PEERS),
-    "carrier-symmetric": (Mapped.BY_PORT, BY_PORT, FEW_PEERS),
-    "no-udp": None,
-}
-"""By kind, with a relay that has two addresses, and two ports at one of them. None: no relay answers."""
 
 
 @pytest.fixture(scope="module")
@@ -75,24 +55,6 @@ async def test_pairs_with_ipv6_are_direct_over_it() -> None:
             assert outcome.direct_to.startswith(f"{other.external}:")
         else:
             assert outcome.direct_s is None
-
-
-async def test_netcheck_reports_what_the_routers_do() -> None:
-    """Twice in a row: the first tests open no NAT for the second ones. No daemon warns of a token."""
-    assert set(REPORTED) == set(PAIRED)
-    with Laboratory() as laboratory:
-        async with Stage() as stage:
-            members = await daemons.start_members(stage, laboratory, PAIRED)
-            before = {kind: (await member.status())["drops"] for kind, member in members.items()}
-            for _ in range(2):
-                answers = await asyncio.gather(*(member.ask("netcheck") for member in members.values()))
-                for kind, answer in zip(members, answers, strict=True):
-                    reported = [
-                        (mapped, filtered, meaning(mapped, filtered)) for _, mapped, filtered in behaviours(answer)
-                    ]
-                    assert reported == ([REPORTED[kind]] if REPORTED[kind] else []), kind
-            for kind, member in members.items():
-                assert (await member.status())["drops"] == before[kind], kind
 
 
 async def test_link_is_back_soon_after_each_fault() -> None:

@@ -165,7 +165,6 @@ class Played:
     """As each end counts them."""
     datagrams: int = 0
     relayed: int = 0
-    filters_known: int = 0
     """Tests that showed how a NAT filters."""
     events: Counter[str] = field(default_factory=Counter)
     judged: int = 0
@@ -368,5 +367,4 @@ class History:
             played.sessions += sum(isinstance(event, SessionEstablished) for _, event in drone.outputs)
             played.largest |= drone.largest
         played.relayed = sum(relay.forwarded for relay in self.fleet.relays if isinstance(relay, Relay))
-        played.filters_known = self.fleet.filters_known if isinstance(self.fleet, RelayFleet) else 0
         played.datagrams = network.datagrams

@@ -6,7 +6,6 @@ A relay has its members in its configuration, or accepts those with a certificat
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -16,7 +15,7 @@ from typing import Final
 import structlog
 
 from tests.authority.signing import AUTHORITY, bulletin
-from tests.network.air import Address, Endpoint
+from tests.network.air import Address
 from tests.network.drone import Drone
 from tests.network.network import Network
 from uavlinkd.authority.trust import Trust
@@ -28,12 +27,12 @@ from uavlinkd.core.crypto import Entropy
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.path import RELAY_HOST, Path
 from uavlinkd.core.peer import Peer
-from uavlinkd.core.relay_records import Bind, CertificateRecord, FilterTest, token_of
+from uavlinkd.core.relay_records import Bind, CertificateRecord
 from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.link.direct_search import OwnSocket
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.relay_link import RELAYED_START, RelayHandles, RelayLink
-from uavlinkd.link.relays import TOKEN_START, Relays
+from uavlinkd.link.relays import Relays
 from uavlinkd.relay.bindings import QUARANTINED_PER_MEMBER
 from uavlinkd.relay.forwarding import MemberSettings, RelayLimits
 from uavlinkd.relay.service import RelayService, RelayShell
@@ -45,7 +44,6 @@ FEATURES: Final = c.KNOWN_FEATURES
 LINK: Final = Link(features=FEATURES)
 BULLETIN: Final = bulletin(1 << 24)
 _LIMITS: Final = RelayLimits(datagrams_s=20_000, bits_s=100_000_000)
-_FIRST_NEW_PORT: Final = 32_768
 _REMEMBERED_S: Final = c.BIND_LIFETIME_S + c.QUESTION_LIFETIME_S + HOUSEKEEPING_S
 """A bind has no effect later than this."""
 _QUIET: Final = structlog.make_filtering_bound_logger("critical")
@@ -63,9 +61,6 @@ class Relay(Drone):
         self.service: RelayService | None = None
         self.forwarded = 0
         self._asked: dict[tuple[str, str], float] = {}
-        self.new_ports: set[Address] = set()
-        """From which it sent tokens. Nothing listens there."""
-        self._tests = Counter[tuple[bytes, Path]]()
         self._arrived: tuple[Path, int] | None = None
         self._housekeeping_at = 0.0
 
@@ -84,7 +79,6 @@ class Relay(Drone):
             clock=lambda: self.local_now,
             perform=partial(self._world.perform, self),
             send=self._forward,
-            send_from_new_port=self._send_from_new_port,
             on_event=lambda event, now: None,
         )
         self.service = RelayService(self.node, _LIMITS, shell)
@@ -128,17 +122,6 @@ class Relay(Drone):
         self.forwarded += 1
         self._world.perform(self, [o.Transmit(datagram, path)])
 
-    def _send_from_new_port(self, datagram: bytes, path: Path) -> bool:
-        """A token goes once for each test, and where the test came from."""
-        token = token_of(datagram)
-        assert self._tests[token, path], f"{self.name} sends a token that was not asked for to {path}"
-        self._tests[token, path] -= 1
-        source = self.addresses[path.socket][0], _FIRST_NEW_PORT + len(self.new_ports)
-        self.new_ports.add(source)
-        self._world.air.endpoints[source] = Endpoint(self.name, path.socket)
-        self._world.inject(datagram, source, path.address[:2])
-        return True
-
     def on_record(self, received: o.RecordReceived) -> None:
         """Members ask for others."""
         assert self.service is not None
@@ -146,8 +129,6 @@ class Relay(Drone):
             for key in received.record.keys:
                 if (name := self.members.get(key)) is not None:
                     self._asked[received.peer.name, name] = self._world.now
-        elif isinstance(received.record, FilterTest):
-            self._tests[received.record.token, received.path] += 1
         self.service.on_record(received, self.local_now)
 
     def on_event(self, event: o.Event) -> None:
@@ -264,7 +245,7 @@ class Member(Drone):
         now = self.local_now
         assert self.node is not None
         self.links = {}
-        relays = Relays(self.node, _Sockets(self), self.links, {}, _LOG, self._entropy())  # type: ignore[arg-type]
+        relays = Relays(self.node, _Sockets(self), self.links, {}, _LOG)  # type: ignore[arg-type]
         self.relays = relays
         self.node.set_certificate(self.certificate)
         self._look()
@@ -304,11 +285,6 @@ class Member(Drone):
     def _entropy(self) -> Entropy:
         return Random(self._world.rng.randbytes(16)).randbytes
 
-    def test_filters(self) -> None:
-        """A person runs ``uavlinkd netcheck``."""
-        if self.relays is not None:
-            self.relays.filter_tests.begin(self.relays.by_name.values(), self.local_now)
-
     def absent_ends(self) -> list[int]:
         """The sockets whose networks are gone."""
         return [end.socket for end in self._world.air.absent if end.drone == self.name]
@@ -318,7 +294,6 @@ class Member(Drone):
     def datagram_for(self, datagram: bytes, path: Path) -> tuple[bytes, Address] | None:
         """Along a relayed path, data for the relay."""
         if not path.is_relayed:
-            assert not any(path.address in relay.new_ports for relay in self.uses), "a token is answered"
             return super().datagram_for(datagram, path)
         assert self.relays is not None
         wrapped = self.relays.handles.wrap(datagram, path)
@@ -327,9 +302,6 @@ class Member(Drone):
     def receive(self, datagram: bytes, path: Path) -> None:
         """Data from a relay comes along a relayed path."""
         assert self.relays is not None
-        if datagram[:1] == TOKEN_START:
-            self._receive_token(datagram, path)
-            return
         if datagram[:1] == RELAYED_START:
             taken = self.relays.handles.unwrap(path.socket, datagram, path.address)
             if isinstance(taken, DropReason):
@@ -339,16 +311,6 @@ class Member(Drone):
                 return
             datagram, path = taken
         super().receive(datagram, path)
-
-    def _receive_token(self, datagram: bytes, path: Path) -> None:
-        """It is taken only from a new port of a relay, and a NAT that filters by port lets none in."""
-        assert self.relays is not None
-        if not self.relays.filter_tests.take_token(datagram, path):
-            self.drops[DropReason.RELAY_UNEXPECTED_TOKEN] += 1
-            return
-        assert any(path.address in relay.new_ports for relay in self.uses)
-        assert path.socket not in self.nats or not self.nats[path.socket].filters_by_port
-        self.tokens_taken += 1
 
     def on_record(self, received: o.RecordReceived) -> None:
         assert self.relays is not None
@@ -404,4 +366,3 @@ class Member(Drone):
         assert len(handles._inward) == len(handles._outward)
         to_relays = len(self.uses) * len(self.addresses)
         assert len(handles._outward) <= to_relays * len(self.acquaintances) * c.HANDLES_PER_PAIR
-        assert len(self.relays.filter_tests._tests) <= to_relays

@@ -9,11 +9,10 @@ from functools import partial
 from tests.network.attackers import Flooder, Recorder
 from tests.network.drone import Drone
 from tests.network.fleet import Fleet
-from tests.network.members import Member
 from tests.network.path_misfortunes import Befalling, PathMisfortunes, random_address, random_radio
 from tests.network.relay_fleet import RelayFleet
 from uavlinkd.core import constants as c
-from uavlinkd.core.relay_records import RELAYED, token_datagram
+from uavlinkd.core.relay_records import RELAYED
 
 _FORGED = 50
 _STRANGER = ("198.51.100.66", 4000)
@@ -31,7 +30,6 @@ class RelayMisfortunes(Befalling):
             ("member roams", self._roam),
             ("data replayed", self._replay),
             ("data forged", self._forge),
-            ("netcheck, and tokens forged", self._test_filters),
         )
 
     def befall(self, until: float) -> str:
@@ -84,23 +82,6 @@ class RelayMisfortunes(Befalling):
                 case _:
                     inner[:0] = header
             self._network.inject(header + inner, source, destination)
-
-    def _test_filters(self) -> None:
-        """An attacker sends other tokens from a relay's host, and the true ones from other hosts and ports."""
-        lot, drone, relay = self._lot, self._lot.choice(self._fleet.drones), self._lot.choice(self._fleet.relays)
-        if not isinstance(drone, Member) or drone.relays is None:
-            return
-        drone.test_filters()
-        host, port = relay.addresses[0]
-        for _ in range(_FORGED):
-            token, source = lot.randbytes(c.FILTER_TOKEN_BYTES), (host, lot.randrange(2**16))
-            if drone.relays.filter_tests._tests and lot.random() < 0.5:
-                token, source = (
-                    lot.choice(list(drone.relays.filter_tests._tests)),
-                    lot.choice(((host, port), _STRANGER)),
-                )
-            socket = lot.randrange(len(drone.addresses))
-            self._network.inject(token_datagram(token), source, drone.source_for(socket, relay.addresses[0]))
 
     def _data(self) -> list[tuple[bytes, tuple[str, int], tuple[str, int]]]:
         data = [recorded for recorded in self._recorder.recorded if recorded[0][0] == RELAYED]

@@ -16,7 +16,6 @@ from tests.network.members import FEATURES, LINK, Member, Relay
 from tests.network.nat import Nat
 from tests.network.network import Network
 from tests.network.plans import Plan
-from uavlinkd.core import constants as c
 from uavlinkd.core.certificates import Certificate, MemberRole
 from uavlinkd.core.settings import Link
 
@@ -26,8 +25,6 @@ class RelayFleet(Fleet):
 
     def __init__(self, network: Network, plan: Plan, lot: Random) -> None:
         self.searches = lot.random() < 0.5
-        self.filters_known = 0
-        """Tests that showed how a NAT filters."""
         super().__init__(network, plan, lot)
         self.relays = [
             network.add_drone(Relay(network, f"r{number}", (f"192.0.2.{number + 1}", 5790), self.random_clock()))
@@ -117,17 +114,3 @@ class RelayFleet(Fleet):
             assert not self.unwanted.peer(drone).is_up
             assert isinstance(drone, Member)
             assert (drone.introductions > 0) is self.is_certified, "drones learn that it asks for them"
-        self._check_filters()
-
-    def _check_filters(self) -> None:
-        """All members test their filters. No token passes a NAT that filters by port."""
-        members = [drone for drone in self.drones if isinstance(drone, Member)]
-        for member in members:
-            member.test_filters()
-        self.network.run((c.FILTER_TRIES + 1) * c.FILTER_TRY_MOST_S)
-        for member in members:
-            assert member.relays is not None
-            assert member.relays.filter_tests.ended.is_set()
-            for result in member.relays.filter_tests.results:
-                assert not (result.passes and member.nats[result.path.socket].filters_by_port)
-                self.filters_known += result.passes is not None

@@ -1,4 +1,4 @@
-"""``uavlinkd netcheck``: what it concludes from views and tokens of relays. ``ping``: what it prints of each path."""
+"""``uavlinkd netcheck``: what it prints of each relay. ``ping``: what it prints of each path."""
 
 from __future__ import annotations
 
@@ -9,113 +9,68 @@ from typing import Any
 import pytest
 
 from tests.test_readmes import ROOT
-from uavlinkd.ops.netcheck import (
-    BLOCKED,
-    BY_TLS,
-    INTERVAL_S,
-    NO_RELAY,
-    ONE_PORT,
-    ONE_RELAY,
-    Filtered,
-    Mapped,
-    behaviours,
-    folded,
-    ping,
-    report,
-)
+from uavlinkd.ops.netcheck import INTERVAL_S, folded, ping, report
 from uavlinkd.system.error_meanings import WEB_ERRORS
 
-PRIVATE, PUBLIC, OTHER = "192.168.1.5:5790", "203.0.113.7:40001", "203.0.113.7:40002"
+RELAY = {"state": "up", "is_udp": True, "round_trip_s": 0.0234, "silent": [], "unresolved": [], "views": []}
+AT = "[2001:db8:1111:2222:3333:4444:5555:6666]:40001"
 
 
-def view(relay: str, at: str, seen_as: str, **more: Any) -> dict[str, Any]:
-    """How a relay sees a socket."""
-    return {"relay": relay, "relay_address": at, "socket": 0, "network": None, "seen_as": seen_as, **more}
-
-
-def shown(passes: bool | None, **more: Any) -> dict[str, Any]:
-    """Whether a token of a relay arrived at a socket."""
-    result = {"relay": "one", "relay_address": "a:1", "socket": 0, "network": None, "other_port_passes": passes}
-    return result | more
-
-
-def answer(*views: dict[str, Any], state: str = "up", filtering: tuple[dict[str, Any], ...] = ()) -> dict[str, Any]:
-    """A daemon's answer with these views, of the relays that they name."""
-    relays = {
-        name: {
-            "state": state,
-            "round_trip_s": 0.0234,
-            "addresses": [f"{name}.example.org:5790"],
-            "unresolved": [],
-            "is_udp": state == "up",
-            "silent": [],
-        }
-        for name in ("one", "two")
-    }
-    return {
-        "relays": relays,
-        "views": list(views),
-        "filtering": list(filtering),
-        "candidates": [PUBLIC, PRIVATE],
-        "other": "",
-        "is_udp_blocked": False,
-        "web": {},
-        "is_relay": False,
-        "own": [PRIVATE],
-    }
+def answer(**relay: Any) -> dict[str, Any]:
+    """A daemon's answer about one relay."""
+    return {"relays": {"vps": RELAY | relay}, "web": {}, "is_relay": False}
 
 
 @pytest.mark.parametrize(
-    ("seen", "mapped"),
+    ("relay", "lines"),
     [
-        ({"a:1": PRIVATE}, Mapped.NO_NAT),
-        ({"a:1": PRIVATE, "b:1": PRIVATE}, Mapped.NO_NAT),
-        ({"a:1": PUBLIC}, Mapped.UNKNOWN),
-        ({"a:1": PUBLIC, "b:1": PUBLIC}, Mapped.INDEPENDENT),
-        ({"a:1": PUBLIC, "a:2": PUBLIC}, Mapped.NOT_BY_PORT),
-        ({"a:1": PUBLIC, "a:2": PUBLIC, "b:1": PUBLIC}, Mapped.INDEPENDENT),
-        ({"a:1": PUBLIC, "b:1": OTHER}, Mapped.BY_EITHER),
-        ({"a:1": PUBLIC, "a:2": PUBLIC, "b:1": OTHER}, Mapped.BY_ADDRESS),
-        ({"a:1": PUBLIC, "a:2": OTHER}, Mapped.BY_PORT),
-        ({"[2001:db8::1]:1": PUBLIC, "[2001:db8::1]:2": OTHER}, Mapped.BY_PORT),
-        ({"[2001:db8::1]:1": PUBLIC, "[2001:db8::2]:1": OTHER}, Mapped.BY_EITHER),
+        ({}, ["UDP          vps: answers, 23 ms"]),
+        ({"round_trip_s": None}, ["UDP          vps: answers"]),
+        (
+            {"silent": ["198.51.100.2:5791"]},
+            ["UDP          vps: answers, 23 ms", "             no answer at 198.51.100.2:5791"],
+        ),
+        ({"is_udp": False}, ["UDP          vps: does not answer; it does by TLS"]),
+        (
+            {"is_udp": False, "state": "waiting", "silent": ["198.51.100.2:5790"]},
+            ["UDP          vps: does not answer", "             no answer at 198.51.100.2:5790"],
+        ),
+        (
+            {"is_udp": False, "state": "waiting", "unresolved": ["vps.example.org"]},
+            ["UDP          vps: vps.example.org has no address now: see `getent hosts vps.example.org`"],
+        ),
+        (
+            {"views": [{"seen_as": "203.0.113.7:40001", "relay_address": "198.51.100.2:5790", "network": "lte"}]},
+            [
+                "UDP          vps: answers, 23 ms",
+                "seen as      203.0.113.7:40001 by vps at 198.51.100.2:5790 on lte",
+            ],
+        ),
     ],
 )
-def test_mapping_follows_from_the_views(seen: dict[str, str], mapped: Mapped) -> None:
-    """Two ports of one relay show whether the NAT maps by port; only two hosts show whether it maps by address."""
-    views = [view("one", at, seen_as) for at, seen_as in seen.items()]
-    assert list(behaviours(answer(*views))) == [(None, mapped, Filtered.UNKNOWN)]
+def test_each_relay_has_its_lines(relay: dict[str, Any], lines: list[str]) -> None:
+    """A hint at `status` follows where something does not answer."""
+    printed = list(report(answer(**relay)))
+    assert printed[: len(lines)] == lines
+    is_complete = printed == lines
+    assert is_complete is not ("silent" in relay or not relay.get("is_udp", True))
+    assert is_complete or "`uavlinkd status`" in printed[-1]
 
 
-@pytest.mark.parametrize(
-    ("passes", "filtered"),
-    [
-        ((), Filtered.UNKNOWN),
-        ((None,), Filtered.UNKNOWN),
-        ((False, None), Filtered.BY_PORT),
-        ((True, None), Filtered.NOT_BY_PORT),
-        ((False, True), Filtered.NOT_BY_PORT),
-    ],
-)
-def test_filtering_follows_from_the_tokens(passes: tuple[bool | None, ...], filtered: Filtered) -> None:
-    """One that arrives weighs more than one that does not, which a firewall of the relay may have dropped."""
-    results = tuple(shown(one) for one in passes)
-    assert list(behaviours(answer(view("one", "a:1", PRIVATE), filtering=results))) == [
-        (None, Mapped.NO_NAT, filtered)
-    ]
+@pytest.mark.parametrize(("is_relay", "count"), [(False, 1), (True, 2)])
+def test_without_relays_it_names_what_to_do(*, is_relay: bool, count: int) -> None:
+    lines = list(report({"relays": {}, "web": {}, "is_relay": is_relay}))
+    assert "no [[relay]]" in lines[0]
+    assert len(lines) == count
 
 
-@pytest.mark.parametrize("state", ["up", "down"])
-def test_report_fits_80_columns(state: str) -> None:
-    """Addresses stay whole, folded lines begin below the text, and a sentence without a label is not indented."""
-    place = "[2001:db8:1111:2222:3333:4444:5555:6666]:40001"
-    lines = list(report(answer(view("one", place, place, network="lte"), state=state)))
+def test_report_fits_80_columns() -> None:
+    """Addresses stay whole, and folded lines begin below the text."""
+    lines = list(report(answer(views=[{"seen_as": AT, "relay_address": AT, "network": "lte"}])))
     printed = [line for text in lines for line in folded(text).splitlines()]
     assert max(map(len, printed)) <= 80
     assert " ".join(" ".join(printed).split()) == " ".join(" ".join(lines).split())
-    assert any(line.startswith(" " * 13) and place in line for line in printed) is (state == "up")
-    rest = printed[printed.index("candidates   203.0.113.7:40001, 192.168.1.5:5790") + 1 :]
-    assert not [line for line in rest if line.startswith(" ")]
+    assert any(line.startswith(" " * 13) and AT in line for line in printed)
 
 
 @pytest.mark.parametrize(
@@ -151,100 +106,6 @@ def test_reasons_by_tls_are_a_closed_list() -> None:
     rows = [line.split(" | ")[0] for line in table.partition("\n\n")[0].splitlines()]
     names = {name for row in rows for name in re.findall(r"`(\w+)`", row)}
     assert names - {"ECONNREFUSED"} == set(WEB_ERRORS)
-
-
-def silent(at: str, icmp: str = "", *, host_answers: bool = False) -> dict[str, Any]:
-    """An address of a relay without an answer."""
-    return {"address": at, "icmp": icmp, "host_answers": host_answers}
-
-
-ONE, TWO = "198.51.100.1:5790", "[2001:db8::2]:5790"
-CHECK = "`nc -zvw3 {} 22`"
-
-
-@pytest.mark.parametrize(
-    ("down", "silences", "facts", "headline", "shown", "advice"),
-    [
-        ("", {}, {}, "gets out: 2 of 2 relays answer", "one: up, 23 ms", ()),
-        (
-            *("one two", {"one": [silent(ONE)], "two": [silent(TWO)]}, {"is_udp_blocked": True}),
-            "is probably blocked here: none of 2 relays on different hosts answers",
-            *(f"one: waiting; no answer at {ONE}", (BLOCKED, CHECK.format("198.51.100.1"))),
-        ),
-        (
-            *(
-                "one two",
-                {"one": [silent(ONE, "ECONNREFUSED")], "two": [silent(TWO, "EACCES")]},
-                {},
-                "gets no answer: 0 of 2 relays answer",
-            ),
-            *(f"one: waiting; no answer at {ONE} (ICMP: no process listens there)", (NO_RELAY,)),
-        ),
-        (
-            *("one two", {"two": [silent(TWO)]}, {"other": "drone1 at 203.0.113.9:5790"}),
-            "gets out: drone1 at 203.0.113.9:5790 answers directly, no relay does",
-            *(f"two: waiting; no answer at {TWO}", (ONE_RELAY, CHECK.format("2001:db8::2"))),
-        ),
-        (
-            *(
-                "two",
-                {"one": [silent(ONE)], "two": [silent(TWO)]},
-                {},
-                "gets out: 1 of 2 relays answer; two alone does not",
-            ),
-            *(f"two: waiting; no answer at {TWO}", (ONE_RELAY, CHECK.format("2001:db8::2"))),
-        ),
-        (
-            *("", {"one": [silent(ONE, host_answers=True)]}, {}),
-            f"gets out: 2 of 2 relays answer; one port does not: {ONE}",
-            *(f"one: up, 23 ms; no answer at {ONE}", (ONE_PORT,)),
-        ),
-    ],
-)
-def test_headline_and_advice_name_the_case(
-    down: str,
-    silences: dict[str, list[dict[str, Any]]],
-    facts: dict[str, Any],
-    headline: str,
-    shown: str,
-    advice: tuple[str, ...],
-) -> None:
-    """UDP at all, the relays, one relay, one port: in the headline, and in the advice at the end."""
-    result = answer() | facts
-    for name in down.split():
-        result["relays"][name] |= {"state": "waiting", "is_udp": False}
-    for name, addresses in silences.items():
-        result["relays"][name]["silent"] = addresses
-    lines = list(report(result))
-    assert lines[0] == f"UDP          {headline}"
-    assert f"relay        {shown}" in lines
-    (last,) = [number for number, line in enumerate(lines) if line.startswith("candidates")]
-    said = " ".join(lines[last + 1 :])
-    assert all(text in said for text in advice)
-    given = [text for text in (BLOCKED, NO_RELAY, ONE_RELAY, ONE_PORT) if text in said]
-    assert len(given) == len(advice[:1])
-    assert max(len(part) for line in lines for part in folded(line).splitlines()) <= 80
-
-
-def test_relays_that_answer_by_tls_alone() -> None:
-    result = answer()
-    for relay in result["relays"].values():
-        relay["is_udp"] = False
-    lines = list(report(result))
-    assert lines[0] == "UDP          gets no answer: 0 of 2 relays answer"
-    assert "relay        one: up by TLS, 23 ms" in lines
-    assert lines[-1] == BY_TLS
-
-
-def test_a_name_without_an_address_is_no_relay_that_is_off() -> None:
-    """Its line names the cause. Advice about firewalls would contradict it."""
-    result = answer()
-    result["relays"]["one"] |= {"state": "waiting", "is_udp": False, "unresolved": ["one.example.org"]}
-    lines = list(report(result))
-    assert (
-        "relay        one: waiting; one.example.org has no address now: see `getent hosts one.example.org`" in lines
-    )
-    assert lines[-1].startswith("candidates")
 
 
 DIRECT: dict[str, Any] = {

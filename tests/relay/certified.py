@@ -119,7 +119,6 @@ class CertifiedRelay:
             clock=lambda: self.now,
             perform=self._perform,
             send=lambda datagram, path: None,
-            send_from_new_port=lambda datagram, path: True,
             on_event=lambda event, now: None,
         )
         self.service = RelayService(self.node, LIMITS, shell)

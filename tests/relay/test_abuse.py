@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tracemalloc
-from dataclasses import replace
 
 import pytest
 
@@ -15,7 +14,7 @@ from uavlinkd.core.drops import DropReason
 from uavlinkd.core.outputs import RecordReceived, Transmit
 from uavlinkd.core.path import Path, relayed
 from uavlinkd.core.path_state import PathState
-from uavlinkd.core.relay_records import Bind, Bound, Candidates, FilterTest, Record, token_datagram, wrap
+from uavlinkd.core.relay_records import Bind, Bound, Candidates, Record, wrap
 from uavlinkd.link.direct_search import DirectSearch, OwnSocket
 from uavlinkd.relay import service
 from uavlinkd.relay.service import BINDS_BURST, LOOK_S
@@ -25,7 +24,6 @@ SECONDS = 10
 VICTIM = "203.0.113.99"
 ELSEWHERE = Path(0, ("203.0.113.7", 4000))
 DATA = b"\x40datagram"
-TOKEN = bytes(range(c.FILTER_TOKEN_BYTES))
 IP_BYTES = 48
 """Of the headers of IPv6 and UDP."""
 
@@ -178,43 +176,6 @@ def test_ten_thousand_requested_bindings_take_bounded_memory(relay: FuzzedRelay)
     relay.check_bounds()
     relay.arrive(wrap(handle, DATA), HOMES[0][0])
     assert len(relay.forwarded) == 1, "another member is slowed"
-
-
-def test_captured_member_that_tests_filters_without_end_costs_few_sockets(relay: FuzzedRelay) -> None:
-    """1,000 tests a second for 20.1 s: 16 sockets, then one in 2 s. Another member has its own limit."""
-    wired_before = len(relay._wire)
-    for number in range(20_100):
-        relay.now += 0.001
-        test = sealed(relay, 2, FilterTest(number.to_bytes(c.FILTER_TOKEN_BYTES)))
-        relay.arrive(test, HOMES[2][0])
-    assert relay.tokens_sent == c.FILTER_TESTS + 20 * c.FILTER_TESTS_PER_S
-    assert relay.service.members[KEYS[3]].filter_tests_ignored == 20_100 - relay.tokens_sent
-    assert len(relay._wire) - wired_before == relay.tokens_sent
-    answers = sum(len(datagram) + IP_BYTES for datagram, _ in relay._wire[wired_before:])
-    tokens = relay.tokens_sent * (len(token_datagram(TOKEN)) + IP_BYTES)
-    assert answers + tokens <= relay.tokens_sent * (len(test) + IP_BYTES), "the tests with an effect are amplified"
-    before, one = relay.tokens_sent, relay.members[0]
-    relay.send(one, one.node.send_record(one.peer, RELAY_AT[0], FilterTest(TOKEN), relay.now))
-    assert relay.tokens_sent == before + 1
-    relay.check_bounds()
-
-
-def test_filter_test_from_an_unproven_address_sends_nothing_there(relay: FuzzedRelay) -> None:
-    """A captured member cannot name a victim: it is counted, and the victim gets no token."""
-    relay.arrive(sealed(relay, 0, FilterTest(TOKEN)), ELSEWHERE)
-    assert relay.tokens_sent == 0
-    assert relay.service.members[KEYS[1]].filter_tests_ignored == 1
-    assert not relay.service._filter_tests
-
-
-def test_token_that_cannot_be_sent_has_no_answer(relay: FuzzedRelay, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Otherwise the member would see a filter that is not there."""
-    one = relay.members[0]
-    refusing = replace(relay.service._shell, send_from_new_port=lambda datagram, path: False)
-    monkeypatch.setattr(relay.service, "_shell", refusing)
-    before = len(relay._wire)
-    relay.send(one, one.node.send_record(one.peer, RELAY_AT[0], FilterTest(TOKEN), relay.now))
-    assert len(relay._wire) == before
 
 
 def test_member_that_asks_along_another_relay_harms_no_report(relay: FuzzedRelay) -> None:

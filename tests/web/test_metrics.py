@@ -86,7 +86,7 @@ LINE: dict[str, Any] = {
     **numbered("cts_held_s", "datagrams_received", "bytes_received", "bytes_written", "reports"),
     "radio": {"remrssi": 255, "txbuf": 98, **numbered("rssi", "noise", "remnoise", "rxerrors", "fixed")},
 }
-MEMBER = numbered("bound", "waiting", "binds_ignored", "filter_tests_ignored", "datagrams", "bytes", "over_limit")
+MEMBER = numbered("bound", "waiting", "binds_ignored", "datagrams", "bytes", "over_limit")
 ENDPOINT = {
     "clients": {"127.0.0.1:14550": {}, "127.0.0.1:14551": {}},
     **numbered("frames_received", "frames_sent", "bytes_received", "bytes_sent", "garbage_bytes"),

@@ -399,16 +399,3 @@ it."""
 CANDIDATE_ROUND_S = 10.0
 CANDIDATE_ROUND_MOST_S = 60.0
 """Later rounds of one question each; the time between them doubles."""
-FILTER_TOKEN_BYTES = 16
-FILTER_TEST_BYTES = 96
-"""Of the record, so that a relay never sends more than it received: what it sends has 34 bytes, and one header of IP
-and UDP more, at most 48 bytes."""
-FILTER_TRIES = 3
-FILTER_ANSWERS = 2
-"""So many answers and no token show that something drops the tokens. A single one may be lost on its path."""
-FILTER_TRY_S = 0.3
-FILTER_TRY_MOST_S = 1.2
-"""Between the tries, and after the last one: twice the round trip, within these limits."""
-FILTER_TESTS = 16
-FILTER_TESTS_PER_S = 0.5
-"""Of one member: so many at once, then so many a second. Each costs the relay a socket."""

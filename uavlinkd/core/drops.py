@@ -61,12 +61,6 @@ class DropReason(Reason):
         Attention.EVERYDAY,
     )
 
-    RELAY_UNEXPECTED_TOKEN = (
-        "relay_unexpected_token",
-        "a token arrived that this daemon did not ask a relay for, or not from another port of that relay",
-        "with tokens that no relay was asked for",
-        Attention.EVERYDAY,
-    )
     RELAY_OVER_LIMIT = (
         "relay_over_limit",
         "a member sends more along this relay than its limit allows",

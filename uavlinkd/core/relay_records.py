@@ -14,14 +14,13 @@ from uavlinkd.core import constants as c
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.wire import CERTIFICATE_BYTES
 
-BIND, BOUND, CANDIDATES, FILTER_TEST, FILTER_TESTED = 1, 2, 3, 4, 5
+BIND, BOUND, CANDIDATES = 1, 2, 3
 HAVE, BULLETIN, CERTIFICATE, WHO = 6, 7, 8, 9
 WAITING = 0
 """The handle of a peer that cannot be reached through the relay now."""
 _BOUND_HEADER = struct.Struct(">B16sH")
 _PLACE = struct.Struct(">16sH")
 _ENTRY = struct.Struct(f">{c.KEY_BYTES}sH")
-_TOKEN_END = 1 + c.FILTER_TOKEN_BYTES
 _HAVE = struct.Struct(">BI4sII")
 _WHO = struct.Struct(">BBI")
 _CERTIFIED_BYTES = 1 + c.KEY_BYTES + CERTIFICATE_BYTES
@@ -59,27 +58,6 @@ class Candidates(NamedTuple):
 
     def encode(self) -> bytes:
         return bytes((CANDIDATES,)) + b"".join(_PLACE.pack(_packed(host), port) for host, port in self.places)
-
-
-class FilterTest(NamedTuple):
-    """A member asks for the token from another port of the relay: whether a NAT or a firewall lets it in.
-
-    It is longer than the token and the answer together, with their IP headers.
-    """
-
-    token: bytes
-
-    def encode(self) -> bytes:
-        return (bytes((FILTER_TEST,)) + self.token).ljust(c.FILTER_TEST_BYTES, b"\0")
-
-
-class FilterTested(NamedTuple):
-    """The relay sent the token from another port, to the address that this record goes to."""
-
-    token: bytes
-
-    def encode(self) -> bytes:
-        return bytes((FILTER_TESTED,)) + self.token
 
 
 class Have(NamedTuple):
@@ -128,7 +106,7 @@ class Who(NamedTuple):
 
 FleetRecord = Have | BulletinRecord | CertificateRecord | Who
 """Valid on sessions of two ends with :data:`c.FEATURE_FLEET` only."""
-Record = Bind | Bound | Candidates | FilterTest | FilterTested | FleetRecord
+Record = Bind | Bound | Candidates | FleetRecord
 
 
 def _packed(host: str) -> bytes:
@@ -160,10 +138,6 @@ def parse_record(data: bytes) -> Record:
         if not rest and 1 <= count <= c.CANDIDATES:
             places: Iterator[tuple[bytes, int]] = _PLACE.iter_unpack(data[1:])
             return Candidates(tuple((_host_of(packed), port) for packed, port in places))
-    elif kind == FILTER_TEST and size == c.FILTER_TEST_BYTES and not any(data[_TOKEN_END:]):
-        return FilterTest(data[1:_TOKEN_END])
-    elif kind == FILTER_TESTED and size == _TOKEN_END:
-        return FilterTested(data[1:])
     elif kind == HAVE and size == _HAVE.size:
         return Have(*_HAVE.unpack(data)[1:])
     elif kind == BULLETIN and size > 1:  # its own parser checks it
@@ -211,18 +185,3 @@ def handle_of(data: bytes) -> int:
     """The handle of data that begins with 0x50; 0, which is never a handle, if it is malformed."""
     is_valid = len(data) > _RELAYED_HEADER.size and data[_RELAYED_HEADER.size] in INNER_STARTS
     return int.from_bytes(data[1:3], "big") if is_valid else 0
-
-
-# A token from another port of a relay. Section 22.
-
-TOKEN = 0x51
-
-
-def token_datagram(token: bytes) -> bytes:
-    """What a relay sends from another port."""
-    return bytes((TOKEN,)) + token
-
-
-def token_of(data: bytes) -> bytes:
-    """The token in a datagram that begins with 0x51; empty, which is never a token, if the length is wrong."""
-    return data[1:] if len(data) == _TOKEN_END else b""

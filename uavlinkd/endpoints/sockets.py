@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple
 
 import structlog
 
-from uavlinkd.endpoints.wildcard import WildcardSocket, sibling
+from uavlinkd.endpoints.wildcard import WildcardSocket
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.error_meanings import ADDRESS_NOT_HERE_YET, meaning_of
 from uavlinkd.system.interfaces import find_interface
@@ -70,20 +70,6 @@ def udp_socket(address: Address, *, may_come_later: bool = False) -> socket.sock
         _enlarge(sock)
         bind(sock, sockaddr, may_come_later=may_come_later)
     return sock
-
-
-def send_from_new_port(sock: socket.socket, datagram: bytes, target: tuple[Any, ...]) -> None:
-    """Send a datagram from the address and interface of a socket, but from an ephemeral port that is closed at once.
-
-    Raises OSError: the kernel's error.
-    """
-    host, _, *rest = sock.getsockname()
-    if isinstance(target[-1], str):  # the own address that was asked
-        host, target = target[-1], target[:-1]
-    with sibling(sock) as other:
-        other.setblocking(False)
-        other.bind((host, 0, *rest))
-        other.sendto(datagram, target)
 
 
 def _enlarge(sock: socket.socket) -> None:

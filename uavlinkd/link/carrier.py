@@ -17,7 +17,7 @@ from uavlinkd.core.drops import DropReason
 from uavlinkd.core.node import PEERS_AT_ONCE
 from uavlinkd.core.outputs import Deliver, Output, Transmit
 from uavlinkd.core.path import Path, SocketAddress
-from uavlinkd.core.relay_records import Bind, FilterTest, FleetRecord
+from uavlinkd.core.relay_records import Bind, FleetRecord
 from uavlinkd.core.timers import Schedule
 from uavlinkd.core.wire import ENVELOPE_STARTS
 from uavlinkd.endpoints.reader import Datagrams
@@ -26,7 +26,6 @@ from uavlinkd.link.parts import DaemonParts
 from uavlinkd.link.peer_link import Carriage, PeerLink
 from uavlinkd.link.peers import Peers
 from uavlinkd.link.relay_link import RELAYED_START, WaitingDatagram
-from uavlinkd.link.relays import TOKEN_START
 from uavlinkd.link.turns import Turns, cost_of
 from uavlinkd.mavlink.frames import Frame, parse_frames, pass_faults
 from uavlinkd.system.clock import monotonic
@@ -46,7 +45,6 @@ which is far below a radio's delay. It is CPU time: by the wall clock each turn 
 other processes use the processor."""
 TURN_FRAMES: Final = 300
 """Frames that end a turn too, by :func:`cost_of`: the delivery of a frame costs as much as reading it."""
-_OF_RELAYS: Final = frozenset({RELAYED_START, TOKEN_START})
 
 
 class FrameCarrier:
@@ -81,7 +79,7 @@ class FrameCarrier:
         paths = self._paths
         arrived: list[WaitingDatagram] = []
         for datagram, address in datagrams:
-            if datagram[:1] in _OF_RELAYS:
+            if datagram[:1] == RELAYED_START:
                 try:
                     self._unwrap(socket, datagram, address, arrived)
                 except Exception as error:
@@ -109,21 +107,16 @@ class FrameCarrier:
     def _unwrap(self, socket: int, data: bytes, source: SocketAddress, arrived: list[WaitingDatagram]) -> None:
         """Add the datagram inside one of a relay or a member, with its path, unless it is handled or dropped here."""
         relays, relay = self._parts.relays, self._parts.relay
-        is_data = data[:1] == RELAYED_START
-        inside = self._sockets.handles.unwrap(socket, data, source) if is_data and relays.by_name else None
+        inside = self._sockets.handles.unwrap(socket, data, source) if relays.by_name else None
         if isinstance(inside, tuple):
             arrived.append(inside)
-        elif is_data and relay is not None:
+        elif relay is not None:
             relay.forwarding.take(socket, data, source)
-        elif is_data and inside is not None:
+        elif inside is not None:
             self._drop_datagram(inside, path=(path := Path(socket, source)))
             if inside is DropReason.RELAY_UNKNOWN_HANDLE:
                 relays.on_unknown_handle(path, monotonic())
                 self.arm()
-        elif not is_data and relays.by_name:
-            if not relays.filter_tests.take_token(data, path := Path(socket, source)):
-                self._drop_datagram(DropReason.RELAY_UNEXPECTED_TOKEN, path=path)
-            self.arm()
         else:
             arrived.append((data, Path(socket, source)))  # the core drops it: this daemon has no relay
 
@@ -309,7 +302,7 @@ class FrameCarrier:
         if isinstance(received.record, FleetRecord):
             reason = DropReason.UNEXPECTED_RECORD if fleet is None else fleet.on_record(received, monotonic())
             self.arm()
-        elif not isinstance(received.record, Bind | FilterTest):
+        elif not isinstance(received.record, Bind):
             reason = self._parts.relays.on_record(received, monotonic())
             self.arm()
         elif relay is None:

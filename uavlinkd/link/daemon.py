@@ -13,15 +13,14 @@ import structlog
 from uavlinkd.config.changes import compare
 from uavlinkd.config.load import load_in_thread
 from uavlinkd.config.model import Config, ConfigError, Problem
-from uavlinkd.core.path import Path
 from uavlinkd.endpoints.sockets import BindError
 from uavlinkd.link.carrier import FrameCarrier
 from uavlinkd.link.diagnosis import find
-from uavlinkd.link.facts import Moment
 from uavlinkd.link.local_endpoints import PilotNotes
 from uavlinkd.link.own_problems import own_codes
 from uavlinkd.link.parts import DaemonParts
 from uavlinkd.link.peer_link import radio_figures
+from uavlinkd.link.relay_link import RelayLink
 from uavlinkd.link.status import daemon_status, overview, paths_status, state_of
 from uavlinkd.link.traffic_problems import has_no_client
 from uavlinkd.mavlink.own_frames import INTERVAL_S
@@ -29,7 +28,6 @@ from uavlinkd.ops import LOG_SCHEMA
 from uavlinkd.ops.control import ControlServer
 from uavlinkd.ops.log import shown
 from uavlinkd.ops.sdnotify import Supervisor
-from uavlinkd.system.addresses import Address
 from uavlinkd.system.base64_text import to_base64
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.guard import report, run
@@ -164,12 +162,7 @@ class Daemon:
                     return {"problems": str(error).splitlines()}
                 return {"problems": [], "name": parts.config.name}
             case ("netcheck", "", ""):
-                tests = parts.relays.filter_tests
-                tests.begin(parts.relays.by_name.values(), monotonic())
-                self.carrier.arm()
-                web = await parts.peer_sockets.web.probe()
-                await tests.ended.wait()
-                return {**netcheck(parts, monotonic()), "web": web}
+                return {**netcheck(parts), "web": await parts.peer_sockets.web.probe()}
             case ("bulletin", "", "") if parts.fleet is not None:
                 return {"bulletin": to_base64(parts.fleet.trust.bulletin_bytes)}
             case ("fleet", "", "") if parts.fleet is not None:
@@ -306,49 +299,29 @@ def ping(parts: DaemonParts, carrier: FrameCarrier, name: str, now: float) -> di
     return {"paths": paths}
 
 
-def netcheck(parts: DaemonParts, now: float) -> dict[str, object]:
-    """How each relay sees each socket, what the last filter tests showed, and the candidates of this daemon.
-
-    ``silent``: the addresses of a relay without an answer, each with the error that ICMP messages report, and whether
-    another port of that host answers. ``other``: a peer that answers directly, as near as the silent relays.
-    """
-    relays, sockets, moment = parts.relays, parts.peer_sockets, Moment(parts, now)
-    own, candidates = relays.places()
-
-    def along(relay: str, path: Path, **facts: object) -> dict[str, object]:
-        address, network = str(Address.of(path.address)), sockets.network_name(path.socket)
-        return {"relay": relay, "relay_address": address, "socket": path.socket, "network": network, **facts}
-
+def netcheck(parts: DaemonParts) -> dict[str, object]:
+    """Which addresses of each relay answer, and this daemon's public addresses as the relays see them."""
     return {
-        "relays": {
-            name: {
-                "state": state_of(relay.peer),
-                "is_udp": bool(moment.working(relay)),
-                "round_trip_s": relay.peer.round_trip_s,
-                "addresses": [str(written) for written in relay.config.addresses],
-                "unresolved": sorted(sockets.unresolved(relay.name if relay.link is None else relay.link.name)),
-                "silent": [
-                    {
-                        "address": shown(path.address),
-                        "icmp": moment.reported_at(path),
-                        "host_answers": path.host in moment.answering,
-                    }
-                    for path in moment.silent_paths(relay)
-                ],
-            }
-            for name, relay in relays.by_name.items()
-        },
-        "views": [
-            along(name, path, seen_as=str(seen))
-            for name, relay in relays.by_name.items()
-            for path, seen in relay.views()
-        ],
-        "filtering": [
-            along(test.relay, test.path, other_port_passes=test.passes) for test in relays.filter_tests.results
-        ],
-        "candidates": [str(Address(*place)) for place in candidates],
-        "other": moment.beside_relays,
-        "is_udp_blocked": moment.is_udp_blocked,
+        "relays": {name: _reach(parts, relay) for name, relay in parts.relays.by_name.items()},
         "is_relay": parts.relay is not None,
-        "own": [str(Address(*place)) for place in own],
+    }
+
+
+def _reach(parts: DaemonParts, relay: RelayLink) -> dict[str, object]:
+    states = [state for state in relay.peer.paths.states if state.path.is_udp]
+    answering = [state for state in states if relay.peer.is_up and state.works and state.is_validated]
+    return {
+        "state": state_of(relay.peer),
+        "is_udp": bool(answering),
+        "round_trip_s": relay.peer.round_trip_s,
+        "silent": [shown(state.path.address) for state in states if state.is_configured and state not in answering],
+        "unresolved": sorted(parts.peer_sockets.unresolved(relay.name if relay.link is None else relay.link.name)),
+        "views": [
+            {
+                "seen_as": str(seen_as),
+                "relay_address": shown(path.address),
+                "network": parts.peer_sockets.network_name(path.socket),
+            }
+            for path, seen_as in relay.views()
+        ],
     }

@@ -79,7 +79,6 @@ class DaemonParts:
                 clock=monotonic,
                 perform=perform,
                 send=sockets.send,
-                send_from_new_port=sockets.send_from_new_port,
                 on_event=self.events.write,
             )
             self.relay = RelayService(node, config.relay_server.limits, shell)

@@ -26,7 +26,6 @@ from uavlinkd.endpoints.sockets import (
     is_absent,
     is_here,
     send_again,
-    send_from_new_port,
     udp_socket,
 )
 from uavlinkd.link.drop_summary import DropSummary, ShellReason
@@ -330,18 +329,6 @@ class PeerSockets:
         if (budget := self.budgets.get(number)) is not None:
             budget.charge(datagram, path, monotonic())
         self.send(datagram, path)
-
-    def send_from_new_port(self, datagram: bytes, path: Path) -> bool:
-        """Send a datagram along a path, but from another port. Returns whether the kernel accepted it."""
-        sock = self._slots[path.socket].sock
-        if sock is None:
-            return False
-        try:
-            send_from_new_port(sock, datagram, path.address)
-        except OSError as error:
-            self._count_failure(error, path.address)
-            return False
-        return True
 
     def on_send_error(self, number: int, datagram: bytes, address: SocketAddress, error: OSError) -> None:
         """A datagram could not be sent. Send it again if the error is about an earlier one; count any other."""

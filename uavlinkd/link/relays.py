@@ -2,27 +2,20 @@
 
 from __future__ import annotations
 
-import asyncio
-import os
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from itertools import zip_longest
 from typing import Final
 
 from structlog.typing import FilteringBoundLogger
 
 from uavlinkd.config.model import RelayConfig
-from uavlinkd.core import constants as c
 from uavlinkd.core import outputs as o
 from uavlinkd.core.constants import NEVER
-from uavlinkd.core.crypto import Entropy
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import LinkedPeer, Output, RecordReceived
+from uavlinkd.core.outputs import LinkedPeer, Output
 from uavlinkd.core.path import RELAY_HOST, Path
-from uavlinkd.core.path_state import PathState
-from uavlinkd.core.peer import Peer
-from uavlinkd.core.relay_records import TOKEN, Candidates, FilterTest, FilterTested, token_of
+from uavlinkd.core.relay_records import Candidates
 from uavlinkd.link.conditions import LineLimits
 from uavlinkd.link.direct_search import DirectSearch, OwnSocket, Place, own_sockets, places_of
 from uavlinkd.link.peer_link import PeerLink
@@ -39,7 +32,6 @@ relay is asked again after each such time: a peer that wants to send cannot wake
 STEADY: Final = 4
 LOOK_S: Final = 5.0
 """How often the addresses and routes of this machine are read, while a peer is reached along a relay."""
-TOKEN_START: Final = bytes((TOKEN,))
 
 
 class _Silence:
@@ -69,120 +61,6 @@ class _Silence:
         return True
 
 
-@dataclass(slots=True, eq=False)
-class PathTest:
-    """Of one path to a relay. It has one token."""
-
-    relay: str
-    """Its name."""
-    peer: Peer
-    path: Path
-    try_s: float
-    next_at: float
-    """When the next try is due, or the test ends; infinity after its end."""
-    tries: int = 0
-    answers: int = 0
-    has_passed: bool = False
-
-    @property
-    def passes(self) -> bool | None:
-        """Whether a token from another port arrived; None if neither it nor enough answers did."""
-        return True if self.has_passed else False if self.answers >= c.FILTER_ANSWERS else None
-
-
-class FilterTests:
-    """Tests of one daemon, all at the same time, when a person asks. Times are monotonic seconds.
-
-    Look at :attr:`next_at` after each call.
-    """
-
-    def __init__(self, node: Node, entropy: Entropy) -> None:
-        self._node = node
-        self._entropy = entropy
-        self._tests: dict[bytes, PathTest] = {}  # by token; empty while none run
-        self.results: tuple[PathTest, ...] = ()
-        """Of the last tests that ended."""
-        self.ended = asyncio.Event()
-        """Set while no tests run."""
-        self.ended.set()
-
-    @property
-    def next_at(self) -> float:
-        """When :meth:`do_due` has something to do."""
-        return min((test.next_at for test in self._tests.values()), default=NEVER)
-
-    def begin(self, relays: Iterable[RelayLink], now: float) -> None:
-        """Test the best path from each socket to each relay that is up. Tests that run are not disturbed."""
-        if self._tests:
-            return
-        for relay in relays:
-            for state in _best_paths(relay.peer):
-                token = self._entropy(c.FILTER_TOKEN_BYTES)
-                try_s = min(max(c.FILTER_TRY_S, 2 * (state.srtt_s or 0.0)), c.FILTER_TRY_MOST_S)
-                self._tests[token] = PathTest(relay.config.name, relay.peer, state.path, try_s, now)
-        self.results = ()
-        if self._tests:
-            self.ended.clear()
-
-    def do_due(self, now: float) -> list[Output]:
-        """Ask relays for tokens, and end the tests. Call it at :attr:`next_at`."""
-        out: list[Output] = []
-        for token, test in self._tests.items():
-            if now < test.next_at:
-                continue
-            if test.has_passed or test.tries == c.FILTER_TRIES:
-                test.next_at = NEVER
-                continue
-            test.tries += 1
-            test.next_at = now + test.try_s
-            out += self._node.send_record(test.peer, test.path, FilterTest(token), now)
-        if self._tests and self.next_at == NEVER:
-            self.results = tuple(self._tests.values())
-            self._tests.clear()
-            self.ended.set()
-        return out
-
-    def on_record(self, received: RecordReceived) -> DropReason | None:
-        """A relay sent a token from another port. Returns why its record has no effect; None if it has one."""
-        test = self._tests.get(received.record.token) if isinstance(received.record, FilterTested) else None
-        if test is None or received.peer is not test.peer or received.path != test.path:
-            return DropReason.UNEXPECTED_RECORD
-        test.answers += 1
-        self._look(test)
-        return None
-
-    def take_token(self, data: bytes, path: Path) -> bool:
-        """Note a datagram that begins with :data:`TOKEN_START`. Returns False if it is to be dropped.
-
-        From a port to which there is a path it shows nothing: a NAT lets it in because this daemon sent there.
-        """
-        test = self._tests.get(token_of(data))
-        if test is None or (path.socket, path.host) != (test.path.socket, test.path.host):
-            return False
-        if any(peer.paths.find(path) is not None for peer in self._node.peers.values()):
-            return False
-        test.has_passed = True
-        self._look(test)
-        return True
-
-    def _look(self, test: PathTest) -> None:
-        """End a test early whose token arrived, with all answers: these are not to come after its end."""
-        if test.has_passed and test.answers >= test.tries:
-            test.next_at = -NEVER
-
-
-def _best_paths(relay: Peer) -> Iterator[PathState]:
-    """The working path with the lowest round trip from each socket to a relay that is up."""
-    best: dict[int, PathState] = {}
-    for state in relay.paths.states if relay.is_up else ():
-        path = state.path
-        if state.works and path.is_udp:
-            before = best.get(path.socket)
-            if before is None or (state.srtt_s or NEVER) < (before.srtt_s or NEVER):
-                best[path.socket] = state
-    yield from best.values()
-
-
 class Relays:
     """All relays, ``by_name``. Look at :attr:`next_at` after each call."""
 
@@ -193,7 +71,6 @@ class Relays:
         links: Mapping[str, PeerLink],
         by_name: dict[str, RelayLink],
         log: FilteringBoundLogger,
-        entropy: Entropy = os.urandom,
     ) -> None:
         self.by_name = by_name
         self.handles = sockets.handles
@@ -208,18 +85,16 @@ class Relays:
         # Also of peers without a handle now. A relay must not reset limits and orders by ending handles.
         self._looked_at = -NEVER
         self._own: list[OwnSocket] = []
-        self.filter_tests = FilterTests(node, entropy)
 
     @property
     def next_at(self) -> float:
         """When :meth:`handle_timeout` has something to do."""
-        return min(self._look_at, *(part.next_at for part in self._parts()))
+        return min((self._look_at, *(part.next_at for part in self._parts())))
 
-    def _parts(self) -> Iterator[RelayLink | DirectSearch | FilterTests]:
+    def _parts(self) -> Iterator[RelayLink | DirectSearch]:
         """All that has times of its own."""
         yield from self.by_name.values()
         yield from self._searches.values()
-        yield self.filter_tests
 
     # The configuration.
 
@@ -256,13 +131,6 @@ class Relays:
     def _of_peer(self, peer: LinkedPeer) -> RelayLink | None:
         return next((relay for relay in self.by_name.values() if relay.peer is peer), None)
 
-    # Facts.
-
-    def places(self) -> tuple[list[Place], tuple[Place, ...]]:
-        """Addresses and ports of the own sockets in their own networks, and where peers may reach this daemon."""
-        sockets = own_sockets(self._sockets)
-        return [place for sock in sockets for place in sock.places], places_of(self._seen(), sockets)
-
     # Time and events.
 
     def handle_timeout(self, now: float) -> list[Output]:
@@ -274,7 +142,7 @@ class Relays:
             if now >= part.next_at:
                 try:
                     out += part.do_due(now)
-                except Exception as error:  # of one relay, search or test
+                except Exception as error:  # of one relay or search
                     report(error)
         return out
 
@@ -310,8 +178,6 @@ class Relays:
 
     def on_record(self, received: o.RecordReceived, now: float) -> DropReason | None:
         """A relay's record, or candidates of a peer. Returns why it has no effect; None if it has one."""
-        if isinstance(received.record, FilterTested):
-            return self.filter_tests.on_record(received)
         is_search = isinstance(received.record, Candidates)
         owner = self._searches.get(received.peer) if is_search else self._of_peer(received.peer)
         return DropReason.UNEXPECTED_RECORD if owner is None else owner.on_record(received, now)

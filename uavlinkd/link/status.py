@@ -316,7 +316,6 @@ def _member_status(relay: RelayService, member: RelayMember, now: float) -> dict
         "bound": bound,
         "waiting": waiting,
         "binds_ignored": member.binds_ignored + relay.bindings.refused(member.key),
-        "filter_tests_ignored": member.filter_tests_ignored,
         "datagrams": meter.datagrams,
         "bytes": meter.bytes,
         "over_limit": meter.over_limit,

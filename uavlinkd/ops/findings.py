@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 from uavlinkd.core.drops import Reason
 
 IS_REACHABLE: Final = "`nc -zvw3 {} 22` shows whether the host is reachable by TCP: connected and refused mean yes"
-"""A remedy beside a silent relay, of ``status`` and ``netcheck``."""
+"""A remedy beside a silent relay."""
 
 
 def titled(kind: str, name: str) -> str:

@@ -19,7 +19,7 @@ from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import LinkedPeer, Output
 from uavlinkd.core.path import Path
 from uavlinkd.core.peer import Peer
-from uavlinkd.core.relay_records import Bind, FilterTest, FilterTested, Who, bounds_of, token_datagram
+from uavlinkd.core.relay_records import Bind, Who, bounds_of
 from uavlinkd.relay.bindings import Bindings, Changes
 from uavlinkd.relay.forwarding import Forwarding, MemberSettings, Meter, RelayLimits, RelayReason
 from uavlinkd.relay.introductions import Introductions
@@ -42,9 +42,6 @@ class RelayMember:
         self.meter = Meter(settings.limits)
         self.binds = TokenBucket(BINDS_PER_S, BINDS_BURST, now)
         self.binds_ignored = 0  # binds above `BINDS_PER_S`
-        self.filter_tests = TokenBucket(c.FILTER_TESTS_PER_S, c.FILTER_TESTS, now)
-        self.filter_tests_ignored = 0
-        """Filter tests above this limit, or along a path that is not validated or does not work."""
         self.since = now  # when it was up or not for the first time, as it is now
         self.reported_over_limit = 0  # of the meter's count
 
@@ -71,8 +68,6 @@ class RelayShell:
     clock: Callable[[], float]  # monotonic
     perform: Callable[[list[Output]], None]  # executes outputs of the core
     send: Callable[[bytes, Path], None]  # passes a datagram to the kernel
-    send_from_new_port: Callable[[bytes, Path], bool]
-    """Does so from a port that sent nothing before, and returns whether the kernel accepted it."""
     on_event: Callable[[o.Event, float], None]  # receives the events of the members that are not peers
 
 
@@ -91,7 +86,6 @@ class RelayService:
         self._asked: dict[bytes, dict[Path, _Asked]] = {}
         self._look_at = 0.0
         self._unchecked: list[bytes] = []  # keys of members whose paths are to be looked at
-        self._filter_tests: list[tuple[Peer, Path, bytes]] = []  # tokens to be sent
         self._questions: list[tuple[RelayMember, Path, Who]] = []
         self._reported = Counter[Reason]()
         self._unreported: list[tuple[Reason, str, int]] = []  # drops of removed members, and of binds that waited
@@ -198,13 +192,7 @@ class RelayService:
             return self._receive_bind(member, path, record, now, is_proven=is_proven)
         if isinstance(record, Who):
             return self._receive_question(member, path, record, now, is_proven=is_proven)
-        if not isinstance(record, FilterTest):
-            return DropReason.UNEXPECTED_RECORD
-        if is_proven and member.filter_tests.take(now):
-            self._filter_tests.append((member.peer, path, record.token))
-            return None
-        member.filter_tests_ignored += 1
-        return DropReason.RECORD_OVER_LIMIT if is_proven else DropReason.UNEXPECTED_RECORD
+        return DropReason.UNEXPECTED_RECORD
 
     def _receive_bind(
         self, member: RelayMember, path: Path, bind: Bind, now: float, *, is_proven: bool
@@ -255,12 +243,10 @@ class RelayService:
     @property
     def is_due(self) -> bool:
         """Whether :meth:`settle` may have something to do."""
-        return bool(self._due or self._asked or self._filter_tests or self._questions or self.introductions.is_due)
+        return bool(self._due or self._asked or self._questions or self.introductions.is_due)
 
     def settle(self, now: float) -> None:
-        """Bind along paths that are validated now, report changes to the members, and send what tests filters, and
-        certificates.
-        """
+        """Bind along paths that are validated now, and send the members changes and certificates."""
         if self._asked and now >= self._look_at:
             self._look_at = now + LOOK_S
             self._bind_validated(now)
@@ -272,10 +258,6 @@ class RelayService:
             host, port = path.address[:2]
             for bound in bounds_of(host.partition("%")[0], port, handles):
                 self._shell.perform(self._node.send_record(member.peer, path, bound, now))
-        tests, self._filter_tests = self._filter_tests, []
-        for peer, path, token in tests:
-            if self._shell.send_from_new_port(token_datagram(token), path):
-                self._shell.perform(self._node.send_record(peer, path, FilterTested(token), now))
         questions, self._questions = self._questions, []
         for member, path, who in questions:
             if self.members.get(member.key) is not member:

@@ -374,7 +374,6 @@ relay replays after a member's restart | replay-data,when=restart,rate_per_s=300
 relay lies about addresses | relay-lie,rate_per_s=100 | is_silent
 relay invents handles | relay-invent | least_s=3 needs=relay_unknown_handle,relay_malformed
 relay sends frames of its own | relay-frames,rate_per_s=100 | needs=frames_not_allowed
-relay lies about filters | relay-filter,rate_per_s=100 | needs=relay_unexpected_token
 relay binds the wrong members | relay-bind-wrong,rate_per_s=100 | least_s=5 needs=unknown_index
 relay restarts, then replays | relay-restart | least_s=6
 """,

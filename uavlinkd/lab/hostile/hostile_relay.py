@@ -26,17 +26,14 @@ from uavlinkd.core.relay_records import (
     RELAYED,
     Bound,
     CertificateRecord,
-    FilterTested,
     Record,
     bounds_of,
-    token_datagram,
-    token_of,
     wrap,
 )
 from uavlinkd.endpoints.reader import RECEIVE_BYTES
-from uavlinkd.endpoints.sockets import send_from_new_port, udp_socket
+from uavlinkd.endpoints.sockets import udp_socket
 from uavlinkd.lab.hostile.hostile_fleet import HostileFleet, HostileMembership
-from uavlinkd.lab.hostile.relay_attacks import ALL_ATTACKS, Lie, LieAboutFilters, RelayAttack, RelayContext, Withhold
+from uavlinkd.lab.hostile.relay_attacks import ALL_ATTACKS, Lie, RelayAttack, RelayContext, Withhold
 from uavlinkd.lab.mitm.attack import Action, AttackContext, AttackObject, Direction, Intervention
 from uavlinkd.lab.mitm.attack_service import ChannelService, RunSettings
 from uavlinkd.lab.mitm.attacks import AttackSpec
@@ -173,7 +170,6 @@ class HostileRelay(ChannelService):
             clock=monotonic,
             perform=self._perform,
             send=self._forward,
-            send_from_new_port=self._send_from_new_port,
             on_event=lambda event, at: None,
         )
         self._service = RelayService(self._node, self.settings.server.limits, shell)
@@ -243,12 +239,6 @@ class HostileRelay(ChannelService):
 
     def send_frames(self, member: str, frame: bytes) -> None:
         self._perform(self._node.send(self._peer(member), [frame], monotonic()))
-
-    def claim_token(self, member: str, token: bytes) -> None:
-        peer = self._peer(member)
-        for path in (state.path for state in peer.paths.states if state.works):
-            self._send(token_datagram(token), path)
-            self._perform(self._node.send_record(peer, path, FilterTested(token), monotonic()))
 
     def restart(self) -> None:
         now = monotonic()
@@ -335,18 +325,6 @@ class HostileRelay(ChannelService):
     def _send(self, data: bytes, path: Path) -> None:
         with suppress(OSError):
             self._sockets[path.socket].sendto(data, path.address)
-
-    def _send_from_new_port(self, data: bytes, path: Path) -> bool:
-        """Returns False if an attack has answered the member."""
-        now = monotonic()
-        members = self._service.members.values()
-        name = next(member.settings.name for member in members if member.peer.paths.find(path) is not None)
-        for attack in self.channel.attacks:
-            if isinstance(attack, LieAboutFilters) and attack.hides(name, token_of(data), now):
-                return False
-        with suppress(OSError):
-            send_from_new_port(self._sockets[path.socket], data, path.address)
-        return True
 
     # Time.
 

@@ -61,9 +61,6 @@ class AttackedRelay(Protocol):
     def send_frames(self, member: str, frame: bytes) -> None:
         """Send a frame in the relay's session with a member."""
 
-    def claim_token(self, member: str, token: bytes) -> None:
-        """Report to a member that a token was sent from another port, and send it from the relay's own one."""
-
     @property
     def certificates(self) -> list[CertificateRecord]:
         """All certificates that it knows."""
@@ -175,26 +172,6 @@ class SendOwnFrames(RelayAttack, name="relay-frames", rate_per_s=20.0):
         return []
 
 
-class LieAboutFilters(RelayAttack, name="relay-filter", rate_per_s=20.0):
-    """Claims to send tokens from other ports, and sends them from its own, which the NAT of the member lets in."""
-
-    def hides(self, member: str, token: bytes, now: float) -> bool:
-        """Whether the relay sends nothing from another port for a test of this member, but says that it did."""
-        if not (member in self.members and self.is_on(now) and self.should_attack()):
-            return False
-        self.relay.claim_token(member, token)
-        self.record(Operation.ALTERED, member, len(token), now, "from the relay's own port")
-        return True
-
-    def send_next(self, now: float) -> list[Action]:
-        for member in self.members:
-            if self.should_attack():
-                token = self.rng.randbytes(c.FILTER_TOKEN_BYTES)
-                self.relay.claim_token(member, token)
-                self.record(Operation.INJECTED, member, len(token), now, "invented token")
-        return []
-
-
 class RestartAndReplay(RelayAttack, name="relay-restart", rate_per_s=0.4):
     """Forgets everything, and sends what it recorded before along the handles that it assigns afterwards.
 
@@ -284,7 +261,7 @@ class Introduce(RelayAttack, name="relay-introduce", rate_per_s=20.0, lie="bytes
 
 
 _ALL: tuple[type[RelayAttack], ...] = (
-    *(LieAboutAddresses, BindWrongMembers, InventHandles, SendOwnFrames, LieAboutFilters, RestartAndReplay),
+    *(LieAboutAddresses, BindWrongMembers, InventHandles, SendOwnFrames, RestartAndReplay),
     *(Withhold, Introduce),
 )
 RELAY_ATTACKS: Final[Mapping[str, type[RelayAttack]]] = MappingProxyType({one.name: one for one in _ALL})
