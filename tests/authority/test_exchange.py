@@ -86,20 +86,18 @@ def test_equal_ends() -> None:
 
 
 def test_session_that_replaces_another_one() -> None:
-    """It tells nothing. A peer that was restarted states what it has, and is answered; then both are silent."""
-    daemon = Daemon(NEW)
+    """Each end states what it has, once. A peer that was restarted with an older disk gets what it lacks."""
+    daemon, stated = Daemon(NEW), Have(6, digest_of(NEW), 10, 20)
     daemon.up()
     daemon.receive(have(NEW))
     daemon.exchange.on_handshake(PEER, NOW + 120)
-    assert daemon.hour(NOW + 120) == []
-    daemon.receive(have(OLD), NOW + 130)
-    assert daemon.due(NOW + 130) == [(PEER, BulletinRecord(NEW)), (PEER, Have(6, digest_of(NEW), 10, 20))]
+    daemon.receive(have(NEW), NOW + 120)
+    assert daemon.hour(NOW + 120) == [(0, PEER, stated)]
+    daemon.exchange.on_handshake(PEER, NOW + 130)
+    assert daemon.receive(have(OLD), NOW + 130).event == ROLLED_BACK
+    assert daemon.due(NOW + 130) == [(PEER, BulletinRecord(NEW)), (PEER, stated)]
     daemon.receive(have(NEW), NOW + 130.2)
     assert daemon.hour(NOW + 131) == []
-    daemon.exchange.on_handshake(PEER, NOW + 240)
-    daemon.exchange.on_down(PEER)
-    daemon.exchange.on_handshake(PEER, NOW + 250)
-    assert daemon.due(NOW + 250) == [(PEER, Have(6, digest_of(NEW), 10, 20))]
 
 
 def test_peer_that_states_nothing() -> None:
@@ -119,7 +117,10 @@ def test_peer_with_an_older_bulletin() -> None:
     assert {item[1:] for item in sent} == {(PEER, BulletinRecord(NEW))}
     assert [at for at, *_ in sent][: c.PUSH_TRIES + 1] == [*(WAIT_S * n for n in range(10)), 14.5]
     daemon.receive(have(NEW), NOW + 4000)
-    assert daemon.hour(NOW + 4000) == []
+    stated = Have(6, digest_of(NEW), 10, 20)
+    assert daemon.hour(NOW + 4000) == [(0, PEER, stated)], (
+        "the peer states what it got, and learns that this end knows"
+    )
 
 
 def test_flood_of_have() -> None:
@@ -192,18 +193,19 @@ def test_bulletin_is_answered() -> None:
     assert daemon.hour(NOW + 1) == []
 
 
-def test_bulletin_before_have() -> None:
-    """Its sender has it, and does not get it back."""
+def test_sender_of_a_bulletin_does_not_get_it_back() -> None:
+    """Though it stated an older one before."""
     daemon = Daemon()
     daemon.up()
+    daemon.receive(have(OLD))
     daemon.receive(BulletinRecord(NEW))
+    assert daemon.exchange.shown(PEER) == 6
     daemon.exchange.note_persisted(6, digest_of(NEW))
-    daemon.receive(have(OLD), NOW + 1)
     assert [record for _, _, record in daemon.hour(NOW + 1)] == [Have(6, digest_of(NEW), 10, 20)]
 
 
-def test_repeated_have_is_a_question() -> None:
-    """It is answered, but not if this end stated it a moment ago: two ends do not answer each other without end."""
+def test_have_is_answered() -> None:
+    """But not if this end stated it a moment ago: two ends do not answer each other without end."""
     daemon = Daemon()
     daemon.up()
     daemon.receive(have(OLD))

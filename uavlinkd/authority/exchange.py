@@ -1,7 +1,8 @@
 """How bulletins and newer certificates reach the peers of one daemon. README.md, "Bulletins".
 
-Pure: no I/O, no clock, no randomness of its own. An exchange knows what each peer stated, so what the peer lacks. It
-sends that until the peer states that it has it. The static public key of a peer names it.
+Each end states what it has when a session begins and when that changes; the end with the newer one sends it, until
+the other states that it has it. The static public key of a peer names it. Pure: no I/O, no clock, no random source of
+its own.
 """
 
 from __future__ import annotations
@@ -37,9 +38,7 @@ class _Peer:
     """What one peer stated, and when it gets what. Kept while it is down: it may come back with an older disk."""
 
     is_up: bool = False
-    is_renewed: bool = False  # it stated what it has on an earlier session of the present link only
-    have: Have | None = None  # what it stated last, on the present link
-    has: int = 0  # the newest bulletin that it stated or sent since then
+    have: Have | None = None  # what it stated last, on the present link; with a bulletin that it sent since
     stated: int | None = None  # the number that it stated last, ever
     order: int = -1  # of the record that stated it
     push_at: float = inf
@@ -78,16 +77,11 @@ class BulletinExchange:
     # Peers.
 
     def on_handshake(self, key: bytes, now: float) -> None:
-        """A session with the peer that has this static public key was made, or its link is up again.
-
-        One that replaces another tells nothing: only an end that was restarted states what it has, and asks.
-        """
+        """A session with the peer that has this static public key was made, or its link is up again."""
         peer = self._peers.setdefault(key, _Peer())
-        if peer.is_up and peer.have is not None:
-            peer.is_renewed = True
-            return
-        peer.is_up, peer.have, peer.has, peer.tries = True, None, 0, 0
-        peer.owes_have, peer.push_at = True, now + self._wait_s(key)
+        if not peer.is_up:
+            peer.is_up, peer.have, peer.tries = True, None, 0
+        peer.owes_have, peer.push_at = True, min(peer.push_at, now + self._wait_s(key))
         self._note(peer)
 
     def on_down(self, key: bytes) -> None:
@@ -102,7 +96,9 @@ class BulletinExchange:
     def shown(self, key: bytes) -> int | None:
         """The number of the newest bulletin that a peer has, as far as is known; None if it did not state any."""
         peer = self._peers.get(key)
-        return None if peer is None or peer.stated is None else max(peer.has, peer.stated)
+        if peer is None:
+            return None
+        return peer.stated if peer.have is None else peer.have.number
 
     def serial(self, key: bytes) -> int | None:
         """The serial of its own certificate that a peer stated on the present link; 0 if it has none."""
@@ -130,12 +126,9 @@ class BulletinExchange:
     def _receive_have(self, key: bytes, peer: _Peer, have: Have, order: int, now: float) -> Reaction:
         if order <= peer.order:
             raise Drop(DropReason.OLD_RECORD)
-        is_renewed, peer.is_renewed = peer.is_renewed, False
-        is_repeated = have == peer.have and not is_renewed
+        is_repeated = have == peer.have
         is_rolled_back = peer.stated is not None and have.number < peer.stated
         peer.order, peer.have, peer.stated = order, have, have.number
-        peer.has = have.number if is_renewed or is_rolled_back else max(peer.has, have.number)
-        peer.owes_have |= is_renewed
         if not is_repeated:
             peer.tries = 0
         wait_s = self._wait_s(key)
@@ -146,7 +139,7 @@ class BulletinExchange:
         else:
             peer.push_at = inf
             # The peer may not know what this end has. The peer's answer to the answer comes too soon for a loop.
-            peer.owes_have |= is_repeated and now >= peer.have_sent_at + wait_s
+            peer.owes_have |= now >= peer.have_sent_at + wait_s
         self._note(peer)
         if is_rolled_back:
             return Reaction(event=ROLLED_BACK)
@@ -163,8 +156,8 @@ class BulletinExchange:
             raise Drop(DropReason.BAD_CONTROL)
         peer.owes_have |= self._persisted[0] == self._trust.bulletin.number  # else when it is written
         self._note(peer)
-        if data == self._trust.bulletin_bytes:
-            peer.has = self._trust.bulletin.number
+        if peer.have is not None and data == self._trust.bulletin_bytes:
+            peer.have = peer.have._replace(number=self._trust.bulletin.number, digest=self._trust.digest)
         if verdict is BulletinVerdict.NEWER:
             return self._accepted(ended, now)
         return Reaction(event="" if verdict is BulletinVerdict.KNOWN else verdict.value)
@@ -283,7 +276,7 @@ class BulletinExchange:
         if own is not None and 0 < have.known < own.certificate.serial:
             records.append(CertificateRecord(trust.own_key, own.data))
         # The bulletin may refuse the certificates that these replace. Then the peer could not get them afterwards.
-        if peer.has < trust.bulletin.number and (not records or peer.tries >= c.PUSH_TRIES - 1):
+        if have.number < trust.bulletin.number and (not records or peer.tries >= c.PUSH_TRIES - 1):
             records.append(BulletinRecord(trust.bulletin_bytes))
         return records
 
