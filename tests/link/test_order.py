@@ -49,6 +49,8 @@ def set_metered(network: Network, metered: Collection[int]) -> None:
 
 
 NEAR, FAR, RELAYED = Radio(0.005), Radio(0.05), Radio(0.02, is_relayed=True)
+BUSY = Radio(0.002, is_relayed=True, jitter_s=0.008)
+"""A relay on a machine that does other work too."""
 NO_DELAY = EgressSettings()
 
 
@@ -60,6 +62,7 @@ NO_DELAY = EgressSettings()
         pytest.param([NEAR, FAR], [], NO_DELAY, id="two paths"),
         pytest.param([FAR, RELAYED], [], NO_DELAY, id="direct and relay"),
         pytest.param([FAR, NEAR], [1], NO_DELAY, id="copies along a faster path"),
+        pytest.param([BUSY, BUSY], [], NO_DELAY, id="two relays, now one and now the other is faster"),
         pytest.param([NEAR, FAR], [], EgressSettings(coalesce_s=0.05), id="coalescing"),
         pytest.param([NEAR, FAR], [], EgressSettings(budget_bits_s=2_000_000), id="budget"),
         pytest.param([Radio(0.005, budget_bits_s=2_000_000), FAR], [], NO_DELAY, id="budget of a network"),

@@ -38,6 +38,8 @@ class Radio(NamedTuple):
     """0: none. Both ends have the same."""
     is_relayed: bool = False
     """Whether the path leads through a relay."""
+    jitter_s: float = 0.0
+    """A datagram takes up to so much longer. A radio keeps the order."""
 
 
 class Sent(NamedTuple):
@@ -146,7 +148,8 @@ class Network:
             return
         receiver = self.bravo if sender is self.alpha else self.alpha
         source = self._path_to(path.socket, sender)
-        arrives_at = max(self.now + radio.delay_s, self._arrived_at.get((sender, path.socket), 0.0))
+        delay_s = radio.delay_s + self._rng.uniform(0.0, radio.jitter_s)
+        arrives_at = max(self.now + delay_s, self._arrived_at.get((sender, path.socket), 0.0))
         self._arrived_at[sender, path.socket] = arrives_at
         self.at(arrives_at, lambda: receiver.perform(receiver.node.receive(datagram, source, self.now)))
 

@@ -1,4 +1,4 @@
-"""Frames that overtook others along a faster path, and wait for these. README.md, section 15."""
+"""Frames that overtook others along another path, and wait for these. README.md, section 15."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ class EarlyFrames:
     """The early frames of one peer.
 
     A copy along a faster path overtakes the stream, and so does the stream itself after a change to a faster path.
-    Such an envelope waits until those before it are here, or for as long as they arrive later.
+    Of equal paths, now one and now the other is faster: delays vary.
+    Such an envelope waits until those before it are here, or for as long as they may arrive later.
     """
 
     __slots__ = ("_newest", "_paths", "_waiting", "highest")
@@ -89,7 +90,9 @@ class EarlyFrames:
         return len(missing) < c.EARLY_ENVELOPES and all(map(envelope.session.window.is_used, missing))
 
     def _due_at(self, path: PathState, now: float) -> float:
-        """Until when an envelope that arrived along this path waits for the stream, if that is a little slower."""
-        slower = self._paths.best if self._newest is None else self._newest.path
-        early_s = path.head_start_s(slower) if slower is not None and slower is not path and slower.works else 0.0
-        return now + early_s + c.EARLY_MARGIN_S if 0 < early_s <= c.EARLY_MOST_S else now
+        """Until when an envelope that arrived along this path waits for the stream; at most now if it does not."""
+        best = self._paths.best if self._newest is None else self._newest.path
+        if best is None or best is path or not (best.works and path.is_validated):
+            return now
+        early_s = path.head_start_s(best)
+        return now + early_s + c.EARLY_MARGIN_S if early_s <= c.EARLY_MOST_S else now

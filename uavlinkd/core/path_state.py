@@ -217,9 +217,14 @@ class PathState:
         self._lags.append((now, lag_s))
 
     def head_start_s(self, slower: PathState) -> float:
-        """How much earlier than along a slower path the peer's envelopes arrive here, at most, as far as is known."""
-        lag_s, own_lag_s = (path._lags[-1][1] if path._lags else 0.0 for path in (slower, self))
-        return max(lag_s - own_lag_s, ((slower.srtt_s or 0.0) - (self.srtt_s or 0.0)) / 2)
+        """How much earlier than along a slower path the peer's envelopes arrive here, at most, as far as is known.
+
+        Negative if the other path is known to be the faster one.
+        """
+        by_answers_s = ((slower.srtt_s or 0.0) - (self.srtt_s or 0.0)) / 2
+        if not (slower._lags and self._lags):
+            return by_answers_s
+        return max(slower._lags[-1][1] - self._lags[-1][1], by_answers_s)
 
     # Probes.
 
