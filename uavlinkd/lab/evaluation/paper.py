@@ -1,4 +1,4 @@
-"""The paper's method, for measurements: bare Diffie-Hellman, then HMAC of data, between two processes over UDP.
+"""The paper's method, for measurements: bare Diffie-Hellman, then HMAC of data, between two sockets over UDP.
 
 It is insecure: public keys are not authenticated (``evaluate tampering`` shows the result). One exchange, as the
 paper times it:
@@ -12,8 +12,7 @@ paper times it:
 This module imports ``cryptography``, besides ``core/crypto.py``: in the paper a library generates parameters, and the
 core has only standard groups. The paper's smallest group has 256 bits, which OpenSSL refuses: it is left out.
 
-``python -m uavlinkd.lab.evaluation.paper initiator|responder`` is one end: a JSON line on standard input requests an
-exchange, and a JSON line on standard output has its result.
+``python -m uavlinkd.lab.evaluation.paper REQUEST`` runs one exchange: the request and the result are JSON.
 """
 
 from __future__ import annotations
@@ -24,8 +23,7 @@ import socket
 import sys
 import time
 import warnings
-from collections.abc import Sequence
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 from cryptography.hazmat.backends.openssl import backend
 from cryptography.hazmat.primitives.asymmetric import dh
@@ -38,8 +36,6 @@ TAG_BYTES = 32
 MAC_KEY_BYTES = 32
 Parameters: TypeAlias = "dh.DHParameters"
 _LABEL = b"evaluation of the paper: HMAC key"
-_WAIT_S = 30.0
-"""How long an end waits for a datagram of the other during an exchange."""
 _DATAGRAM_BYTES = 65536
 
 
@@ -74,7 +70,7 @@ def mac_key(secret: bytes) -> bytes:
     return hkdf_expand(sha256(secret), _LABEL, MAC_KEY_BYTES)
 
 
-# One end. Integers are sent as u16 length and big-endian bytes.
+# One exchange. Integers are sent as u16 length and big-endian bytes.
 
 
 def _pack(*numbers: int) -> bytes:
@@ -91,54 +87,47 @@ def _unpack(data: bytes) -> list[int]:
     return numbers
 
 
-def initiate(sock: socket.socket, bits: int, data: bytes, *, standard: bool) -> dict[str, float]:
-    """The initiator's part of one exchange. Return its start (monotonic), and the seconds to make the parameters."""
+def exchange(
+    initiator: socket.socket, responder: socket.socket, bits: int, data: bytes, *, standard: bool
+) -> dict[str, float | bool]:
+    """One exchange between two connected sockets. Return whether the tag is valid, and the seconds that it took.
+
+    Each end computes while the other one waits, so one process takes as long as two.
+    """
     started_at = time.monotonic()
     parameters = make_parameters(bits, standard=standard)
     parameters_s = time.monotonic() - started_at
-    key = GroupKey(parameters)
-    sock.send(_pack(parameters.parameter_numbers().p, key.public))
-    (public,) = _unpack(sock.recv(_DATAGRAM_BYTES))
-    secret = key.secret(public)
-    sock.send(data + hmac_sha256(mac_key(secret), data))
-    return {"started_at": started_at, "parameters_s": parameters_s}
+    ours = GroupKey(parameters)
+    initiator.send(_pack(parameters.parameter_numbers().p, ours.public))
+    prime, public = _unpack(responder.recv(_DATAGRAM_BYTES))
+    theirs = GroupKey(load_parameters(prime))
+    responder.send(_pack(theirs.public))
+    secret = theirs.secret(public)
+    (public,) = _unpack(initiator.recv(_DATAGRAM_BYTES))
+    initiator.send(data + hmac_sha256(mac_key(ours.secret(public)), data))
+    last = responder.recv(_DATAGRAM_BYTES)
+    expected = hmac_sha256(mac_key(secret), last[:-TAG_BYTES])
+    verified = hmac.compare_digest(expected, last[-TAG_BYTES:])
+    return {"verified": verified, "total_s": time.monotonic() - started_at, "parameters_s": parameters_s}
 
 
-def respond(sock: socket.socket) -> dict[str, float | bool]:
-    """The responder's part of one exchange. Return whether the tag is valid, and when (monotonic)."""
-    hello, initiator = sock.recvfrom(_DATAGRAM_BYTES)
-    prime, public = _unpack(hello)
-    key = GroupKey(load_parameters(prime))
-    sock.sendto(_pack(key.public), initiator)
-    secret = key.secret(public)
-    sock.settimeout(_WAIT_S)
-    last = sock.recv(_DATAGRAM_BYTES)
-    data, tag = last[:-TAG_BYTES], last[-TAG_BYTES:]
-    verified = hmac.compare_digest(hmac_sha256(mac_key(secret), data), tag)
-    return {"verified": verified, "verified_at": time.monotonic()}
-
-
-def main(arguments: Sequence[str]) -> int:
-    """Run one end as a process, for one exchange."""
+def main(request: str) -> int:
+    """Run one exchange as a process."""
     # cryptography 50 deprecates FFDH; pyproject.toml bounds the version.
     warnings.filterwarnings("ignore", message="Diffie-Hellman over finite fields")
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        sock.bind(("127.0.0.1", 0))
-        _say({"port": sock.getsockname()[1]})
-        if arguments == ["responder"]:
-            _say(respond(sock))
-            return 0
-        request = json.loads(sys.stdin.readline())
-        sock.connect(("127.0.0.1", request["port"]))
-        sock.settimeout(_WAIT_S)
-        data = bytes.fromhex(request["data"])
-        _say(initiate(sock, request["bits"], data, standard=request["standard"]))
+    facts = json.loads(request)
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as initiator,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as responder,
+    ):
+        for end in (initiator, responder):
+            end.bind(("127.0.0.1", 0))
+        initiator.connect(responder.getsockname())
+        responder.connect(initiator.getsockname())
+        data = bytes.fromhex(facts.pop("data"))
+        print(json.dumps(exchange(initiator, responder, data=data, **facts)))
     return 0
 
 
-def _say(what: dict[str, Any]) -> None:
-    print(json.dumps(what), flush=True)
-
-
 if __name__ == "__main__":
-    raise SystemExit(main(sys.argv[1:]))
+    raise SystemExit(main(sys.argv[1]))
