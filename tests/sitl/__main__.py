@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from tests.sitl.radio import BY_NAME
+from tests.sitl.real_autopilot import Firmware, RealAutopilotError, binary_of
 from tests.sitl.scenarios import KINDS, SCENARIOS, Record, Run, fly, runs
 from uavlinkd.lab.evaluation.frame import NOTHING, ReportSection, Table, to_markdown
-from uavlinkd.lab.sim.real_autopilot import Firmware, RealAutopilotError, binary_of
 
 WHO = ("autopilot", "version", "condition", "daemons", "seconds", "error")
 WHICH = ("scenario", "autopilot", "condition", "daemons")

@@ -15,6 +15,7 @@ from tests.sitl.downloads import downloads
 from tests.sitl.flights import flight, follow_me, outages, restarts, two_radios, two_vehicles
 from tests.sitl.pilots import COPTER, OWN, PX4, ROVER, Kind, Pilot
 from tests.sitl.radio import BY_NAME, CLEAN
+from tests.sitl.real_autopilot import Firmware
 from tests.sitl.relayed import relayed
 from tests.sitl.roles import roles
 from tests.sitl.simulators import OwnSimulator, RealSimulator, Simulator
@@ -22,7 +23,6 @@ from tests.sitl.station import Station
 from tests.sitl.transfers import Figures, FlightError, log_and_file, parameters_and_mission, signing
 from tests.sitl.world import Layout, World, flying
 from uavlinkd.lab.sim.loopback_ports import free_port
-from uavlinkd.lab.sim.real_autopilot import Firmware
 
 KINDS: Mapping[str, Kind] = {"ardupilot": COPTER, "px4": PX4, "rover": ROVER, "own": OWN}
 ALL_KINDS = tuple(KINDS)

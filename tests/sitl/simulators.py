@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Protocol
 
 from tests.daemon.udp import Sockaddr, shown
+from tests.sitl.real_autopilot import Firmware, RealAutopilot, RealAutopilotSettings, binary_of
 from uavlinkd.lab.child_processes import end_with_parent
 from uavlinkd.lab.sim.autopilot import HOME
-from uavlinkd.lab.sim.real_autopilot import Firmware, RealAutopilot, RealAutopilotSettings, binary_of
 
 FIRST_INSTANCE = 20 + 4 * (os.getpid() % 50)
 """PX4's instances are numbered for the whole machine. Other processes may fly some at the same time."""

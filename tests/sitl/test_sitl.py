@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
+from tests.sitl.real_autopilot import Firmware, RealAutopilotError, binary_of
 from tests.sitl.scenarios import Run, fly, runs
-from uavlinkd.lab.sim.real_autopilot import Firmware, RealAutopilotError, binary_of
 
 
 def flights() -> Iterator[Any]:

@@ -108,12 +108,10 @@ def _report(options: argparse.Namespace) -> int:
 def _errors() -> tuple[type[Exception], ...]:
     """What a run may raise; the message is for the operator."""
     from uavlinkd.lab.evaluation.records import EvaluationError  # noqa: PLC0415
-    from uavlinkd.lab.sim.aircraft import PilotError  # noqa: PLC0415
     from uavlinkd.lab.sim.drone_process import DroneError  # noqa: PLC0415
-    from uavlinkd.lab.sim.real_autopilot import RealAutopilotError  # noqa: PLC0415
     from uavlinkd.ops.control import ControlError  # noqa: PLC0415
 
-    return (EvaluationError, DroneError, PilotError, RealAutopilotError, ControlError, OSError)
+    return (EvaluationError, DroneError, ControlError, OSError)
 
 
 def _show(line: str) -> None:

@@ -8,9 +8,7 @@ from typing import Any, Final, TypeVar
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from uavlinkd.lab.evaluation.flight_plan import ATTACKS, LINK_NAMES, PAIR, AttackPhase, LinkKind
@@ -43,10 +41,8 @@ _PHASE_COLOURS: Final = {
     AttackPhase.DROP: _BLACK,
 }
 _STATE_COLOURS: Final = {"link down": _GREEN, "freshness unverified": _BLUE}
-_FLOWN: Final = "#a9d8f3"
 _POINT_EVERY: Final = 2
-_LINE_EVERY: Final = 3
-"""So many samples for each point, and points for each thin line."""
+"""The count of samples for each point."""
 
 
 def to_svg(draw: Callable[[F], dict[str, Figure]], findings: F) -> dict[str, bytes]:
@@ -87,60 +83,26 @@ def _split(points: Sequence[tuple[float, float]]) -> tuple[list[float], list[flo
 
 
 def draw_flight(findings: FlightFindings) -> dict[str, Figure]:
-    """Above, the path flown and the positions believed over each link; below, the error of the latter over time."""
+    """The error of the positions that the receiver of the first aircraft believed, over time."""
     shown = {link: findings.of("sample", link=link, aircraft=PAIR[0]) for link in LinkKind}
     if not all(shown.values()):
         return {}
-    figure = Figure(figsize=(11.0, 9.0), layout="constrained")
-    halves = figure.add_gridspec(2, 1, height_ratios=(3.5, 5.5))
-    upper, lower = figure.add_subfigure(halves[0]), figure.add_subfigure(halves[1])
-    maps: Sequence[Axes] = upper.subplots(1, len(LinkKind), sharex=True, sharey=True)
-    for axes, (link, samples) in zip(maps, shown.items(), strict=True):
-        _draw_map(axes, samples)
-        axes.set_title(LINK_NAMES[link], loc="left")
-        axes.set_xlabel("east (m)")
-    maps[0].set_ylabel("north (m)")
-    handles = [Line2D([], [], color=_FLOWN, linewidth=4, label="flown")]
-    handles += [
-        Line2D([], [], color=colour, marker=".", linestyle="none", markersize=8, label=f"believed, {phase}")
-        for phase, colour in _PHASE_COLOURS.items()
-    ]
-    upper.legend(handles=handles, loc="outside lower center", ncols=4)
-    rows: Sequence[Axes] = lower.subplots(len(LinkKind), 1, sharex=True, sharey=True)
+    figure = Figure(figsize=(11.0, 5.0), layout="constrained")
+    rows: Sequence[Axes] = figure.subplots(len(LinkKind), 1, sharex=True, sharey=True)
     for axes, (link, samples) in zip(rows, shown.items(), strict=True):
         _draw_errors(axes, findings, link, samples)
     rows[0].set_ylim(0, 1.05 * max(sample.number("error_m") for part in shown.values() for sample in part))
-    rows[1].set_ylabel("distance between believed and flown position (m)")
-    rows[-1].set_xlabel("time since take-off (s)")
-    reported = {state for state, _, _ in findings.states(LinkKind.OURS)}
+    figure.supylabel("distance between believed and flown position (m)", fontsize=10)
+    rows[-1].set_xlabel("time (s)")
+    reported = {state for state, _, _ in findings.states()}
     states = [
         Patch(color=colour, label=f"uavlinkd reports: {state}")
         for state, colour in _STATE_COLOURS.items()
         if state in reported
     ]
     if states:
-        lower.legend(handles=states, loc="outside lower center", ncols=2)
+        figure.legend(handles=states, loc="outside lower center", ncols=2)
     return {"flight": figure}
-
-
-def _draw_map(axes: Axes, samples: Sequence[Record]) -> None:
-    axes.plot(*_split(_places(samples, "flown")), color=_FLOWN, linewidth=4, zorder=2)
-    for phase, colour in _PHASE_COLOURS.items():
-        chosen = [sample for sample in samples[::_POINT_EVERY] if sample.point["phase"] == phase]
-        believed = _places(chosen, "believed")
-        lines = list(zip(_places(chosen, "flown"), believed, strict=True))[::_LINE_EVERY]
-        axes.add_collection(LineCollection(lines, colors=colour, linewidths=0.5, alpha=0.35, zorder=1))
-        _draw_points(axes, believed, colour)
-    axes.set_aspect("equal", adjustable="box")
-
-
-def _places(samples: Sequence[Record], kind: str) -> list[tuple[float, float]]:
-    return [(sample.number(f"{kind}_east_m"), sample.number(f"{kind}_north_m")) for sample in samples]
-
-
-def _draw_points(axes: Axes, points: Sequence[tuple[float, float]], colour: str) -> None:
-    # Not scatter(), which writes a style for each point: the SVG would be three times as large.
-    axes.plot(*_split(points), ".", color=colour, markersize=3, zorder=3)
 
 
 def _draw_errors(axes: Axes, findings: FlightFindings, link: LinkKind, samples: Sequence[Record]) -> None:
@@ -148,14 +110,16 @@ def _draw_errors(axes: Axes, findings: FlightFindings, link: LinkKind, samples: 
     for phase, begin_s, end_s in spans:
         if phase in ATTACKS:
             axes.axvspan(begin_s, end_s, color=_PHASE_COLOURS[phase], alpha=0.13, linewidth=0)
-            if link is LinkKind.PLAIN:
+            if link is LinkKind.PAPER:
                 place = {"transform": axes.get_xaxis_transform(), "ha": "center", "va": "bottom", "fontsize": 9}
                 axes.text((begin_s + end_s) / 2, 1.02, phase, **place)  # type: ignore[arg-type]
     for phase, colour in _PHASE_COLOURS.items():
         chosen = [sample for sample in samples[::_POINT_EVERY] if sample.point["phase"] == phase]
-        _draw_points(axes, [(sample.number("at_s"), sample.number("error_m")) for sample in chosen], colour)
+        points = [(sample.number("at_s"), sample.number("error_m")) for sample in chosen]
+        # Not scatter(), which writes a style for each point: the SVG would be three times as large.
+        axes.plot(*_split(points), ".", color=colour, markersize=3, zorder=3)
     axes.text(1.01, 0.5, LINK_NAMES[link], transform=axes.transAxes, rotation=270, ha="left", va="center")
     if spans:
         axes.set_xlim(spans[0][1], spans[-1][2])
-    for state, begin_s, end_s in findings.states(link):
+    for state, begin_s, end_s in findings.states() if link is LinkKind.OURS else ():
         axes.axvspan(begin_s, end_s, ymin=0.0, ymax=0.05, color=_STATE_COLOURS[state], linewidth=0)

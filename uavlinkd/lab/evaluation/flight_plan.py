@@ -24,18 +24,13 @@ SYSTEM_IDS: Final = {"drone0": 1, "drone1": 2}
 
 
 class LinkKind(StrEnum):
-    """The links between both aircraft. All of them carry the same frames of the same flight."""
+    """The links between both aircraft. Both carry the same frames of the same flight."""
 
-    PLAIN = "plain"
     PAPER = "paper"
     OURS = "uavlinkd"
 
 
-LINK_NAMES: Final = {
-    LinkKind.PLAIN: "plain MAVLink",
-    LinkKind.PAPER: "the paper's protocol",
-    LinkKind.OURS: "uavlinkd",
-}
+LINK_NAMES: Final = {LinkKind.PAPER: "the paper's protocol", LinkKind.OURS: "uavlinkd"}
 
 
 class Provenance(StrEnum):

@@ -16,8 +16,6 @@ REPORTED_WITHIN_S = 10.0
 """Within this time a daemon must report that its link is down or its freshness unverified."""
 _FALSE = (Provenance.REPLAYED, Provenance.ALTERED)
 _WITHOUT_EFFECT = (
-    (LinkKind.PLAIN, AttackPhase.ALTER, Provenance.ALTERED),
-    (LinkKind.PLAIN, AttackPhase.REPLAY, Provenance.REPLAYED),
     (LinkKind.PAPER, AttackPhase.REPLAY, Provenance.REPLAYED),
     (LinkKind.PAPER, AttackPhase.KEYS, Provenance.ALTERED),
 )
@@ -29,7 +27,7 @@ class FlightFindings(RunRecords):
 
     @property
     def spans(self) -> list[tuple[AttackPhase, float, float]]:
-        """Every phase in order, with begin and end in seconds after take-off."""
+        """Every phase in order, with begin and end in seconds."""
         return [
             (AttackPhase(str(record.point["phase"])), record.number("begin_s"), record.number("end_s"))
             for record in self.of("phase", link=LinkKind.OURS)
@@ -37,7 +35,7 @@ class FlightFindings(RunRecords):
 
     @property
     def duration_s(self) -> float:
-        """From take-off to the last measurement; 0 if the run was interrupted."""
+        """From the first frame to the last measurement; 0 if the run was interrupted."""
         ends = self.of("end")
         return ends[0].number("duration_s") if ends else 0.0
 
@@ -50,11 +48,11 @@ class FlightFindings(RunRecords):
 
     def is_reported(self, at: float) -> bool:
         """Whether a daemon reports at this time that its link is not well."""
-        return any(begin_s <= at < end_s for _, begin_s, end_s in self.states(LinkKind.OURS))
+        return any(begin_s <= at < end_s for _, begin_s, end_s in self.states())
 
     def unnoticed_errors_m(self, link: LinkKind) -> list[float]:
         """The errors of believed positions, without those after which an end reported a problem."""
-        states = self.states(link)
+        states = self.states() if link is LinkKind.OURS else []
         return [
             sample.number("error_m")
             for sample in self.of("sample", link=link)
@@ -64,21 +62,16 @@ class FlightFindings(RunRecords):
             )
         ]
 
-    def states(self, link: LinkKind) -> list[tuple[str, float, float]]:
-        """The reported states of a link that are not well, with begin and end in seconds."""
-        changes = [(str(record.values["state"]), record.number("at_s")) for record in self.of("state", link=link)]
+    def states(self) -> list[tuple[str, float, float]]:
+        """What the daemons reported of a link that was not well, with begin and end in seconds."""
+        changes = [(str(record.values["state"]), record.number("at_s")) for record in self.of("state")]
         changes.append(("", self.duration_s))
         return [(state, at, end) for (state, at), (_, end) in pairwise(changes) if state]
 
 
 def summary(findings: FlightFindings) -> dict[str, Value]:
-    ends = findings.of("end")
-    facts: dict[str, Value] = {
-        "aircraft": ends[0].values.get("aircraft") if ends else None,
-        "quick": findings.run.get("quick"),
-        "duration_s": findings.duration_s,
-    }
-    for link, name in ((LinkKind.PLAIN, "plain"), (LinkKind.PAPER, "paper"), (LinkKind.OURS, "ours")):
+    facts: dict[str, Value] = {"quick": findings.run.get("quick"), "duration_s": findings.duration_s}
+    for link, name in ((LinkKind.PAPER, "paper"), (LinkKind.OURS, "ours")):
         facts |= {f"{name}_{kind.value}_accepted": findings.count(kind.value, link=link) for kind in _FALSE}
         facts[f"{name}_max_error_m"] = max(findings.numbers("sample", "error_m", link=link), default=None)
         facts[f"{name}_max_unnoticed_error_m"] = max(findings.unnoticed_errors_m(link), default=None)
@@ -165,6 +158,6 @@ def _noticed(findings: FlightFindings) -> Table:
 
 
 def _states(findings: FlightFindings) -> Table:
-    states = findings.states(LinkKind.OURS)
+    states = findings.states()
     rows = [[f"{begin_s:.1f} s", state, f"{end_s - begin_s:.1f} s"] for state, begin_s, end_s in states]
     return Table(["time", "report", "lasted"], rows)

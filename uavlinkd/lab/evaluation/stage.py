@@ -19,7 +19,7 @@ from typing import Any, Self
 from uavlinkd.config.keys import decode_key, generate_psk
 from uavlinkd.lab.evaluation.ledger import Ledger
 from uavlinkd.lab.evaluation.middle import HOST, Clients, Middle, MiddleHere
-from uavlinkd.lab.evaluation.paper_protocol import PaperEnd, paper_pair
+from uavlinkd.lab.evaluation.paper_protocol import RENEW_S, PaperEnd, paper_pair
 from uavlinkd.lab.evaluation.records import EvaluationError
 from uavlinkd.lab.evaluation.tampering_records import OURS, PAPER
 from uavlinkd.lab.mitm.attack import Direction
@@ -61,6 +61,8 @@ class Stage(ABC):
         self.middle = middle
         self.ledger = ledger
         self.rate_hz = rate_hz
+        self.receive: Callable[[str, bytes, float], None] = ledger.on_received
+        """Gets what the clients receive: the name of the receiver, the datagram and the time."""
         self.unwritten: dict[str, set[str]] = {name: set() for name in names}
         """By drone: what a killed daemon counted. It logs its totals when it stops."""
         self._traffic: asyncio.Task[None] | None = None
@@ -158,7 +160,7 @@ class DaemonStage(Stage):
         self.psks: dict[frozenset[str], str] = {}
         self.link = link
         self._silent = frozenset(silent)
-        self._clients = Clients(lambda name, datagram: self.ledger.on_received(name, datagram, monotonic()))
+        self._clients = Clients(lambda name, datagram: self.receive(name, datagram, monotonic()))
         self._before: dict[str, Counter[str]] = {name: Counter() for name in names}
 
     @property
@@ -274,16 +276,19 @@ def _counters(status: Mapping[str, Any]) -> Counter[str]:
 
 
 class PaperStage(Stage):
-    """Two ends of the paper's protocol. A restart would lose nothing: its keys change continually."""
+    """Two ends of the paper's protocol. A restart would lose nothing: its keys change every ``renew_s`` seconds."""
 
     system = PAPER
 
-    def __init__(self, names: Sequence[str], middle: MiddleHere, *, rate_hz: float) -> None:
+    def __init__(
+        self, names: Sequence[str], middle: MiddleHere, *, rate_hz: float, renew_s: float | None = RENEW_S
+    ) -> None:
         super().__init__(names, middle, Ledger(names), rate_hz)
         self.ends: dict[str, PaperEnd] = {}
+        self._renew_s = renew_s
 
     async def open(self) -> None:
-        self.ends = paper_pair(self.names, lambda name, frame: self.ledger.on_received(name, frame, monotonic()))
+        self.ends = paper_pair(self.names, lambda name, frame: self.receive(name, frame, monotonic()), self._renew_s)
         await self.middle.start({name: end.port for name, end in self.ends.items()}, {})
         for one, other in (self.names, self.names[::-1]):
             self.ends[one].start((HOST, self.middle.ports[Direction(one, other)]))

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from uavlinkd.lab.sim.autopilot import HOME
-from uavlinkd.lab.sim.real_autopilot import (
+from tests.sitl.real_autopilot import (
     Firmware,
     RealAutopilot,
     RealAutopilotError,
     RealAutopilotSettings,
     binary_of,
 )
+from uavlinkd.lab.sim.autopilot import HOME
 
 
 @pytest.mark.parametrize("firmware", Firmware)
