@@ -5,10 +5,8 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any, Final
 
-from uavlinkd.config.keys import encode_key
 from uavlinkd.core import constants as c
 from uavlinkd.core.certificates import (
     GENERATION,
@@ -20,19 +18,14 @@ from uavlinkd.core.certificates import (
     parse_certificate,
 )
 from uavlinkd.core.crypto import AuthorityKey, KeyPair, Secret, SigningKey
-from uavlinkd.core.relay_records import BulletinRecord, CertificateRecord, FleetRecord, Have, Who
+from uavlinkd.core.relay_records import BulletinRecord, CertificateRecord, FleetRecord
 from uavlinkd.lab.evaluation.impostors import Disguise, KeyAttack
-from uavlinkd.lab.evaluation.middle import HOST
 from uavlinkd.lab.evaluation.records import EvaluationError
 from uavlinkd.lab.evaluation.stage import DaemonStage
 from uavlinkd.lab.evaluation.tampering_plan import FLEET
-from uavlinkd.lab.evaluation.tampering_stages import AMPLE, RELAY_LINK, RELAY_PEERS, MiddleRelay
-from uavlinkd.lab.hostile.hostile_fleet import HostileMembership
 from uavlinkd.system.base64_text import to_base64
 
-PINNED: Final = "pinned"
-"""The name of a peer in the files, for which there is a certificate too."""
-_PINNED_ID, _GONE_ID, _CAPTURED_ID = 97, 98, 99
+_GONE_ID, _CAPTURED_ID = 98, 99
 _NUMBER: Final = GENERATION + 2
 
 
@@ -60,29 +53,22 @@ class FleetStage(DaemonStage):
     """Members by certificate. All but the first have the first one as their contact."""
 
     authority: Authority
-    forgets = True
-    """Whether the first drone is restarted with another one."""
 
     async def open(self) -> None:
-        """Sign before all starts: for each drone a certificate that is revoked and a valid one, and for a member that
-        is revoked.
-        """
+        """Sign before all starts: a certificate for each drone, and one for a member that is revoked."""
         self.authority, self.gone = Authority(), KeyPair(os.urandom(c.KEY_BYTES))
-        self.recorded = {self.public_keys[name]: self._certify(name) for name in self.names}
-        self.certificates = {name: self._certify(name) for name in self.names}
-        self.recorded[self.gone.public] = self.authority.certify(self.gone.public, "gone", _GONE_ID)
-        count = len(self.names)
-        self.revoked = [*range(1, count + 1), 2 * count + 1]
+        self.certificates = {
+            name: self.authority.certify(self.public_keys[name], name, number)
+            for number, name in enumerate(self.names, 1)
+        }
+        self.certificate_of_gone = self.authority.certify(self.gone.public, "gone", _GONE_ID)
+        self.revoked = [len(self.names) + 1]
         self.bulletin = self.authority.publish(_NUMBER, *self.revoked)
         await super().open()
 
-    def _certify(self, name: str) -> bytes:
-        return self.authority.certify(self.public_keys[name], name, self.names.index(name) + 1)
-
     async def restart(self, name: str) -> None:
         """The first one too: then it knows no member."""
-        if self.forgets:
-            await super().restart(self.names[0])
+        await super().restart(self.names[0])
         await super().restart(name)
 
     def configure(self, one: str) -> None:
@@ -96,22 +82,15 @@ class FleetStage(DaemonStage):
             ("[fleet]", fleet),
             ("[[fleet_role]]", {"name": "vehicle", "role": "all"}),
         ]
-        others += [("[[contact]]", contact) for contact in self.contacts(one)]
-        self.drones[one].configure(self.link, self.pinned(one), others=others)
-
-    def contacts(self, one: str) -> list[dict[str, object]]:
-        """The contacts of a drone."""
         first = self.names[0]
-        addresses = self.addresses(one, first)
-        return [] if one == first else [self.contact(self.public_keys[first], self.certificates[first], addresses)]
-
-    def contact(self, key: bytes, certificate: bytes, addresses: list[object]) -> dict[str, object]:
-        return {"public_key": to_base64(key), "certificate": to_base64(certificate), "addresses": addresses}
-
-    def pinned(self, one: str) -> list[dict[str, object]]:
-        """The peers in the file of a drone."""
-        del one
-        return []
+        if one != first:
+            contact = {
+                "public_key": to_base64(self.public_keys[first]),
+                "certificate": to_base64(self.certificates[first]),
+                "addresses": self.addresses(one, first),
+            }
+            others.append(("[[contact]]", contact))
+        self.drones[one].configure(self.link, [], others=others)
 
     async def notices(self) -> dict[str, Counter[str]]:
         """The counters, if no attack changed what the drones know of their fleet.
@@ -123,53 +102,9 @@ class FleetStage(DaemonStage):
         for name, drone in self.drones.items():
             fleet = drone.status["fleet"]
             state = fleet["number"], fleet["revoked"], fleet["serial"]
-            if state != (_NUMBER, self.revoked, len(self.names) + self.names.index(name) + 1):
+            if state != (_NUMBER, self.revoked, self.names.index(name) + 1):
                 raise EvaluationError(f"{name}: an attack changed the bulletin or the certificate: {state}")
         return counters
-
-
-class FleetRelayStage(FleetStage):
-    """Members whose only contact is a hostile relay of their fleet. The files pin a peer of whose name it has a
-    certificate.
-    """
-
-    middle: MiddleRelay
-    forgets = False
-
-    async def open(self) -> None:
-        self._pinned_key = KeyPair(os.urandom(c.KEY_BYTES)).public
-        await super().open()
-
-    def configure(self, one: str) -> None:
-        if self.middle.membership is None:
-            self._enrol_relay()
-        super().configure(one)
-
-    def _enrol_relay(self) -> None:
-        sign = self.authority.certify
-        key = KeyPair(os.urandom(c.KEY_BYTES)).public
-        self._relay_certificate = sign(self.middle.public_key, "vps", 0, MemberRole.RELAY)
-        recorded = self.recorded | {key: sign(key, PINNED, _PINNED_ID)}
-        self.middle.membership = HostileMembership(
-            authority=self.authority.key,
-            certificate=self._relay_certificate,
-            bulletin=self.bulletin,
-            link=replace(RELAY_LINK, features=c.FEATURE_RECORDS | c.FEATURE_FLEET),
-            limits=AMPLE,
-            most_peers=RELAY_PEERS,
-            recorded=tuple(CertificateRecord(*item) for item in recorded.items()),
-        )
-
-    def contacts(self, one: str) -> list[dict[str, object]]:
-        del one
-        middle = self.middle
-        return [self.contact(middle.public_key, self._relay_certificate, [f"{HOST}:{middle.port}"])]
-
-    def pinned(self, one: str) -> list[dict[str, object]]:
-        del one
-        key = encode_key(self._pinned_key)
-        policy = {"allow_in": [], "allow_out": [], "system_ids": [_PINNED_ID]}
-        return [{"name": PINNED, "public_key": key, **policy}]
 
 
 def member_attacks(stage: FleetStage) -> list[KeyAttack]:
@@ -194,7 +129,7 @@ def member_attacks(stage: FleetStage) -> list[KeyAttack]:
             Authority().certify(captured.public, "captured", _CAPTURED_ID),
             "bad_certificate",
         ),
-        attack("revoked", "was revoked", stage.recorded[stage.gone.public], "certificate_revoked", key=stage.gone),
+        attack("revoked", "was revoked", stage.certificate_of_gone, "certificate_revoked", key=stage.gone),
         attack(
             "false bulletins",
             "forged, older, shrinking, another fleet's, and another one of the same number",
@@ -203,7 +138,6 @@ def member_attacks(stage: FleetStage) -> list[KeyAttack]:
             "record_over_limit",
             records=_bulletins(stage),
         ),
-        attack("questions", "floods of records that ask", valid, "unexpected_record", records=_questions()),
         attack(
             "certificates",
             "floods with altered ones, for itself, for the drone and for others",
@@ -220,11 +154,6 @@ def _bulletins(stage: FleetStage) -> list[FleetRecord]:
     forged = publish(_NUMBER + 1, *revoked)[:-1] + b"\0"
     genuine = publish(_NUMBER - 1), publish(_NUMBER, *revoked, 1000), publish(_NUMBER + 1, revoked[0])
     return [BulletinRecord(data) for data in (forged, *genuine, Authority().publish(_NUMBER + 1))]
-
-
-def _questions() -> list[FleetRecord]:
-    claims = [Have(number, bytes(4), number % 7, number % 5) for number in range(_NUMBER - 20, _NUMBER + 20)]
-    return [*claims, *(Who(0xFF, after) for after in range(9))]
 
 
 def _certificates(stage: FleetStage, own: bytes, valid: bytes) -> list[FleetRecord]:

@@ -16,7 +16,7 @@ from time import monotonic
 from uavlinkd.config.keys import decode_key
 from uavlinkd.core import wire
 from uavlinkd.core.constants import FEATURE_FLEET, FEATURE_RECORDS, PROBLEMS_PER_REPORT, REFUSALS_PER_REPORT
-from uavlinkd.core.cookie import CookieJar, MacKeys
+from uavlinkd.core.cookie import MacKeys
 from uavlinkd.core.crypto import KeyPair, Secret
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.node import Node
@@ -34,7 +34,7 @@ from uavlinkd.lab.evaluation.ledger import numbered_frame
 from uavlinkd.lab.evaluation.paper_attacks import PaperRelay
 from uavlinkd.lab.evaluation.stage import DaemonStage
 from uavlinkd.lab.evaluation.tampering_bench import Bench, KeyHolder
-from uavlinkd.lab.evaluation.tampering_plan import HANDSHAKE, KEYS, TrialPlan
+from uavlinkd.lab.evaluation.tampering_plan import KEYS, TrialPlan
 from uavlinkd.lab.evaluation.tampering_records import RELAY
 from uavlinkd.lab.mitm.anatomy import DatagramKind, kind_of
 from uavlinkd.lab.mitm.attack import NEVER, Action, Direction, Intervention, Operation, PassiveAttack, Send
@@ -104,7 +104,6 @@ class Impostor(PassiveAttack):
 
     Args:
         frames: the frames to send on a session, if it gets one. Then it also invents refusals and problems.
-        lies: send invented problems and no frame.
     """
 
     def __init__(
@@ -115,13 +114,11 @@ class Impostor(PassiveAttack):
         *,
         relays: bool = False,
         frames: tuple[bytes, ...] = (),
-        lies: bool = False,
     ) -> None:
         self.name = name
         self.achieved = {disguise.victim: Achieved() for disguise in disguises}
         self.relays = relays
         self._frames = frames
-        self._speaks = bool(frames) or lies
         self.records: Iterator[FleetRecord] = iter(())
         """To be sent on a session, without an end."""
         self._claimed = 0
@@ -162,10 +159,9 @@ class Impostor(PassiveAttack):
                 continue
             for record in islice(self.records, REPORTS_AT_ONCE):
                 actions += self._perform(victim, node.send_record(peer, None, record, now), now)
-            if self._speaks:
+            if self._frames:
                 self.achieved[victim].frames_sent += len(self._frames)
-                if self._frames:
-                    actions += self._perform(victim, node.send(peer, self._frames, now), now)
+                actions += self._perform(victim, node.send(peer, self._frames, now), now)
                 actions += self._perform(victim, self._invent(peer, peer.sessions.current, now), now)
         if now >= self._speaks_at:
             self._speaks_at = now + RETRY_S
@@ -178,7 +174,7 @@ class Impostor(PassiveAttack):
             self._claimed += 1
             entries = (Refused(self._claimed % 2**24, 400, place, 2**32 - 1) for place in range(REFUSALS_PER_REPORT))
             problems = ProblemReport(tuple(range(self._claimed % 249, self._claimed % 249 + PROBLEMS_PER_REPORT)))
-            for report in (RefusalReport(tuple(entries)), problems) if self._frames else (problems,):
+            for report in (RefusalReport(tuple(entries)), problems):
                 out += seal(peer, session, report.encode(), peer.paths.routes[Class.BULK], now, is_answer=True)
         return out
 
@@ -205,30 +201,6 @@ class Impostor(PassiveAttack):
         return actions
 
 
-class SealedCookies(PassiveAttack):
-    """Answers each handshake message with a cookie reply that can be decrypted, before the peer answers.
-
-    The key of a cookie reply is derived from the peer's public key, so an attacker can know it. Such a cookie is
-    useless: with it, the sender only sends its message again.
-    """
-
-    name = "sealed-cookies"
-
-    def __init__(self, public_keys: dict[str, bytes], now: float) -> None:
-        self._jars = {name: CookieJar(MacKeys(key), os.urandom, now) for name, key in public_keys.items()}
-
-    def on_datagram(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
-        actions: list[Action] = [Send(datagram, direction)]
-        jar = self._jars.get(direction.receiver)
-        is_answered = kind_of(datagram) in (DatagramKind.INITIATION, DatagramKind.RESPONSE) and len(datagram) >= 4
-        if jar is None or not is_answered:
-            return actions
-        reply = jar.reply(datagram, int.from_bytes(datagram[2:4], "big"), _PATH, now)
-        back, kind = direction.reverse, DatagramKind.COOKIE
-        note = Intervention(now, self.name, Operation.INJECTED, back, 0, kind, len(reply), "valid cookie reply")
-        return [*actions, Send(reply, back), note]
-
-
 @dataclass(frozen=True, slots=True)
 class KeyAttack:
     """One attacker with keys against the first two drones of three."""
@@ -238,7 +210,6 @@ class KeyAttack:
     disguises: Sequence[Disguise]
     relays: bool = False
     frames: tuple[bytes, ...] = ()
-    lies: bool = False
     records: Sequence[FleetRecord] = ()
     group: str = KEYS
     needs: tuple[str, ...] = ()
@@ -279,18 +250,11 @@ def key_attacks(stage: DaemonStage) -> list[KeyAttack]:
             [to_a(captured, with_c)],
             frames=of_b,
         ),
-        KeyAttack(
-            "captured drone, invented problems",
-            f"holds all keys of {c}, has a session as {c}, and reports problems that it does not have",
-            [to_a(captured, with_c)],
-            lies=True,
-        ),
     ]
 
 
 async def run_key_attack(bench: Bench, attack: KeyAttack) -> None:
-    now, lies = monotonic(), attack.lies
-    impostor = Impostor(attack.name, attack.disguises, now, relays=attack.relays, frames=attack.frames, lies=lies)
+    impostor = Impostor(attack.name, attack.disguises, monotonic(), relays=attack.relays, frames=attack.frames)
     impostor.records = cycle(attack.records)
 
     def total(name: str) -> int:
@@ -299,13 +263,12 @@ async def run_key_attack(bench: Bench, attack: KeyAttack) -> None:
     attacker = KeyHolder(
         [impostor],
         # As itself, a captured drone has a genuine session: only its frames and reports matter.
-        sessions=lambda: 0 if attack.frames or lies or attack.records else total("sessions"),
+        sessions=lambda: 0 if attack.frames or attack.records else total("sessions"),
         achieved=lambda: {name: total(name) for name in ("initiations", "answers", "sessions", "frames_read")},
     )
     least_s = 2.0 if attack.relays else 0.5
-    needs = ("problem_began",) if lies else attack.needs
     plan = TrialPlan(
-        attack.name, attack.group, (), restarts=attack.relays, least_s=least_s, needs=needs, notes=attack.notes
+        attack.name, attack.group, (), restarts=attack.relays, least_s=least_s, needs=attack.needs, notes=attack.notes
     )
     await bench.run(plan, attacker)
 
@@ -320,9 +283,3 @@ async def run_paper_relay(bench: Bench) -> None:
     )
     notes = "a key exchange with each side; every second frame altered"
     await bench.run(TrialPlan(RELAY, KEYS, (), least_s=1.0, notes=notes), attacker)
-
-
-async def run_sealed_cookies(bench: Bench, public_keys: dict[str, bytes]) -> None:
-    """Run the attacker with the public keys that sends valid cookie replies."""
-    plan = TrialPlan("sealed-cookies", HANDSHAKE, (), least_s=1.0)
-    await bench.run(plan, KeyHolder([SealedCookies(public_keys, monotonic())]))

@@ -19,8 +19,6 @@ _HEARTBEAT, _HEARTBEAT_CRC_EXTRA = 0, 50
 _HEARTBEAT_EVERY = 20
 STALE_S = 8.0
 """The maximum age of a delivered frame, with a large margin for busy machines."""
-IN_TIME_S = 0.5
-"""While one path is honest, a critical frame arrives within this time."""
 _NUMBER = struct.Struct("<I")
 _HEADER_BYTES = 10
 _STARTS = frozenset(b"\xfd\xfe")
@@ -43,10 +41,10 @@ class Fault(StrEnum):
     """Unaltered, but older than :data:`STALE_S`."""
 
 
-def numbered_frame(system: int, number: int, heartbeat_every: int = _HEARTBEAT_EVERY) -> bytes:
+def numbered_frame(system: int, number: int) -> bytes:
     """An ATTITUDE, or regularly a HEARTBEAT; each of a system is unique."""
     payload = _NUMBER.pack(number)
-    if number % heartbeat_every == 0:
+    if number % _HEARTBEAT_EVERY == 0:
         return mavlink_frame(_HEARTBEAT, payload + _GROUND_STATION, _HEARTBEAT_CRC_EXTRA, system, number)
     return mavlink_frame(_ATTITUDE, payload + _ANGLES, _ATTITUDE_CRC_EXTRA, system, number)
 
@@ -66,8 +64,6 @@ class Ledger:
         self.split = SplitCounters()
         self.sent_at = {name: array("d") for name in self.names}
         """When each frame of a drone was sent, by its number."""
-        self.heartbeat_every = _HEARTBEAT_EVERY
-        """The position of the heartbeats among the frames; 1: all frames are heartbeats."""
         self._directions = [(sender, to) for sender in self.names for to in sorted(self.audience[sender])]
         self._delivered = {direction: bytearray() for direction in self._directions}
         self._arrived_at: dict[tuple[str, str], float] = {}
@@ -81,7 +77,7 @@ class Ledger:
         times.append(now)
         for to in self.audience[sender]:
             self._delivered[sender, to].append(0)
-        return numbered_frame(self.names.index(sender) + 1, len(times) - 1, self.heartbeat_every)
+        return numbered_frame(self.names.index(sender) + 1, len(times) - 1)
 
     def on_received(self, receiver: str, datagram: bytes, now: float) -> None:
         frames = split_datagram(datagram, self.split)
@@ -98,7 +94,7 @@ class Ledger:
         sender = self.names[system - 1] if 0 < system <= len(self.names) else None
         number = _NUMBER.unpack_from(raw, _HEADER_BYTES)[0] if sender else 0
         is_sent = sender is not None and number < len(self.sent_at[sender])
-        if sender is None or not is_sent or raw != numbered_frame(system, number, self.heartbeat_every):
+        if sender is None or not is_sent or raw != numbered_frame(system, number):
             self.faults[Fault.FALSE] += 1
         elif sender == receiver:
             self.faults[Fault.REFLECTED] += 1
@@ -108,7 +104,7 @@ class Ledger:
             self.faults[Fault.REPLAYED] += 1
         else:
             sent_at = self.sent_at[sender][number]
-            self._delivered[sender, receiver][number] = 1 + (now > sent_at + IN_TIME_S)
+            self._delivered[sender, receiver][number] = 1
             self._gap_s = max(self._gap_s, now - self._arrived_at.get((sender, receiver), now))
             self._arrived_at[sender, receiver] = now
             if now - sent_at > STALE_S:
@@ -123,22 +119,19 @@ class Ledger:
 
     def count(self, begin: dict[str, int], end: dict[str, int]) -> tuple[int, int]:
         """Frames sent between two marks, counted per receiver, and how many were delivered."""
+        return self._count(begin, end, 1)
+
+    def _count(self, begin: dict[str, int], end: dict[str, int], every: int) -> tuple[int, int]:
         sent = delivered = 0
         for sender, to in self._directions:
-            part = self._delivered[sender, to][begin[sender] : end[sender]]
+            part = self._delivered[sender, to][-(-begin[sender] // every) * every : end[sender] : every]
             sent += len(part)
-            delivered += len(part) - part.count(0)
+            delivered += part.count(1)
         return sent, delivered
 
-    def count_critical(self, begin: dict[str, int], end: dict[str, int], *, in_time: bool = False) -> tuple[int, int]:
-        """The same of the heartbeats alone. ``in_time``: later ones than :data:`IN_TIME_S` are not delivered."""
-        sent = delivered = 0
-        for sender, to in self._directions:
-            first = -(-begin[sender] // self.heartbeat_every) * self.heartbeat_every
-            part = self._delivered[sender, to][first : end[sender] : self.heartbeat_every]
-            sent += len(part)
-            delivered += part.count(1) if in_time else len(part) - part.count(0)
-        return sent, delivered
+    def count_critical(self, begin: dict[str, int], end: dict[str, int]) -> tuple[int, int]:
+        """Heartbeats sent between two marks, counted per receiver, and how many were delivered."""
+        return self._count(begin, end, _HEARTBEAT_EVERY)
 
     def await_gap(self, since: float) -> None:
         self._arrived_at = dict.fromkeys(self._directions, since)

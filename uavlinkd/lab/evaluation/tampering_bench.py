@@ -91,7 +91,7 @@ class Bench:
         after_stats = await stage.middle.statistics()
         interventions = _difference(after_stats.of(names), stats.of(names))
         sent, delivered = ledger.count(begin, end)
-        critical_sent, critical_delivered = ledger.count_critical(begin, end, in_time=plan.spoils_s > 0)
+        critical_sent, critical_delivered = ledger.count_critical(begin, end)
         trial = Trial(
             system=stage.system,
             attack=plan.attack,
@@ -138,10 +138,6 @@ class Bench:
         phases = [line.split() for line in lines] or [[]]
         for position, specs in enumerate(phases, 1):
             await stage.middle.attack(specs, made)
-            if plan.spoils_s:
-                await asyncio.sleep(plan.spoils_s)
-                begin, begin_at = ledger.mark(), monotonic()
-                ledger.await_gap(begin_at)
             phase_at, least_at = monotonic(), begin_at + plan.least_s
             if plan.restarts:
                 await asyncio.sleep(begin_at + 0.3 * plan.least_s - monotonic())

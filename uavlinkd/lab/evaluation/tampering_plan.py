@@ -14,7 +14,7 @@ from uavlinkd.lab.evaluation.frame import EvaluationSettings
 from uavlinkd.lab.evaluation.tampering_records import PAPER
 
 HANDSHAKE, DATA, FLOOD, TRAFFIC, KEYS = "handshake", "data", "flood", "traffic", "keys"
-PATHS, SPOILED, LINE, RELAYED, WEB, FLEET = "paths", "spoiled", "line", "relay", "web", "fleet"
+PATHS, LINE, RELAYED, WEB, FLEET = "paths", "line", "relay", "web", "fleet"
 _SHORT_GROUPS: Final = (HANDSHAKE, KEYS, FLEET)
 LOAD: Final = "flood-initiations,rate_per_s=600"
 """The load at which daemons require cookies."""
@@ -62,9 +62,6 @@ class TrialPlan:
     validates: bool = False
     """Its strangers relay answers and so become validated addresses: they may receive more than they sent."""
     least_s: float = 0.3
-    spoils_s: float = 0.0
-    """How long its attacks spoil every path first. Frames of that time do not count. Then one path is honest: each
-    critical frame must arrive in time."""
     after_s: float = 0.0
     """How long it continues after the last attempt, to release held datagrams."""
     targeted: bool = True
@@ -168,7 +165,6 @@ STALE_PLANS: Final = plan_rows(
     """
 tamper-key, peer restarted | tamper-key | -is_variant
 replace-key, peer restarted | replace-key
-random, peer restarted | random
 drop-message, peer restarted | drop-message,message=response
 block-rekey, peer restarted | block-rekey
 """,
@@ -234,6 +230,8 @@ drop-heartbeats |  | takes_away needs=envelopes_missing
 stretch | stretch,direction=drone0>drone1,interval_s=0.4 | least_s=5 takes_away
 stretch-one-way | stretch-one-way,direction=drone0>drone1,interval_s=0.4 | paper=none least_s=5 takes_away
 blackout, 1 s | blackout,seconds=60 | takes_away needs=envelopes_missing
+blackout, 12 s | blackout,seconds=60 | paper=none least_s=12 is_variant
+blackout, kept and let go | hold,kinds=any,hold_s=10,seconds=10 | least_s=10 after_s=10.5 is_variant
 """,
     paper="same",
     targeted=False,
@@ -241,18 +239,6 @@ blackout, 1 s | blackout,seconds=60 | takes_away needs=envelopes_missing
 )
 """Between three drones, with a rekey per second. In ``stretch`` the delay grows with each envelope; one way, the echo
 records of the other direction are dropped."""
-
-LONG_PLANS: Final = plan_rows(
-    TRAFFIC,
-    """
-blackout, 4 s | blackout,seconds=60 | least_s=4
-blackout, 12 s | blackout,seconds=60 | least_s=12
-blackout, kept and let go | hold,kinds=any,hold_s=10,seconds=10 | paper=same least_s=10 after_s=10.5
-""",
-    targeted=False,
-    is_variant=True,
-)
-"""Likewise, only in a full run."""
 
 LAST_PLANS: Final = plan_rows(
     DATA,
@@ -272,7 +258,7 @@ MISROUTE_PLANS: Final = (
 
 PAPER_PLANS: Final = tuple(
     plan
-    for rows in (HANDSHAKE_PLANS, DATA_PLANS, FLOOD_PLANS, TRAFFIC_PLANS, LONG_PLANS, LAST_PLANS)
+    for rows in (HANDSHAKE_PLANS, DATA_PLANS, FLOOD_PLANS, TRAFFIC_PLANS, LAST_PLANS)
     for plan in rows
     if plan.paper is not None
 )
@@ -283,34 +269,24 @@ PATH_PLANS: Final = plan_rows(
     PATHS,
     """
 copies on the other path | replay-data,<first>,onto=2 | least_s=0.3 targeted -is_variant needs=duplicate
-copies on the other path, after 3 s | replay-data,<first>,onto=2,when=later,delay_s=3
-    | least_s=0.3 targeted needs=late_copy
 copies on the other path, after 10 s | replay-data,<first>,onto=2,when=later,delay_s=10
     | least_s=0.3 targeted needs=late_copy
 moved to the other path | move,<first>,onto=2 | least_s=3 -is_variant needs=unexpected_answer
 one path dropped | drop,<first> | least_s=3 -is_variant needs=path_changed
-one path dropped, long | drop,<first> | needs=path_changed
 one path slowed | hold,kinds=any,<first>,hold_s=0.2 | needs=path_changed
 frames dropped, probes pass | drop,kinds=frames,<first> | least_s=5 -is_variant needs=path_changed
-frames dropped, probes pass, long | drop,kinds=frames,<first> | needs=path_changed
-stream dropped, copies pass | drop-heartbeats,message_id=30,<first> | needs=path_changed
 frames delayed, probes pass | hold,kinds=frames,<first>,hold_s=3 | after_s=3.5 needs=path_changed,delayed
 frames replaced by those of the other path | drop,kinds=frames,<first> move,direction=both/2,onto=1,beside=true
     | needs=unexpected_answer
 one path held and let go | hold,kinds=any,<first>,hold_s=10,at_once=true,seconds=10
     | least_s=10 after_s=2 needs=path_changed,late_copy
 probes copied to the other path | duplicate,kinds=probe,<first>,onto=2 | least_s=3 -is_variant needs=duplicate
-probes of one path, faster along the other | move,kinds=probe,direction=both/2,onto=1,beside=true
-    | needs=unexpected_answer
 probes replayed later | duplicate,kinds=probe,<first>,when=later,delay_s=1 | needs=duplicate
 bit-flip probes | bit-flip,kinds=probe,<first> | least_s=3 -is_variant needs=bad_tag
-bit-flip probes beside genuine ones | bit-flip,kinds=probe,beside=true | needs=bad_tag
 responses dropped on one path | drop-message,message=response,<first> | needs=handshakes_unanswered
-responses dropped on one path, peer restarted | drop-message,message=response,<first> | restarts -keeps_link
 roam on one path, racing | roam,<first> | needs=duplicate,paths_unproven
 roam on one path, then gone | roam,<first>,mode=instead | noticed_after_s=<question> needs=paths_unproven
 many spoofed sources | wander,mode=race | least_s=3 -is_variant needs=paths_unproven
-many spoofed sources, long | wander,mode=race | needs=paths_unproven
 many relayed sources | wander,<first> | validates needs=paths_unproven
 roam on one path, relaying | roam,<first>,mode=relay | validates needs=path_changed
 """,
@@ -320,20 +296,6 @@ roam on one path, relaying | roam,<first>,mode=relay | validates needs=path_chan
     **_ON_PATHS,
 )
 """The first path is the faster one, so it is the best when an attack begins. The last rows validate strangers."""
-
-SPOILED_PLANS: Final = plan_rows(
-    PATHS,
-    """
-both paths spoiled, then one held | hold,kinds=any,direction=both/2,begin_s=7,hold_s=10
-    drop,share=0.5,<first>,seconds=7 drop,kinds=probe,<first>,seconds=7
-    hold,kinds=any,direction=both/2,hold_s=1.9,seconds=7
-    | least_s=12 spoils_s=7 needs=path_changed,late_copy
-""",
-    is_variant=True,
-    **_ON_PATHS,
-)
-"""For 7 s the first path loses half, and all probes; the second one is 1.9 s slow, and becomes the best. With
-heartbeats alone: a stream would show sooner that the best path carries nothing."""
 
 LINE_PLANS: Final = plan_rows(
     LINE,
@@ -421,10 +383,7 @@ initiations with certificates replayed later
 initiations with certificates truncated | truncate,kinds=certificate | restarts needs=malformed
 initiations with certificates extended | extend,kinds=certificate | restarts needs=malformed
 certificates cut off and added | certificate-length {_UNANSWERED} | restarts needs=bad_handshake
-initiations with certificates dropped | drop,kinds=certificate | restarts needs=handshakes_unanswered
 records replayed | replay-data,kinds=record,copies=20 | restarts needs=duplicate
-records replayed later | replay-data,kinds=record,copies=20,when=later,delay_s=3
-    | restarts is_variant after_s=3.1 needs=late_copy
 flood of the length of certificates | flood-initiations,certificate=true,rate_per_s=1500 | needs=bad_handshake
 flood of recorded certificates | flood-replays,kinds=certificate,rate_per_s=1500 {_UNANSWERED}
     | restarts needs=replayed_initiation
@@ -434,17 +393,3 @@ flood of recorded certificates | flood-replays,kinds=certificate,rate_per_s=1500
 )
 """On two members by certificate. The second one has the first as its contact. The first one has forgotten it after a
 restart of both."""
-
-FLEET_RELAY_PLANS: Final = plan_rows(
-    FLEET,
-    """
-relay hides members and bulletins | relay-withhold | restarts least_s=5 -targeted
-relay sends recorded certificates | relay-introduce,lie=recorded | needs=member_conflict,certificate_revoked
-relay sends certificates with other keys | relay-introduce,lie=key | needs=bad_certificate
-relay sends altered certificates | relay-introduce | needs=bad_certificate
-relay floods certificates | relay-introduce,rate_per_s=600 | needs=record_over_limit
-""",
-    least_s=3.0,
-    takes_away=True,
-)
-"""On three members by certificate along a hostile relay of the same fleet."""

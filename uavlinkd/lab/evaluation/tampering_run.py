@@ -16,9 +16,9 @@ from typing import Any, Final
 from uavlinkd.core.drops import DropReason
 from uavlinkd.lab.evaluation import tampering_plan as plans
 from uavlinkd.lab.evaluation.commands import STAGES
-from uavlinkd.lab.evaluation.fleet_stages import FleetRelayStage, FleetStage, member_attacks
+from uavlinkd.lab.evaluation.fleet_stages import FleetStage, member_attacks
 from uavlinkd.lab.evaluation.frame import Evaluation, Work, duration
-from uavlinkd.lab.evaluation.impostors import key_attacks, run_key_attack, run_paper_relay, run_sealed_cookies
+from uavlinkd.lab.evaluation.impostors import key_attacks, run_key_attack, run_paper_relay
 from uavlinkd.lab.evaluation.middle import MiddleHere
 from uavlinkd.lab.evaluation.paper_attacks import CHANGES, AlterKeys
 from uavlinkd.lab.evaluation.stage import DaemonStage, PaperStage, Stage
@@ -77,21 +77,18 @@ class _Lane:
     silent: Sequence[str] = ()
 
 
-_KEYS_ROWS: Final = (*plans.TRAFFIC_PLANS, *plans.LONG_PLANS)
 _FLEET_LINK: Final = {**_rekeying(2.0, 10.0), "retry_max_s": 0.1}
 _LANES: Final = {
     "handshake-0": _Lane(PAIR, FAST_LINK, 50.0, plans.HANDSHAKE_PLANS[0::2]),
     "handshake-1": _Lane(PAIR, FAST_LINK, 50.0, plans.HANDSHAKE_PLANS[1::2]),
     "data": _Lane(PAIR, _rekeying(2.0, 20.0), 1.0, _DATA_ROWS),
-    "keys": _Lane(TRIO, _rekeying(1.0, 10.0), 0.5, _KEYS_ROWS, silent=TRIO[2:]),
+    "keys": _Lane(TRIO, _rekeying(1.0, 10.0), 0.5, plans.TRAFFIC_PLANS, silent=TRIO[2:]),
     "paths": _Lane(PAIR, _rekeying(5.0, 30.0), 0.5, plans.PATH_PLANS, TwoPathStage, _on_two_paths),
-    "spoiled": _Lane(PAIR, {}, 25.0, plans.SPOILED_PLANS, TwoPathStage, _on_two_paths),
     # The radio carries more than ten frames per second, so a lost frame was lost by the attack.
     "line": _Lane(PAIR, _rekeying(10.0, 60.0), 10.0, plans.LINE_PLANS, LineStage, MiddleLine),
     "relay": _Lane(TRIO, _rekeying(2.0, 10.0), 0.25, plans.RELAYED_PLANS, RelayStage, MiddleRelay),
     "web": _Lane(PAIR, _rekeying(2.0, 10.0), 1.0, plans.WEB_PLANS, WebStage, MiddleWeb),
     "fleet": _Lane(PAIR, _FLEET_LINK, 50.0, plans.FLEET_PLANS, FleetStage),
-    "fleet-relay": _Lane(TRIO, _FLEET_LINK, 50.0, plans.FLEET_RELAY_PLANS, FleetRelayStage, MiddleRelay),
 }
 
 
@@ -151,8 +148,6 @@ class _Run:
         if not rows:
             return
         stage = self._stage(label, lane)
-        if label == plans.SPOILED:
-            stage.ledger.heartbeat_every = 1
 
         async def work(bench: Bench) -> None:
             if label == plans.KEYS:
@@ -160,7 +155,6 @@ class _Run:
                     await bench.run(plan)
                 for attack in key_attacks(stage):
                     await run_key_attack(bench, attack)
-                await run_sealed_cookies(bench, stage.public_keys)
             if label == plans.FLEET and isinstance(stage, FleetStage):
                 for attack in member_attacks(stage):
                     await run_key_attack(bench, attack)

@@ -16,7 +16,6 @@ from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.core.suites import SUITES_BY_NAME
 from uavlinkd.lab.evaluation.middle import HOST, Interventions, interventions, silent_log
 from uavlinkd.lab.evaluation.stage import DaemonStage, until
-from uavlinkd.lab.hostile.hostile_fleet import HostileMembership
 from uavlinkd.lab.hostile.hostile_relay import HostileRelay, HostileRelaySettings
 from uavlinkd.lab.mitm.attack import AttackObject, Direction
 from uavlinkd.lab.mitm.line_attacks import parse_line_attack
@@ -116,7 +115,6 @@ class MiddleRelay:
         self._log, self._seed = log, seed
         self._private = os.urandom(c.KEY_BYTES)
         self.public_key = KeyPair(self._private).public
-        self.membership: HostileMembership | None = None
 
     @property
     def section(self) -> dict[str, object]:
@@ -125,8 +123,7 @@ class MiddleRelay:
     async def start(self, addresses: Mapping[str, int], public_keys: Mapping[str, bytes]) -> None:
         """Start for members with these keys. They reach the relay; it does not need their ports."""
         del addresses
-        names = self._names if self.membership is None else ()
-        members = (PeerSettings(name, public_keys[name], None, RELAY_LINK) for name in names)
+        members = (PeerSettings(name, public_keys[name], None, RELAY_LINK) for name in self._names)
         settings = HostileRelaySettings(
             name="vps",
             private_key=Secret(self._private),
@@ -134,7 +131,6 @@ class MiddleRelay:
             server=RelayServer(tuple(MemberSettings(member, RELAY_PEERS, AMPLE) for member in members), AMPLE),
             seed=self._seed,
             log=self._log,
-            fleet=self.membership,
         )
         self.relay = HostileRelay(settings)
         self.relay.log = silent_log()

@@ -10,30 +10,28 @@ import asyncio
 import os
 import socket
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from time import monotonic
 from typing import Final
 
 from uavlinkd.config.model import RelayServer
-from uavlinkd.core.crypto import Secret, x25519_public_key
+from uavlinkd.core.crypto import Secret
 from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import CertificateShown, Event, Output, PeerAdmitted, RecordReceived, Transmit
+from uavlinkd.core.outputs import Event, Output, RecordReceived, Transmit
 from uavlinkd.core.path import Path
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.relay_records import (
     RELAYED,
     Bound,
-    CertificateRecord,
     Record,
     bounds_of,
     wrap,
 )
 from uavlinkd.endpoints.reader import RECEIVE_BYTES
 from uavlinkd.endpoints.sockets import udp_socket
-from uavlinkd.lab.hostile.hostile_fleet import HostileFleet, HostileMembership
-from uavlinkd.lab.hostile.relay_attacks import ALL_ATTACKS, Lie, RelayAttack, RelayContext, Withhold
+from uavlinkd.lab.hostile.relay_attacks import ALL_ATTACKS, Lie, RelayAttack, RelayContext
 from uavlinkd.lab.mitm.attack import Action, AttackContext, AttackObject, Direction, Intervention
 from uavlinkd.lab.mitm.attack_service import ChannelService, RunSettings
 from uavlinkd.lab.mitm.attacks import AttackSpec
@@ -59,8 +57,6 @@ class HostileRelaySettings(RunSettings):
     listen: tuple[Address, ...]
     server: RelayServer
     attacks: tuple[AttackSpec, ...] = ()
-    fleet: HostileMembership | None = None
-    """With an authority. Then its members come by certificate: attacks are chosen when they are there."""
 
 
 class _LyingNode(Node):
@@ -71,8 +67,6 @@ class _LyingNode(Node):
     def send_record(self, peer: Peer, path: Path | None, record: Record, now: float) -> list[Output]:
         if isinstance(record, Bound):
             record = self.relay.falsified(peer.name, record, now)
-        elif self.relay.withholds(peer.name, record, now):
-            return []
         return super().send_record(peer, path, record, now)
 
 
@@ -106,20 +100,16 @@ class HostileRelay(ChannelService):
         super().__init__(settings)
         self.settings = settings
         self.name = settings.name
-        self.keys: dict[str, bytes] = {}
-        self._add_members({member.name: member.peer.public_key for member in settings.server.members})
+        self.keys = {member.name: member.peer.public_key for member in settings.server.members}
+        self._names = {key: name for name, key in self.keys.items()}
+        around = AttackContext.between(*self.keys, public_keys=self.keys)
+        self.context = RelayContext(around.directions, around.public_keys, relay=self)
         self.received: Counter[Direction] = Counter()
         self.sent: Counter[Direction] = Counter()
         self._directions: dict[_Target, Direction] = {}
         self._targets: dict[Direction, _Target] = {}  # of several, the one that was used last
         self._sockets: list[socket.socket] = []
         self._bytes_to_victim = 0
-
-    def _add_members(self, keys: Mapping[str, bytes]) -> None:
-        self.keys |= keys
-        self._names = {key: name for name, key in self.keys.items()}
-        around = AttackContext.between(*self.keys, public_keys=self.keys)
-        self.context = RelayContext(around.directions, around.public_keys, relay=self)
 
     async def start(self) -> None:
         self._began_at = now = monotonic()
@@ -160,10 +150,7 @@ class HostileRelay(ChannelService):
         """A relay without sessions, bindings and handles."""
         self._directions.clear()
         self._targets.clear()
-        key, fleet = self.settings.private_key, self.settings.fleet
-        own_key = x25519_public_key(key.reveal())
-        self._fleet = None if fleet is None else HostileFleet(fleet, own_key, os.urandom, self._add_members)
-        self._node = _LyingNode(key, os.urandom, now, takes_certificates=self._fleet is not None)
+        self._node = _LyingNode(self.settings.private_key, os.urandom, now)
         self._node.relay = self
         shell = RelayShell(
             entropy=os.urandom,
@@ -219,18 +206,6 @@ class HostileRelay(ChannelService):
             host, port = path.address[:2]
             for bound in bounds_of(host.partition("%")[0], port, of_peers):
                 self._perform(self._node.send_record(self._peer(name), path, bound, monotonic()))
-        for name, key in self.keys.items():
-            for record in self.certificates:
-                if record.key != key:
-                    self.send_certificate(name, record)
-
-    @property
-    def certificates(self) -> list[CertificateRecord]:
-        return [] if self._fleet is None else self._fleet.certificates
-
-    def send_certificate(self, member: str, record: CertificateRecord) -> None:
-        if (known := self._service.members.get(self.keys[member])) is not None:
-            self._perform(self._node.send_record(known.peer, None, record, monotonic()))
 
     def send_data(self, member: str, handle: int, inner: bytes) -> None:
         for path in (path for direction, (_, path) in self._targets.items() if direction.receiver == member):
@@ -256,10 +231,6 @@ class HostileRelay(ChannelService):
             if isinstance(attack, Lie):
                 bound = attack.report(member, bound, now)
         return bound
-
-    def withholds(self, member: str, record: Record, now: float) -> bool:
-        """Whether an attack keeps a record from a member."""
-        return any(one.withholds(member, record, now) for one in self.channel.attacks if isinstance(one, Withhold))
 
     def direction(self, sender: bytes, receiver: bytes) -> Direction:
         """From one member to another, by their keys."""
@@ -293,16 +264,7 @@ class HostileRelay(ChannelService):
                 self._send(output.datagram, output.path)
             elif isinstance(output, RecordReceived):
                 self._service.on_record(output, monotonic())
-                if self._fleet is not None:
-                    self._fleet.on_record(output, self._service, monotonic())
-            elif isinstance(output, CertificateShown):
-                if self._fleet is not None:
-                    self._perform(self._fleet.answer(output, self._node, monotonic()))
             elif isinstance(output, Event):
-                if self._fleet is not None:
-                    if isinstance(output, PeerAdmitted) and isinstance(output.peer, Peer):
-                        self._node.accept(output.peer)
-                    self._fleet.on_event(output, self._service, monotonic())
                 self._service.on_event(output, monotonic())
 
     def _forward(self, data: bytes, path: Path) -> None:
@@ -337,9 +299,6 @@ class HostileRelay(ChannelService):
                 self._service.do_housekeeping(now)
                 self.journal.flush(now)
             self._act(self.channel.due(now))
-            for key, record in () if self._fleet is None else self._fleet.pop_due(now):
-                if (peer := self._node.find(key)) is not None:
-                    self._perform(self._node.send_record(peer, None, record, now))
             self._settle()
             await asyncio.sleep(TICK_S)
 

@@ -15,8 +15,8 @@ from types import MappingProxyType
 from typing import ClassVar, Final, Protocol
 
 from uavlinkd.core import constants as c
-from uavlinkd.core.relay_records import Bound, BulletinRecord, CertificateRecord, Record, wrap
-from uavlinkd.lab.mitm.anatomy import DatagramKind, with_changed_byte
+from uavlinkd.core.relay_records import Bound, wrap
+from uavlinkd.lab.mitm.anatomy import DatagramKind
 from uavlinkd.lab.mitm.attack import (
     NEVER,
     Action,
@@ -53,20 +53,13 @@ class AttackedRelay(Protocol):
         """Count an attempt."""
 
     def report_all(self) -> None:
-        """Report to each member the handles of its peers, as after a bind, and introduce all members."""
+        """Report to each member the handles of its peers, as after a bind."""
 
     def send_data(self, member: str, handle: int, inner: bytes) -> None:
         """Send data to a member with any handle."""
 
     def send_frames(self, member: str, frame: bytes) -> None:
         """Send a frame in the relay's session with a member."""
-
-    @property
-    def certificates(self) -> list[CertificateRecord]:
-        """All certificates that it knows."""
-
-    def send_certificate(self, member: str, record: CertificateRecord) -> None:
-        """Send a certificate to a member."""
 
     def restart(self) -> None:
         """Forget all sessions, bindings and handles."""
@@ -213,56 +206,8 @@ class RestartAndReplay(RelayAttack, name="relay-restart", rate_per_s=0.4):
         return min(super().next_deadline(), self._replay_at)
 
 
-# In a fleet with an authority: attacks on bulletins, certificates and introductions.
-
-
-class Withhold(RelayAttack, name="relay-withhold"):
-    """Hides members from each other, and sends no bulletin and no newer certificate."""
-
-    reports_after = True
-
-    def withholds(self, member: str, record: Record, now: float) -> bool:
-        """Whether this record for a member is not sent."""
-        is_chosen = isinstance(record, BulletinRecord | CertificateRecord) and member in self.members
-        if not (is_chosen and self.is_on(now) and self.should_attack()):
-            return False
-        self.record(Operation.DROPPED, member, len(record.encode()), now, type(record).__name__)
-        return True
-
-    def send_next(self, now: float) -> list[Action]:
-        """Nothing: the records of others are withheld."""
-        del now
-        return []
-
-
-class Introduce(RelayAttack, name="relay-introduce", rate_per_s=20.0, lie="bytes"):
-    """Sends false certificates to each member: recorded ones, with the key of another member, with altered bytes."""
-
-    def send_next(self, now: float) -> list[Action]:
-        for member in self.members:
-            known = self.relay.certificates
-            if len(known) > 1 and self.should_attack():
-                record = self._falsified(known)
-                self.relay.send_certificate(member, record)
-                self.record(Operation.INJECTED, member, len(record.encode()), now, self.options.lie)
-        return []
-
-    def _falsified(self, known: list[CertificateRecord]) -> CertificateRecord:
-        at = self.attempts % len(known)
-        record, other = known[at], known[at - 1]
-        match self.options.lie:
-            case "key":
-                return record._replace(key=other.key)
-            case "bytes":
-                altered = with_changed_byte(record.certificate, self.rng.randrange(len(record.certificate)), self.rng)
-                return record._replace(certificate=altered)
-            case _:
-                return record
-
-
 _ALL: tuple[type[RelayAttack], ...] = (
     *(LieAboutAddresses, BindWrongMembers, InventHandles, SendOwnFrames, RestartAndReplay),
-    *(Withhold, Introduce),
 )
 RELAY_ATTACKS: Final[Mapping[str, type[RelayAttack]]] = MappingProxyType({one.name: one for one in _ALL})
 ALL_ATTACKS: Final[Mapping[str, type[Attack]]] = MappingProxyType({**RELAY_ATTACKS, **ATTACKS})

@@ -6,15 +6,12 @@ import argparse
 import asyncio
 import os
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 from uavlinkd.config.load import load_config, load_control_socket
-from uavlinkd.config.model import ConfigError, FleetConfig
-from uavlinkd.core.constants import FEATURE_FLEET, FEATURE_RECORDS
+from uavlinkd.config.model import ConfigError
 from uavlinkd.endpoints.sockets import BindError
-from uavlinkd.lab.hostile.hostile_fleet import HostileMembership
 from uavlinkd.lab.hostile.hostile_relay import HostileRelay, HostileRelaySettings
 from uavlinkd.lab.hostile.relay_attacks import ALL_ATTACKS
 from uavlinkd.lab.mitm.attack import AttackError
@@ -56,31 +53,19 @@ def relay_main(arguments: Sequence[str]) -> int:
         return fail(error, WRONG)
 
 
-def _membership(fleet: FleetConfig) -> HostileMembership:
-    return HostileMembership(
-        authority=fleet.authority,
-        certificate=fleet.own.data,
-        bulletin=fleet.bulletin,
-        link=replace(fleet.link, features=FEATURE_RECORDS | FEATURE_FLEET),
-        limits=fleet.member_limits,
-        most_peers=fleet.member_most_peers,
-    )
-
-
 def _run(options: argparse.Namespace) -> int:
     core_dumps.forbid_core_dumps()
     config = load_config(options.config, os.environ)
     if config.relay_server is None or not config.is_only_relay:
         return fail(f"{options.config}: is not the file of a relay: that has a [[member]], and no [[peer]]", WRONG)
-    if config.fleet is not None and options.attack:
-        return fail("members by certificate are unknown at the start: choose the attacks later, with --ask", WRONG)
+    if config.fleet is not None:
+        return fail(f"{options.config}: has a [fleet]: this relay attacks the members that its file names", WRONG)
     settings = HostileRelaySettings(
         name=config.name,
         private_key=config.private_key,
         listen=config.listen,
         server=config.relay_server,
         attacks=tuple(options.attack),
-        fleet=None if config.fleet is None else _membership(config.fleet),
         seed=options.seed or 0,
         log=options.log,
         control_socket=config.control_socket,

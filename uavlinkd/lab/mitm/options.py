@@ -60,10 +60,6 @@ class Options(BaseModel):
     delay_s: float = Field(10.0, ge=0, description="for when=later: seconds until the replay")
     copies: int = Field(1, ge=1, le=1000, description="number of copies of each datagram")
     onto: int = Field(0, ge=0, description="number of the path along which they are sent; 0: the same one")
-    lie: Literal["recorded", "key", "bytes"] = Field(
-        "bytes",
-        description="certificates as recorded earlier, with the key of another member, or with an altered byte",
-    )
     hold_s: float = Field(30.0, gt=0, description="seconds until the release")
     at_once: bool = Field(False, description="release all together, hold_s after the first was held")
     interval_s: float = Field(1.8, gt=0, description="seconds between two envelopes")
