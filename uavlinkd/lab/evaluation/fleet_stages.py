@@ -62,7 +62,7 @@ class FleetStage(DaemonStage):
             for number, name in enumerate(self.names, 1)
         }
         self.certificate_of_gone = self.authority.certify(self.gone.public, "gone", _GONE_ID)
-        self.revoked = [len(self.names) + 1]
+        self.revoked = [len(self.names) + 1, len(self.names) + 2]  # a later bulletin may not shrink
         self.bulletin = self.authority.publish(_NUMBER, *self.revoked)
         await super().open()
 
