@@ -5,13 +5,12 @@ from __future__ import annotations
 import re
 import tomllib
 from pathlib import Path
-from typing import Literal, get_args, get_origin
 
 import pytest
-from pydantic import BaseModel
-from pydantic.fields import FieldInfo
+from pydantic_core import CoreSchema
 
 from uavlinkd.config import schema
+from uavlinkd.config.section import Key, Section, read
 from uavlinkd.mavlink.dialect import GROUPS
 from uavlinkd.mavlink.policy.roles import ROLES
 from uavlinkd.mavlink.policy.settings import KEYS, read_settings
@@ -22,16 +21,16 @@ _MODELS = {schema.FileSection, schema.PolicySection, *schema.SINGLE.values(), *s
 _TITLES = dict(re.findall(r"^## (`\[*(\w+)\]*`|Policy|Top of the file)$", PAGE, re.MULTILINE))
 
 
-def _model(title: str) -> type[BaseModel]:
+def _model(title: str) -> type[Section]:
     name = {"Policy": "Policy", "Top of the file": "File"}.get(title) or _TITLES[title].title().replace("_", "")
-    model: type[BaseModel] = getattr(schema, f"{name}Section")
+    model: type[Section] = getattr(schema, f"{name}Section")
     return model
 
 
-def _own_keys(model: type[BaseModel]) -> set[str]:
+def _own_keys(model: type[Section]) -> set[str]:
     """The keys that a section adds to those it shares with others."""
     shared = (base for base in (schema.LinkSection, schema.PolicySection) if model is not base)
-    return set(model.model_fields) - {key for base in shared if issubclass(model, base) for key in base.model_fields}
+    return set(model.keys) - {key for base in shared if issubclass(model, base) for key in base.keys}
 
 
 def _rows(title: str) -> dict[str, tuple[str, str, str]]:
@@ -40,20 +39,20 @@ def _rows(title: str) -> dict[str, tuple[str, str, str]]:
     return {key: (kind, default, example) for key, kind, default, example in _ROW.findall(section)}
 
 
-def _limits(field: FieldInfo) -> set[str]:
+def _limits(kind: CoreSchema) -> set[str]:
     """The numbers of a key's range, or its choices."""
-    if get_origin(field.annotation) is Literal:
-        return set(map(str, get_args(field.annotation)))
-    return {f"{getattr(limit, end):.16g}" for limit in field.metadata for end in ("ge", "le") if hasattr(limit, end)}
+    facts = {**kind, **kind.get("schema", {})}
+    limits = (f"{facts[end]:.16g}" for end in ("ge", "le") if end in facts)
+    return {*map(str, facts.get("expected", ())), *limits}
 
 
-def _default(field: FieldInfo) -> object:
+def _default(key: Key) -> object:
     """A key's default as the page writes it."""
-    if field.is_required():
+    if key.is_required:
         return "required"
-    if isinstance(field.default, list):
-        return [suite.name for suite in field.default]
-    return "off" if field.default is None else field.default
+    if isinstance(key.default, list):
+        return [suite.name for suite in key.default]
+    return "off" if key.default is None else key.default
 
 
 ALL_ROWS = [(title, key, *row) for title in _TITLES for key, row in _rows(title).items()]
@@ -74,12 +73,12 @@ def test_row_agrees_with_the_schema(title: str, key: str, kind: str, default: st
         read_settings({**other, **tomllib.loads(f"{key} = {example}")}, is_local=False)
         return
     model = _model(title)
-    field = model.model_fields[key]
+    described = model.keys[key]
     written = tomllib.loads(f"value = {default.strip('`')}")["value"] if default.startswith("`") else default
-    assert written == _default(field)
-    assert _limits(field) <= set(re.findall(r"[\w.]+", kind))
+    assert written == _default(described)
+    assert _limits(described.kind) <= set(re.findall(r"[\w.]+", kind))
     value = tomllib.loads(f"value = {example}")["value"]
-    model.__pydantic_validator__.validate_assignment(model.model_construct(), key, value)
+    assert key in read(model, {key: value})[0]
 
 
 def test_groups_and_roles_are_listed() -> None:

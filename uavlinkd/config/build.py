@@ -83,8 +83,8 @@ def build(path: Path, file: Sections, states: Path) -> Config:
 
 
 def _fleet(file: Sections, states: Path) -> FleetConfig:
-    keys = FleetSection.model_construct(**file.fleet.valid)
-    link, limits = LinkSection.model_construct(**file.link.valid), _relay_server_keys(file)
+    keys = FleetSection(file.fleet.valid)
+    link, limits = LinkSection(file.link.valid), _relay_server_keys(file)
     own = keys.certificate.certificate.role
     policies = fleet_policies(file, own)
     usual = MemberRole.OPERATOR if own == MemberRole.VEHICLE else MemberRole.VEHICLE
@@ -147,12 +147,12 @@ def _contact_peers(file: Sections, fleet: FleetConfig) -> Iterator[PeerConfig]:
 
 
 def _endpoint(section: Values) -> EndpointConfig:
-    keys = EndpointSection.model_construct(**section.valid)
+    keys = EndpointSection(section.valid)
     return EndpointConfig(keys.name, keys.url, policy_data(section), keys.radio_status, keys.status_text)
 
 
 def _peer(file: Sections, peer: Values) -> PeerConfig:
-    keys = LinkSection.model_construct(**inherited(file.link, peer))
+    keys = LinkSection(inherited(file.link, peer))
     link, used = link_of(keys), _relays(peer, file.used_relays)
     if file.has_fleet:
         link = fleet_link(link)
@@ -170,7 +170,7 @@ def _peer(file: Sections, peer: Values) -> PeerConfig:
 
 def inherited(link: Values, peer: Values) -> dict[str, Any]:
     """The link keys that apply to a peer: its own, else those of ``[link]``, without defaults."""
-    return {key: value for key, value in {**link.valid, **peer.valid}.items() if key in LinkSection.model_fields}
+    return {key: value for key, value in {**link.valid, **peer.valid}.items() if key in LinkSection.keys}
 
 
 def link_of(keys: LinkSection) -> Link:
@@ -213,7 +213,7 @@ def verify_interval_s(budget_bits_s: int, tag_bytes: int) -> float:
 def policy_data(section: Values) -> PolicyData:
     """The section's policy, as data that cannot change and that messages may repeat."""
     return MappingProxyType(
-        {key: _frozen(key, value) for key, value in section.valid.items() if key in PolicySection.model_fields}
+        {key: _frozen(key, value) for key, value in section.valid.items() if key in PolicySection.keys}
     )
 
 
@@ -262,7 +262,7 @@ def _addresses(peer: Values, sections: Sequence[Values]) -> tuple[PeerAddress, .
 
 def _relay(file: Sections, section: Values, fleet: FleetConfig | None) -> RelayConfig:
     """A relay. It inherits the suites of ``[link]``."""
-    suites, is_contact = LinkSection.model_construct(**file.link.valid).suites, section.kind == "contact"
+    suites, is_contact = LinkSection(file.link.valid).suites, section.kind == "contact"
     link = Link(tuple(suites), timers=TIMERS, features=c.KNOWN_FEATURES & ~c.FEATURE_FLEET)
     peer = peer_of(section, file.peers)
     if fleet is not None and is_contact and role_of(section) in fleet.policies:
@@ -281,7 +281,7 @@ def _relay(file: Sections, section: Values, fleet: FleetConfig | None) -> RelayC
 
 
 def _relay_server_keys(file: Sections) -> RelayServerSection:
-    return RelayServerSection.model_construct(**file.relay_server.valid)
+    return RelayServerSection(file.relay_server.valid)
 
 
 def _relay_server(file: Sections) -> RelayServer | None:
@@ -289,13 +289,13 @@ def _relay_server(file: Sections) -> RelayServer | None:
     if not file.is_relay:
         return None
     keys = _relay_server_keys(file)
-    link = replace(link_of(LinkSection.model_construct(**file.link.valid)), features=c.FEATURE_RECORDS)
+    link = replace(link_of(LinkSection(file.link.valid)), features=c.FEATURE_RECORDS)
     link = fleet_link(link) if file.has_fleet else link
     every = tuple(_member(file, section, link) for section in file.members)
     return RelayServer(every, RelayLimits(keys.datagrams_s, keys.bits_s), keys.https)
 
 
 def _member(file: Sections, section: Values, link: Link) -> MemberSettings:
-    keys = MemberSection.model_construct(**section.valid)
+    keys = MemberSection(section.valid)
     peer = PeerSettings(keys.name, keys.public_key, file.secret(section, "psk_file"), link, initiates=False)
     return MemberSettings(peer, keys.max_peers, RelayLimits(keys.datagrams_s, keys.bits_s))

@@ -103,7 +103,7 @@ def _clash(a: NetworkUrl, b: NetworkUrl) -> str | None:
 def _timers(section: Values, link: Values | None = None) -> Found:
     """The timers of ``[link]``, or of a peer that inherits from it, are in order."""
     given = inherited(link, section) if link else section.valid
-    values = {name: field.default for name, field in LinkSection.model_fields.items()} | given
+    values = {name: key.default for name, key in LinkSection.keys.items()} | given
     unknown = section.invalid | (link.invalid - set(section.valid) if link else frozenset())
     least = values["rekey_after_s"] + _RETRIES_BEFORE_REJECT * values["retry_max_s"]
     for key, others, is_wrong, message in (

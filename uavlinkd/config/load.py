@@ -22,6 +22,7 @@ from uavlinkd.config.build import build
 from uavlinkd.config.keys import CREDENTIALS, KeyFileError, decode_key, find_secret_file, read_secret_file
 from uavlinkd.config.model import Config, ConfigError, Problem
 from uavlinkd.config.problems import Problems, Sections, Values, example_of
+from uavlinkd.config.section import Section
 from uavlinkd.config.tls_files import TlsFileError, find_tls_files
 from uavlinkd.core.crypto import Secret
 from uavlinkd.system.tasks import Threads
@@ -189,7 +190,7 @@ def _table(problems: Problems, table: Mapping[str, Any], key: str) -> Mapping[st
     return {}
 
 
-def _sections(problems: Problems, table: Mapping[str, Any], key: str, model: type[schema.Section]) -> list[Values]:
+def _sections(problems: Problems, table: Mapping[str, Any], key: str, model: type[Section]) -> list[Values]:
     value = table.get(key, [])
     sections = value if isinstance(value, list) else [value]
     if key == "relay" and isinstance(value, bool):

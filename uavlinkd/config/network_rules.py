@@ -78,7 +78,7 @@ def _wrong(written: PeerAddress, known: set[str], serial: set[str], configs: Seq
 
 
 def network_of(section: Values) -> NetworkConfig:
-    keys = NetworkSection.model_construct(**section.valid)
+    keys = NetworkSection(section.valid)
     air_bits_s = 0 if keys.serial is None else _air_bits_s(section, keys.serial)
     budget_bits_s = int(SENDING_SHARE * air_bits_s) if air_bits_s else keys.budget_bits_s
     return NetworkConfig(

@@ -13,13 +13,12 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pydantic import ValidationError
-from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from uavlinkd.authority.trust import HeldCertificate
 from uavlinkd.config import schema
 from uavlinkd.config.model import ConfigError, Problem
+from uavlinkd.config.section import Key, Section, read
 from uavlinkd.core.certificates import MemberRole
 from uavlinkd.core.crypto import Secret, x25519_public_key
 from uavlinkd.mavlink.policy.settings import INSTEAD_OF_DENIAL
@@ -147,18 +146,12 @@ class Problems:
         if self._found:
             raise ConfigError(tuple(self._found))
 
-    def read(self, model: type[schema.Section], table: Mapping[str, Any], section: str) -> Values:
-        valid: dict[str, Any] = {}
-        invalid: set[str] = set()
-        try:
-            model.model_validate(table, context=valid)
-        except ValidationError as error:
-            values = Values(section, valid, frozenset())
-            for details in error.errors(include_url=False, include_input=False):
-                invalid.add(str(details["loc"][0]))
-                self.add(values.at(_path(details["loc"])), _message(details, model))
-        # The context has no list with an invalid item, but it may have a value that a later check refused.
-        return Values(section, {key: valid[key] for key in valid if key not in invalid}, frozenset(invalid))
+    def read(self, model: type[Section], table: Mapping[str, Any], section: str) -> Values:
+        valid, problems = read(model, table)
+        values = Values(section, valid, frozenset(str(details["loc"][0]) for details in problems))
+        for details in problems:
+            self.add(values.at(_path(details["loc"])), _message(details, model))
+        return values
 
 
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]{1,32}")
@@ -185,7 +178,7 @@ _MESSAGES = {
 """The problem and its remedy, for each kind of error that the schema raises."""
 
 
-def _message(details: ErrorDetails, model: type[schema.Section]) -> str:
+def _message(details: ErrorDetails, model: type[Section]) -> str:
     key, context = str(details["loc"][0]), details.get("ctx", {})
     if details["type"] == "extra_forbidden":
         return unknown_key(key, model)
@@ -194,28 +187,28 @@ def _message(details: ErrorDetails, model: type[schema.Section]) -> str:
     limit = context.get("ge", context.get("le"))
     return _MESSAGES.get(details["type"], "cannot be used: write {key} = {example}").format(
         key=key,
-        example=_example(model.model_fields[key]),
+        example=_example(model.keys[key]),
         limit=f"{limit:g}" if isinstance(limit, float) else limit,
         expected=context.get("expected"),
     )
 
 
-def _example(field: FieldInfo) -> str:
+def _example(key: Key) -> str:
     """A value as it is written in TOML. A person who writes a boolean wants another value than the default."""
-    if field.examples:
-        return str(field.examples[0])
-    if isinstance(field.default, bool):
-        return str(not field.default).lower()
-    return f"{field.default:g}" if isinstance(field.default, int | float) else f'"{field.default}"'
+    if key.example:
+        return key.example
+    if isinstance(key.default, bool):
+        return str(not key.default).lower()
+    return f"{key.default:g}" if isinstance(key.default, int | float) else f'"{key.default}"'
 
 
 def example_of(key: str) -> str | None:
     """A value of a key as it is written in TOML; None if no section has the key."""
-    fields = (model.model_fields.get(key) for model in _SECTIONS.values())
-    return next((_example(field) for field in fields if field is not None), None)
+    keys = (model.keys.get(key) for model in _SECTIONS.values())
+    return next((_example(one) for one in keys if one is not None), None)
 
 
-_SECTIONS: dict[str, type[schema.Section]] = {
+_SECTIONS: dict[str, type[Section]] = {
     "at the top, before the first [section]": schema.FileSection,
     "in [link] or in a [[peer]]": schema.LinkSection,
     "in a [[peer]] or an [[endpoint]]": schema.PolicySection,
@@ -225,8 +218,8 @@ _SECTIONS: dict[str, type[schema.Section]] = {
 
 _UDP, _SERIAL = 'url = "udpin:127.0.0.1:14550"', 'url = "serial:/dev/ttyACM0:57600"'
 _IN_A_FILE = "the name of a file that holds the key: this file never contains a key"
-_OTHERS_CALL_IT: dict[type[schema.Section], dict[str, str]] = {
-    schema.Section: {
+_OTHERS_CALL_IT: dict[type[Section], dict[str, str]] = {
+    Section: {
         "private_key": f"private_key_file, {_IN_A_FILE}",
         **dict.fromkeys(("psk", "preshared_key"), f"psk_file, {_IN_A_FILE}"),
         "listen_port": 'listen, with an address: listen = ["0.0.0.0:5790"]',
@@ -263,19 +256,19 @@ _REMOVED = {
 """Keys and sections that files of earlier versions may have."""
 
 
-def unknown_key(key: str, model: type[schema.Section]) -> str:
+def unknown_key(key: str, model: type[Section]) -> str:
     if key in _REMOVED:
         return f"was removed: {_REMOVED[key]}"
     plain = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|[ -]", "_", key).lower()
-    for section in (model, schema.Section):
+    for section in (model, Section):
         if remedy := _OTHERS_CALL_IT.get(section, {}).get(plain):
             return f"is not known here: write {remedy}"
     if key in _SECTION_NAMES:
         return f"does not belong here: write {_SECTION_NAMES[key]}, a section of its own"
     for where, other in _SECTIONS.items():
-        if key in other.model_fields and key not in model.model_fields:
+        if key in other.keys and key not in model.keys:
             return f"does not belong here: write it {where}"
-    known = [*model.model_fields, *(_SECTION_NAMES if model is schema.FileSection else ())]
+    known = [*model.keys, *(_SECTION_NAMES if model is schema.FileSection else ())]
     if close := get_close_matches(plain, known, n=1, cutoff=0.7):
         return f"is not known: did you mean {_SECTION_NAMES.get(close[0], close[0])}?"
     return f"is not known here: the keys are {', '.join(known)}"

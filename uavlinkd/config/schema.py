@@ -11,13 +11,25 @@ from collections.abc import Callable
 from contextlib import suppress
 from ipaddress import IPv4Address, IPv6Address, ip_address
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Final
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PlainValidator, ValidationInfo, field_validator
+from pydantic_core import CoreSchema
 
 from uavlinkd.authority.trust import HeldCertificate
 from uavlinkd.config.keys import decode_key, is_canonical_public_key
 from uavlinkd.config.model import SERIAL, HttpsServer, PeerAddress
+from uavlinkd.config.section import (
+    ANYTHING,
+    BOOLEAN,
+    Section,
+    checked,
+    choice,
+    each,
+    integer,
+    key,
+    number,
+    parsed,
+)
 from uavlinkd.core import constants as c
 from uavlinkd.core.certificates import LAST_SERIAL, parse_bulletin, parse_certificate
 from uavlinkd.core.certificates import NAME as MEMBER_NAME
@@ -65,20 +77,20 @@ def _file_name(value: Any) -> str:
 
 def _public_key(value: Any) -> bytes:
     try:
-        key = decode_key(_text(value))
+        decoded = decode_key(_text(value))
     except ValueError as error:
         raise ValueError(f"{error}: write what `uavlinkd pubkey` prints there") from None
-    if not is_usable_public_key(key):
+    if not is_usable_public_key(decoded):
         raise ValueError(
             "is a point of low order, with which everyone knows the shared secret:"
             " write what `uavlinkd pubkey` prints there"
         )
-    if not is_canonical_public_key(key):
+    if not is_canonical_public_key(decoded):
         raise ValueError(
             "is not a public key of X25519, but perhaps a private key, which must stay secret:"
             " write what `uavlinkd pubkey` prints there"
         )
-    return key
+    return decoded
 
 
 def _suite(value: Any) -> Suite:
@@ -199,76 +211,42 @@ def _member_name(value: Any) -> str:
     return str(value)
 
 
-def _signed(parse: Callable[[bytes], object], what: str) -> PlainValidator:
+def _signed(parse: Callable[[bytes], object], what: str) -> CoreSchema:
     """A value of the line that an authority prints, in base64. Its signature: :mod:`uavlinkd.config.fleet_rules`."""
 
     def check(value: Any) -> object:
         text = _text(value)
         with suppress(ValueError, Drop):
-            if (parsed := parse(from_base64(text))) is not None:
-                return parsed
+            if (result := parse(from_base64(text))) is not None:
+                return result
         raise ValueError(f"is not {what}, or was cut: {ENROLL_AGAIN}")
 
-    return PlainValidator(check)
+    return parsed(check)
 
 
-Name = Annotated[str, PlainValidator(_name)]
-FileName = Annotated[str, PlainValidator(_file_name)]
-PublicKey = Annotated[bytes, PlainValidator(_public_key)]
-Suites = Annotated[list[Annotated[Suite, PlainValidator(_suite)]], AfterValidator(_suites)]
-ListenAddress = Annotated[Address, PlainValidator(lambda value: parse_address(_text(value), allow_names=False))]
-PeerAddresses = Annotated[list[Annotated[PeerAddress, PlainValidator(_peer_address)]], AfterValidator(_addresses)]
-Interface = Annotated[str, PlainValidator(_interface)]
-OwnAddress = Annotated[str, PlainValidator(_own_address)]
-SerialLine = Annotated[SerialUrl, PlainValidator(lambda value: parse_line(_text(value)))]
-Url = Annotated[EndpointUrl, PlainValidator(lambda value: parse_url(_text(value)))]
-Https = Annotated[HttpsServer, PlainValidator(_https)]
-Budget = Annotated[int, AfterValidator(_budget)]
-Authority = Annotated[AuthorityKey, _signed(AuthorityKey, "the public key of an authority")]
-KeyHash = Annotated[bytes, _signed(lambda data: data if len(data) == c.KEY_BYTES else None, "a hash of 32 bytes")]
-SignedCertificate = Annotated[
-    HeldCertificate, _signed(lambda data: HeldCertificate(parse_certificate(data), data), "a certificate")
-]
-SignedBulletin = Annotated[bytes, _signed(lambda data: data if parse_bulletin(data) else None, "a bulletin")]
-MemberName = Annotated[str, PlainValidator(_member_name)]
-FrameRole = Literal["vehicle", "operator", "observer"]
+NAME: Final = parsed(_name)
+FILE_NAME: Final = parsed(_file_name)
+PUBLIC_KEY: Final = parsed(_public_key)
+PEER_ADDRESSES: Final = checked(each(parsed(_peer_address)), _addresses)
+BUDGET: Final = checked(integer(0, 10**9), _budget)
+CERTIFICATE: Final = _signed(lambda data: HeldCertificate(parse_certificate(data), data), "a certificate")
+FRAME_ROLE: Final = choice("vehicle", "operator", "observer")
 
 
 def _seconds(default: float, least: float, most: float) -> Any:
-    return Field(default=default, ge=least, le=most, allow_inf_nan=False)
+    return key(number(least, most), default)
 
 
-_MESSAGES = Field(default=None, examples=['["heartbeat", "telemetry"]'])
 _SIGNED = '"…", which `uavlinkd enroll --finish` writes'
-_RATES = Field(default=None, examples=["{ ATTITUDE = 10 }"])
-
-
-class Section(BaseModel):
-    """Unknown keys are refused, nothing is converted, and no message repeats what was written."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, hide_input_in_errors=True)
-
-    @field_validator("*")
-    @classmethod
-    def _keep(cls, value: Any, info: ValidationInfo) -> Any:
-        """Put each valid value of the file into the context, if there is one.
-
-        The checks of several values use it while other values are invalid, so one run reports every problem.
-        """
-        if info.context is not None:
-            info.context[info.field_name] = value
-        return value
 
 
 class LinkSection(Section):
     """``[link]``, and the same keys in ``[[peer]]``: how to communicate with peers."""
 
-    suites: Suites = Field(default=[X25519], examples=['["x25519"]'])
-    confidential: bool = False
-    tag_bits: Literal[64, 96, 128] = 128
-    max_envelope_bytes: int = Field(
-        default=c.DEFAULT_ENVELOPE_LIMIT, ge=c.MIN_ENVELOPE_LIMIT, le=c.MAX_ENVELOPE_LIMIT
-    )
+    suites: list[Suite] = key(checked(each(parsed(_suite)), _suites), [X25519], '["x25519"]')
+    confidential: bool = key(BOOLEAN, False)
+    tag_bits: int = key(choice(64, 96, 128), 128)
+    max_envelope_bytes: int = key(integer(c.MIN_ENVELOPE_LIMIT, c.MAX_ENVELOPE_LIMIT), c.DEFAULT_ENVELOPE_LIMIT)
 
     keepalive_s: float = _seconds(c.KEEPALIVE_S, 0.1, 3600)
     lost_after_s: float = _seconds(c.LOST_AFTER_S, 0.2, 1200)
@@ -277,21 +255,21 @@ class LinkSection(Section):
     reject_after_s: float = _seconds(c.REJECT_AFTER_S, 1, 7200)
     probe_interval_s: float = _seconds(c.PROBE_INTERVAL_S, 0.1, 3600)
 
-    budget_bits_s: Budget = Field(default=_EGRESS.budget_bits_s, ge=0, le=10**9)
+    budget_bits_s: int = key(BUDGET, _EGRESS.budget_bits_s)
     coalesce_s: float = _seconds(_EGRESS.coalesce_s, 0, 0.5)
     max_age_s: float = _seconds(_EGRESS.max_age_s, 0.1, 60)
-    redundancy: Literal["critical", "all", "none"] = "critical"
+    redundancy: str = key(choice("critical", "all", "none"), "critical")
     idle_probe_s: float = _seconds(c.PROBE_IDLE_S, 0, 3600)
 
 
 class NetworkSection(Section):
-    name: Name = Field(examples=['"lte"'])
-    interface: Interface | None = Field(default=None, examples=['"wwan0"'])
-    address: OwnAddress | None = Field(default=None, examples=['"10.0.0.5"'])
-    serial: SerialLine | None = Field(default=None, examples=['"/dev/ttyUSB0:57600"'])
-    air_bits_s: int | None = Field(default=None, ge=_LEAST_AIR, le=10_000_000, examples=["24000"])
-    metered: bool = False
-    budget_bits_s: Budget = Field(default=0, ge=0, le=10**9)
+    name: str = key(NAME, example='"lte"')
+    interface: str | None = key(parsed(_interface), None, '"wwan0"')
+    address: str | None = key(parsed(_own_address), None, '"10.0.0.5"')
+    serial: SerialUrl | None = key(parsed(lambda value: parse_line(_text(value))), None, '"/dev/ttyUSB0:57600"')
+    air_bits_s: int | None = key(integer(_LEAST_AIR, 10_000_000), None, "24000")
+    metered: bool = key(BOOLEAN, False)
+    budget_bits_s: int = key(BUDGET, 0)
 
 
 class PolicySection(Section):
@@ -300,95 +278,99 @@ class PolicySection(Section):
     :func:`uavlinkd.mavlink.policy.settings.read_settings` checks them together.
     """
 
-    role: Any = Field(default=None, examples=['"swarm-member"'])
-    system_ids: Any = Field(default=None, examples=["[2]"])
-    allow_in: Any = _MESSAGES
-    allow_out: Any = _MESSAGES
-    rate_in: Any = _RATES
-    rate_out: Any = _RATES
-    mavlink1: Any = Field(default=None, examples=["false"])
-    ground_station: Any = Field(default=None, examples=["false"])
+    role: Any = key(ANYTHING, None, '"swarm-member"')
+    system_ids: Any = key(ANYTHING, None, "[2]")
+    allow_in: Any = key(ANYTHING, None, '["heartbeat", "telemetry"]')
+    allow_out: Any = key(ANYTHING, None, '["heartbeat", "telemetry"]')
+    rate_in: Any = key(ANYTHING, None, "{ ATTITUDE = 10 }")
+    rate_out: Any = key(ANYTHING, None, "{ ATTITUDE = 10 }")
+    mavlink1: Any = key(ANYTHING, None, "false")
+    ground_station: Any = key(ANYTHING, None, "false")
 
 
 class KeySection(Section):
     """The keys in ``[[peer]]``, ``[[relay]]`` and ``[[member]]`` that say who another daemon is."""
 
-    name: Name = Field(examples=['"drone1"'])
-    public_key: PublicKey = Field(examples=['"…", what `uavlinkd pubkey` prints there'])
-    psk_file: FileName | None = Field(default=None, examples=['"drone0-drone1.psk"'])
+    name: str = key(NAME, example='"drone1"')
+    public_key: bytes = key(PUBLIC_KEY, example='"…", what `uavlinkd pubkey` prints there')
+    psk_file: str | None = key(FILE_NAME, None, '"drone0-drone1.psk"')
 
 
 class PeerSection(LinkSection, PolicySection, KeySection):
-    addresses: PeerAddresses = Field(default=[], examples=['["10.13.0.2:5790"]'])
-    relays: list[Name] | None = Field(default=None, examples=["[]"])
+    addresses: list[PeerAddress] = key(PEER_ADDRESSES, [], '["10.13.0.2:5790"]')
+    relays: list[str] | None = key(each(NAME), None, "[]")
 
 
 class RelaySection(KeySection):
-    addresses: PeerAddresses = Field(default=[], examples=['["relay.example.org:5790"]'])
+    addresses: list[PeerAddress] = key(PEER_ADDRESSES, [], '["relay.example.org:5790"]')
 
 
 class MemberSection(KeySection):
-    max_peers: int = Field(default=256, ge=1, le=4000)
-    datagrams_s: int = Field(default=2000, ge=1, le=10**6)
-    bits_s: int = Field(default=20_000_000, ge=LEAST_BUDGET, le=10**10, examples=["20_000_000"])
+    max_peers: int = key(integer(1, 4000), 256)
+    datagrams_s: int = key(integer(1, 10**6), 2000)
+    bits_s: int = key(integer(LEAST_BUDGET, 10**10), 20_000_000, "20_000_000")
 
 
 class RelayServerSection(Section):
-    https: Https | None = Field(default=None, examples=[_HTTPS])
-    datagrams_s: int = Field(default=10**6, ge=1, le=10**6, examples=["100_000"])
-    bits_s: int = Field(default=10**10, ge=LEAST_BUDGET, le=10**10, examples=["100_000_000"])
-    member_max_peers: int = Field(default=256, ge=1, le=4000)
-    member_datagrams_s: int = Field(default=2000, ge=1, le=10**6)
-    member_bits_s: int = Field(default=20_000_000, ge=LEAST_BUDGET, le=10**10, examples=["20_000_000"])
+    https: HttpsServer | None = key(parsed(_https), None, _HTTPS)
+    datagrams_s: int = key(integer(1, 10**6), 10**6, "100_000")
+    bits_s: int = key(integer(LEAST_BUDGET, 10**10), 10**10, "100_000_000")
+    member_max_peers: int = key(integer(1, 4000), 256)
+    member_datagrams_s: int = key(integer(1, 10**6), 2000)
+    member_bits_s: int = key(integer(LEAST_BUDGET, 10**10), 20_000_000, "20_000_000")
 
 
 class FleetSection(Section):
-    authority: Authority = Field(examples=[_SIGNED])
-    successor: KeyHash | None = Field(default=None, examples=[_SIGNED])
-    certificate: SignedCertificate = Field(examples=[_SIGNED])
-    bulletin: SignedBulletin = Field(examples=[_SIGNED])
-    call: list[FrameRole] | None = Field(default=None, examples=['["operator"]'])
-    operator: Literal["certificate", "pinned"] = "certificate"
-    require_bulletin: int = Field(default=0, ge=0, le=LAST_SERIAL)
-    deny: list[MemberName] = Field(default=[], examples=['["v3"]'])
+    authority: AuthorityKey = key(_signed(AuthorityKey, "the public key of an authority"), example=_SIGNED)
+    successor: bytes | None = key(
+        _signed(lambda data: data if len(data) == c.KEY_BYTES else None, "a hash of 32 bytes"), None, _SIGNED
+    )
+    certificate: HeldCertificate = key(CERTIFICATE, example=_SIGNED)
+    bulletin: bytes = key(_signed(lambda data: data if parse_bulletin(data) else None, "a bulletin"), example=_SIGNED)
+    call: list[str] | None = key(each(FRAME_ROLE), None, '["operator"]')
+    operator: str = key(choice("certificate", "pinned"), "certificate")
+    require_bulletin: int = key(integer(0, LAST_SERIAL), 0)
+    deny: list[str] = key(each(parsed(_member_name)), [], '["v3"]')
 
 
 class ContactSection(Section):
-    public_key: PublicKey = Field(examples=[_SIGNED])
-    certificate: SignedCertificate = Field(examples=[_SIGNED])
-    addresses: PeerAddresses = Field(default=[], examples=['["relay.example.org:5790"]'])
-    relays: bool = False
+    public_key: bytes = key(PUBLIC_KEY, example=_SIGNED)
+    certificate: HeldCertificate = key(CERTIFICATE, example=_SIGNED)
+    addresses: list[PeerAddress] = key(PEER_ADDRESSES, [], '["relay.example.org:5790"]')
+    relays: bool = key(BOOLEAN, False)
 
 
 class FleetRoleSection(PolicySection):
     """``[[fleet_role]]``: what the members with a role may send here, instead of the usual policy."""
 
-    name: FrameRole = Field(examples=['"operator"'])
+    name: str = key(FRAME_ROLE, example='"operator"')
 
 
 class EndpointSection(PolicySection):
-    name: Name = Field(examples=['"autopilot"'])
-    url: Url = Field(examples=['"udpin:127.0.0.1:14550"'])
-    radio_status: bool = False
-    status_text: bool = False
+    name: str = key(NAME, example='"autopilot"')
+    url: EndpointUrl = key(parsed(lambda value: parse_url(_text(value))), example='"udpin:127.0.0.1:14550"')
+    radio_status: bool = key(BOOLEAN, False)
+    status_text: bool = key(BOOLEAN, False)
 
 
 class RoutingSection(Section):
-    relay: bool = False
+    relay: bool = key(BOOLEAN, False)
 
 
 class LogSection(Section):
-    level: Literal["debug", "info", "warning", "error"] = "info"
-    format: Literal["auto", "console", "json"] = "auto"
+    level: str = key(choice("debug", "info", "warning", "error"), "info")
+    format: str = key(choice("auto", "console", "json"), "auto")
 
 
 class FileSection(Section):
     """The top of the file. Its sections are read one by one, so that each problem names its section."""
 
-    name: Name = Field(examples=['"drone0"'])
-    private_key_file: FileName = Field(examples=['"drone0.key"'])
-    listen: list[ListenAddress] = Field(default=[], examples=['["0.0.0.0:5790"]'])
-    control_socket: FileName | None = Field(default=None, examples=['"drone0.sock"'])
+    name: str = key(NAME, example='"drone0"')
+    private_key_file: str = key(FILE_NAME, example='"drone0.key"')
+    listen: list[Address] = key(
+        each(parsed(lambda value: parse_address(_text(value), allow_names=False))), [], '["0.0.0.0:5790"]'
+    )
+    control_socket: str | None = key(FILE_NAME, None, '"drone0.sock"')
 
 
 SINGLE: dict[str, type[Section]] = {
