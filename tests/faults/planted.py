@@ -134,7 +134,7 @@ PLACES: Final[Sequence[Place]] = (
     Place("endpoints/udp.py", "UdpServer.do_housekeeping"),
     Place("relay/service.py", "RelayService.do_housekeeping"),
     Place("relay/service.py", "RelayService.settle"),
-    Place("link/diagnosis.py", "find"),
+    Place("link/findings.py", "find"),
     Place("link/drop_summary.py", "DropSummary.check"),
     # The relay, the disk, and requests.
     Place("link/carrier.py", "FrameCarrier._unwrap"),

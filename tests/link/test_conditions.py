@@ -29,7 +29,7 @@ from uavlinkd.link.conditions import (
 )
 from uavlinkd.link.event_log import ENDED_PROBLEMS, ENDPOINT_DELAY_S, FINDING_DELAY_S, EventLog
 from uavlinkd.link.evidence import History
-from uavlinkd.ops.findings import Finding, Severity, Subject
+from uavlinkd.link.finding import Finding, Severity, Subject
 
 BEGAN, CONTINUED, ENDED = Phase
 

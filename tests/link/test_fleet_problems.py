@@ -14,8 +14,8 @@ import pytest
 
 from tests.config.files import KEY
 from tests.config.fleets import OTHER_SIGNER, bulletin, certificate, contact, fleet, load_member, member_file
-from tests.link.test_diagnosis import NOW, STRANGER, Daemon
 from tests.link.test_evidence import THERE
+from tests.link.test_findings import NOW, STRANGER, Daemon
 from uavlinkd.authority import state_file
 from uavlinkd.authority.constants import CONTACTS_FIRST_S, HAVE_INTERVAL_S
 from uavlinkd.config.keys import encode_key
@@ -25,9 +25,9 @@ from uavlinkd.core.outputs import Dropped, RecordReceived
 from uavlinkd.core.path import SERIAL_HOST
 from uavlinkd.core.path import Path as NetPath
 from uavlinkd.core.relay_records import BulletinRecord, CertificateRecord, FleetRecord, Have
+from uavlinkd.link.finding import Severity, Subject
 from uavlinkd.link.fleet_members import EVENT_S, FleetMembers
 from uavlinkd.link.fleet_shell import FleetShell
-from uavlinkd.ops.findings import Severity, Subject
 
 C, D = (b64decode(KEY[name]) for name in ("c", "d"))
 
@@ -167,24 +167,21 @@ async def test_bulletins_that_contradict_each_other(tmp_path: Path) -> None:
     assert member.record(BulletinRecord(b64decode(bulletin(3, 8)))) is None
     findings = member.findings()
     assert {cause: finding.severity for cause, finding in findings.items()} == {
-        "bulletin_conflict": Severity.SECURITY,
-        "bulletin_shrinks": Severity.SECURITY,
-        "bulletin_rolled_back": Severity.WARNING,
+        "bulletin_conflict": Severity.SECURITY
     }
     assert all(finding.text.startswith("drone1 ") for finding in findings.values())
     assert member.findings(NOW + EVENT_S) == {}
 
 
 async def test_revoked_here_and_elsewhere(tmp_path: Path) -> None:
-    """This daemon, its contact, and a pinned peer, which stays; a bulletin that is too old for the file."""
+    """This daemon, and a pinned peer, which stays; a bulletin that is too old for the file."""
     member = Member(tmp_path, news=bulletin(2, 2, 7, 9), more="require_bulletin = 3", contacts=contact())
     member.have(2, bulletin(2, 2, 7, 9), serial=9)
     findings = member.findings()
     assert set(findings) == {
-        *("own_certificate_revoked", "contact_refused", "bulletin_awaited", "revoked_but_pinned")
+        *("own_certificate_revoked", "bulletin_awaited", "revoked_but_pinned"),
     }
     assert "revokes the certificate of this daemon (serial 7)" in findings["own_certificate_revoked"].text
-    assert "the contact gs (serial 2) is refused: the bulletin revokes" in findings["contact_refused"].text
     assert findings["revoked_but_pinned"].subject is Subject.PEER
     assert "(serial 9)" in findings["revoked_but_pinned"].text
 

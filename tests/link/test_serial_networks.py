@@ -14,18 +14,17 @@ from tests.link.socket_states import SocketStateLog
 from uavlinkd.config.model import NetworkConfig
 from uavlinkd.endpoints.serial_line import SerialLine
 from uavlinkd.endpoints.url import SerialUrl
-from uavlinkd.link.diagnosis import line_problems
 from uavlinkd.link.serial_networks import (
     LATER_S,
     LEAST_BITS_S,
     LEAST_SHARE,
     NOISE_PIECES,
     SHORTEST_OF_S,
-    SLOW_FOR_S,
     UNANSWERED,
     LineRate,
     SerialNetworks,
 )
+from uavlinkd.link.signs import line_noise
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.stall import StallWatch
 
@@ -106,55 +105,25 @@ async def test_late_and_missing_answers_along_the_best_path_lower_the_budget(ser
         assert budgets[NUMBER].all.rate == bits_s / 8
 
 
-@pytest.mark.parametrize("carried", [4_000, 24_000])
-async def test_finding_about_a_radio_that_carries_less_than_the_file_says(
-    serial: SerialNetworks, carried: int
-) -> None:
-    """What it carried in both directions while answers were late, unless it is what the file says."""
-    (network,) = serial.networks
-    state: Any = SimpleNamespace(path=network.path, round_trip_s=None, answered_at=0.0, is_off=False)
-    requests, paths = SimpleNamespace(was_late=True, unanswered=0), SimpleNamespace(states=[state], best=state)
-    peer: Any = SimpleNamespace(paths=paths, echo_requests=requests)
-    parts: Any = SimpleNamespace(peer_sockets=SimpleNamespace(serial=serial))
-    network.note_answers(peer, state, 0.0)
-    for _ in range(20):
-        network.line.bytes_written += carried // 16
-        network.line.bytes_received += carried // 16
-        network.line.decoder.datagrams += 1
-        serial.do_housekeeping()
-    assert [*line_problems(cast(Any, SimpleNamespace(daemon=parts, now=20.0)))] == []
-    network.note_answers(peer, state, 20.0)
-    serial.do_housekeeping()  # nothing comes any more: the peer is gone, and no answer will be in time
-    network.note_answers(peer, state, 21.0)
-    found = [*line_problems(cast(Any, SimpleNamespace(daemon=parts, now=20.0 + SLOW_FOR_S)))]
-    assert [one.cause for one in found] == (["radio_slow"] if carried == 4_000 else [])
-    assert [*line_problems(cast(Any, SimpleNamespace(daemon=parts, now=20.1 + SLOW_FOR_S)))] == []
-    for one in found:
-        assert "4,000 bits/s" in one.text
-        assert "24,000" in one.text
-        assert "air_bits_s = 4000" in one.remedy
-
-
-async def test_findings_about_modem_and_noise(serial: SerialNetworks) -> None:
-    """They name the setting, and end when it stops."""
+async def test_finding_about_noise(serial: SerialNetworks) -> None:
+    """It names the baud rate, and ends when the noise stops."""
     decoder = serial.networks[0].line.decoder
     serial.do_housekeeping()
     moment: Any = SimpleNamespace(
         daemon=SimpleNamespace(peer_sockets=SimpleNamespace(serial=serial)), now=monotonic()
     )
-    assert [*line_problems(moment)] == []
+    assert [*line_noise(moment)] == []
     decoder.feed(report())
     decoder.feed(b"noise\0" * NOISE_PIECES)
     serial.do_housekeeping()
-    modem, noise = line_problems(moment)
-    assert "MAVLINK=0" in modem.remedy
-    assert "57600" in noise.remedy
+    (noise,) = line_noise(moment)
+    assert (noise["noise"], noise["baud"]) == (NOISE_PIECES, 57600)
     line = cast(Any, serial.networks[0].status(monotonic())["serial"])
     assert line["radio"]["rssi"] == 200
     assert (line["discarded"]["bad_cobs"], line["discarded_bytes"]["bad_cobs"]) == (NOISE_PIECES, 5 * NOISE_PIECES)
     for _ in range(20):
         serial.do_housekeeping()
-    assert [*line_problems(moment)] == []
+    assert [*line_noise(moment)] == []
     assert cast(Any, serial.networks[0].status(monotonic())["serial"])["radio"] is None, "old figures"
 
 

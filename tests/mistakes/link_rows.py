@@ -49,7 +49,7 @@ LINK_ROWS = (
         "23",
         scenes.families,
         check=r'add "\[::\]:(?!5790)\d+" to listen',
-        signs=_both("family_missing", r'add "\[::\]:(?!5790)\d+"'),
+        signs=_both("no_route", r'add "\[::\]:(?!5790)\d+"'),
     ),
     Mistake("25", scenes.psk, signs=_both("wrong_psk", r"same psk_file")),
     Mistake("26", scenes.suites, signs=_both("no_common_suite", r"write this end's suites")),

@@ -97,8 +97,8 @@ async def netcheck(daemon: DaemonProcess) -> str:
     ("relays", "ports", "rules", "cause", "text", "shown"),
     [
         (
-            *(2, 1, ["ip saddr {D} meta l4proto udp"], "udp_blocked"),
-            "UDP is probably blocked here: none of 2 relays on different hosts answers (vps0, vps1)",
+            *(2, 1, ["ip saddr {D} meta l4proto udp"], "relay_not_answering"),
+            "a firewall drops UDP here or there",
             "UDP vps0: does not answer no answer at 11.0.3.2:5790 UDP vps1: does not answer",
         ),
         (
@@ -108,13 +108,8 @@ async def netcheck(daemon: DaemonProcess) -> str:
         ),
         (
             *(2, 1, ["ip daddr {R} meta l4proto udp"], "relay_not_answering"),
-            "UDP gets out here (vps1 at 11.0.4.2:5790 answers), so this relay is off",
+            "the relay vps0 does not answer at 11.0.3.2:5790: it is off, its address is wrong",
             "UDP vps0: does not answer no answer at 11.0.3.2:5790 UDP vps1: answers",
-        ),
-        (
-            *(1, 2, ["ip daddr {R} udp dport 5790"], "relay_port_silent"),
-            "that host answers (vps0 at 11.0.3.2:5791), so a firewall drops UDP to this port only",
-            "ms no answer at 11.0.3.2:5790",
         ),
         (
             *(1, 1, ["ip saddr {R} ip daddr {D}"], "relay_not_answering"),
@@ -122,12 +117,12 @@ async def netcheck(daemon: DaemonProcess) -> str:
             "UDP vps0: does not answer",
         ),
     ],
-    ids=["no UDP", "no UDP, one relay", "this relay", "the port", "the way back"],
+    ids=["no UDP", "no UDP, one relay", "this relay", "the way back"],
 )
 async def test_what_is_blocked_at_the_start(
     relays: int, ports: int, rules: list[str], cause: str, text: str, shown: str
 ) -> None:
-    """`status` names the case, `netcheck` what does not answer. The relay names a member that it cannot reach."""
+    """`status` names the case, `netcheck` what does not answer."""
     async with scene(relays, ports) as there:
         there.drop(rules)
         for member in (there.drone, there.station):
@@ -136,47 +131,39 @@ async def test_what_is_blocked_at_the_start(
         assert shown in await netcheck(there.drone)
         if "saddr {D}" in rules[0]:
             assert "cannot reach the relay (UDP blocked there)" in await said(there.station, "not_bound")
-        if "ip saddr {R}" in rules[0]:
-            text = await said(there.relays[0], "member_not_confirmed")
-            assert text.startswith("initiations of drone at 11.0.1.2:5790 arrive")
 
 
 def _has_received(peer: str, status: Status) -> bool:
     return bool(status["peers"][peer]["frames_received"] > 20)
 
 
-DEAF = "nothing arrives from it any more"
+DEAF = "no answer from it any more"
 NOT_ARRIVING = "the peer's frames arrive, its echo replies do not: the direction from here to it is blocked"
 
 
 @pytest.mark.parametrize(
-    ("relays", "rule", "at_drone", "at_station", "relay"),
+    ("relays", "rule", "at_drone", "at_station"),
     [
         (
             *(1, "ip saddr {R} ip daddr {S}", ("freshness_unverified", NOT_ARRIVING)),
             ("relay_not_answering", "it did before, so it is off, or UDP to it or back is blocked"),
-            "initiations of station",
         ),
         (
-            *(
-                1,
-                "ip saddr {S} ip daddr {R}",
-                ("no_answer", f"{DEAF} through the relay vps0, which answers: it is off,"),
-            ),
-            *(("relay_not_answering", "through it, so the direction from here to it is blocked"), ""),
+            *(1, "ip saddr {S} ip daddr {R}", ("no_answer", f"{DEAF} through the relay vps0, which answers: it is")),
+            ("relay_not_answering", "it did before, so it is off, or UDP to it or back is blocked"),
         ),
-        (0, "ip saddr {D} ip daddr {S}", ("freshness_unverified", NOT_ARRIVING), ("no_answer", DEAF), ""),
+        (0, "ip saddr {D} ip daddr {S}", ("freshness_unverified", NOT_ARRIVING), ("no_answer", DEAF)),
         (
             *(1, "ip saddr {R} ip daddr {S} numgen random mod 100 < 60", ("high_loss", "% from here to it")),
-            *(("high_loss", "% from it to here"), ""),
+            ("high_loss", "% from it to here"),
         ),
     ],
     ids=["relay to station", "station to relay", "direct", "part of it"],
 )
 async def test_one_direction_of_a_link_that_is_up(
-    relays: int, rule: str, at_drone: tuple[str, str], at_station: tuple[str, str], relay: str
+    relays: int, rule: str, at_drone: tuple[str, str], at_station: tuple[str, str]
 ) -> None:
-    """Both ends name the direction; the relay names the member that it does not reach."""
+    """Both ends name the direction."""
     direct = ["ip saddr {D} ip daddr {S}", "ip saddr {S} ip daddr {D}"] if relays else []
     async with scene(relays) as there:
         there.drop(direct)
@@ -200,8 +187,6 @@ async def test_one_direction_of_a_link_that_is_up(
             there.drop([*direct, rule])
             for member, (cause, text) in ((there.drone, at_drone), (there.station, at_station)):
                 assert text in await said(member, cause)
-            if relay:
-                assert (await said(there.relays[0], "member_not_confirmed")).startswith(relay)
         finally:
             sending.cancel()
             for socket, *_ in clients:

@@ -129,26 +129,17 @@ SETTLED_S = 10.0
 LONGEST_GAP_S = 3.5
 
 
-@pytest.mark.parametrize(
-    ("says", "carries", "is_named"),
-    [(8_000, 4_000, False), (16_000, 4_000, False), (24_000, 4_000, True), (57_600, 9_600, False)],
-)
+@pytest.mark.parametrize(("says", "carries"), [(8_000, 4_000), (16_000, 4_000), (24_000, 4_000), (57_600, 9_600)])
 @pytest.mark.parametrize("seed", range(3))
 def test_link_over_a_radio_that_carries_less_than_the_file_says(
-    monkeypatch: pytest.MonkeyPatch, says: int, carries: int, *, is_named: bool, seed: int
+    monkeypatch: pytest.MonkeyPatch, says: int, carries: int, *, seed: int
 ) -> None:
-    """Heartbeats and a state a second from each end. No heartbeat is lost. Long queues are a finding."""
+    """Heartbeats and a state a second from each end. No heartbeat is lost."""
     radio = OverstatedRadio(monkeypatch, says, carries, seed)
     flows = heartbeats(cast(Any, radio))
     attitudes(cast(Any, radio), 1.0)
     since = up_within(cast(Any, radio), UP_WITHIN_S) + SETTLED_S
-    named: list[float] = []
-    for second in map(float, range(int(since), int(SECONDS))):
-        radio.run(second)
-        found = (serial.networks[0].carried_bits_s(second) for serial in radio.serial.values())
-        named += [bits_s for bits_s in found if bits_s is not None]
+    radio.run(SECONDS)
     for flow in flows:
         assert flow.lost(since, SECONDS - 3.0) == 0
         assert longest_gap(flow, since, SECONDS) < LONGEST_GAP_S
-    assert named or not is_named
-    assert all(carries / 2 < bits_s < 1.5 * carries for bits_s in named), named

@@ -8,8 +8,9 @@ from typing import Any
 import pytest
 from rich.console import Console, RenderableType
 
+from uavlinkd.core.drops import LinkProblem
 from uavlinkd.core.path_state import PathCondition
-from uavlinkd.ops.findings import Finding, LinkProblem, Severity, Subject
+from uavlinkd.link.finding import Finding, Severity, Subject
 from uavlinkd.ops.status_screen import render_status
 
 PATH: dict[str, Any] = {

@@ -316,6 +316,38 @@ class DropReason(Reason):
     )
 
 
+class LinkProblem(Reason):
+    """What the daemon counts for a peer although it drops no datagram."""
+
+    ENVELOPES_MISSING = "envelopes_missing", "envelopes did not arrive: the radio is bad, or an attacker drops them"
+    ENVELOPES_OUT_OF_ORDER = (
+        "envelopes_out_of_order",
+        "envelopes with frames arrived after later ones: the network has several paths, or an attacker reorders them",
+    )
+    PATHS_UNPROVEN = (
+        "paths_unproven",
+        "envelopes of the peer came from an address that did not answer: its network changes, an attacker forwards"
+        " them, or a second machine has its key",
+        "addresses without an answer",
+    )
+    ECHOES_UNANSWERED = (
+        "echoes_unanswered",
+        "the peer did not answer echo requests: it restarts, does not receive them, or an attacker drops replies",
+        "unanswered echo requests",
+    )
+    HANDSHAKES_UNANSWERED = (
+        "handshakes_unanswered",
+        "the daemon repeated handshakes while the peer was up: it restarts, the radio is bad, or an attacker drops"
+        " them",
+        "unanswered handshakes",
+    )
+    COOKIES_TAKEN = (
+        "cookies_taken",
+        "the peer asked for proof of this daemon's address: it is under load, or an attacker forges its replies",
+        "cookies requested by the peer",
+    )
+
+
 Detail = bytes | str | int
 """A fact about a dropped datagram; an empty string without one."""
 

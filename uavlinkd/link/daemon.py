@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+from collections import Counter
 from contextlib import suppress
 from math import inf
 from typing import TYPE_CHECKING
@@ -15,14 +16,12 @@ from uavlinkd.config.load import load_in_thread
 from uavlinkd.config.model import Config, ConfigError, Problem
 from uavlinkd.endpoints.sockets import BindError
 from uavlinkd.link.carrier import FrameCarrier
-from uavlinkd.link.diagnosis import find
+from uavlinkd.link.findings import find, has_no_client, own_codes
 from uavlinkd.link.local_endpoints import PilotNotes
-from uavlinkd.link.own_problems import own_codes
 from uavlinkd.link.parts import DaemonParts
 from uavlinkd.link.peer_link import radio_figures
 from uavlinkd.link.relay_link import RelayLink
 from uavlinkd.link.status import daemon_status, overview, paths_status, state_of
-from uavlinkd.link.traffic_problems import has_no_client
 from uavlinkd.mavlink.own_frames import INTERVAL_S
 from uavlinkd.ops import LOG_SCHEMA
 from uavlinkd.ops.control import ControlServer
@@ -132,7 +131,10 @@ class Daemon:
             parts.events.check_link(link, now)
         parts.drops.close()
         parts.events.close()
-        counted = {**parts.drops.plain_totals(), **parts.events.totals, **parts.peer_sockets.serial.totals}
+        problems = Counter[str]()
+        for link in parts.links.values():
+            problems.update({problem.value: count for problem, count in link.problems(now).items()})
+        counted = {**parts.drops.plain_totals(), **+problems, **parts.peer_sockets.serial.totals}
         self.log.info("daemon_stopped", uptime_s=round(now - parts.started_at, 1), counted=counted)
 
     def _close_sockets(self) -> None:

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Iterable, Mapping
-from typing import Final, NamedTuple
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterable
 
 from structlog.typing import FilteringBoundLogger
 
 from uavlinkd.core import outputs as o
 from uavlinkd.core.path import Path
 from uavlinkd.link.conditions import Conditions, LineLimits, OpenCondition, Phase
+from uavlinkd.link.finding import Finding, Severity, Subject
 from uavlinkd.link.peer_link import PeerLink
-from uavlinkd.ops.findings import Finding, LinkProblem, Severity, Subject
 from uavlinkd.ops.log import shown
 
 FINDING_DELAY_S = 2.0
@@ -47,12 +46,6 @@ class EventLog:
         self._findings: dict[_FindingKey, Finding] = {}
         self._present: dict[_FindingKey, float] = {}  # since when
         self._ended = deque[tuple[Finding, float, float]](maxlen=ENDED_PROBLEMS)  # when they began and ended
-        self._forgotten: Counter[LinkProblem] = Counter()  # problems of peers that were removed
-        self._problem_conditions = Conditions[tuple[str, LinkProblem]](
-            "link", self._limits, self._write_problem, lambda key: (key[0], False)
-        )
-        self._pauses = Conditions[str]("pause", self._limits, self._write_pause, lambda _: ("", False))
-        self._paused_s = 0.0
         self._finding_conditions = Conditions[_FindingKey](
             "finding",
             self._limits,
@@ -61,36 +54,22 @@ class EventLog:
             quiet_s=FINDING_QUIET_S,
         )
 
-    @property
-    def totals(self) -> dict[str, int]:
-        """All link problems since the start, logged or not."""
-        return {
-            problem.value: count
-            for problem in LinkProblem
-            if (count := self._forgotten[problem] + sum(watch.totals[problem] for watch in self._watches.values()))
-        }
-
     def check(self, now: float) -> None:
         """Write the lines that are due. Call it about once a second."""
         for state in [watch.omitted_state for watch in self._watches.values() if watch.omitted_state is not None]:
             if self._limits.are_used_up("peer", now):
                 break
             self._write_event(state, now)
-        self._problem_conditions.check(now)
-        self._pauses.check(now)
         self._finding_conditions.check(now)
 
     def close(self) -> None:
         """Write the ends of all conditions: the daemon stops."""
-        for conditions in (self._problem_conditions, self._pauses, self._finding_conditions):
-            conditions.close()
+        self._finding_conditions.close()
 
     def forget(self, peer: str) -> None:
         """Forget a peer that was removed."""
-        self._problem_conditions.close(lambda key: key[0] == peer)
         self._finding_conditions.close(lambda key: key[1] is Subject.PEER and key[2] == peer)
-        if peer in self._watches:
-            self._forgotten += self._watches.pop(peer).totals
+        self._watches.pop(peer, None)
         self._limits.forget(peer)
 
     # Events of the core.
@@ -152,21 +131,7 @@ class EventLog:
     # Conditions.
 
     def check_link(self, link: PeerLink, now: float) -> None:
-        """Note the problems of a link that exceed their thresholds, and repair. Call it about once a second."""
-        self._check_repair(link, now)
-        peer = link.peer.name
-        watch = self._watches[peer]
-        received = link.peer.traffic.envelopes_received
-        for problem, growth in watch.measure(link.problems(now), received, now).items():
-            if problem is LinkProblem.ENVELOPES_OUT_OF_ORDER and link.peer.paths.has_several:
-                continue  # its paths overtake one another: `status` shows how often
-            key = peer, problem
-            is_open = key in self._problem_conditions
-            if growth.minute and is_noteworthy(problem, growth, is_logged=is_open):
-                watch.shares[problem] = growth.share
-                self._problem_conditions.note(key, now, growth.since if is_open else growth.minute)
-
-    def _check_repair(self, link: PeerLink, now: float) -> None:
+        """Note the repair of a link. Call it about once a second."""
         repair, size, watch = link.output.repair, link.output.copies.repeat_bytes, self._watches[link.name]
         if repair.is_on and watch.repair is None:
             watch.repair = now, size
@@ -175,36 +140,13 @@ class EventLog:
             (began_at, before), watch.repair = watch.repair, None
             self._log.info("repair_ended", peer=link.name, duration_s=round(now - began_at, 3), bytes=size - before)
 
-    def _write_problem(
-        self, key: tuple[str, LinkProblem], phase: Phase, condition: OpenCondition, omitted: dict[str, int]
-    ) -> None:
-        peer, problem = key
-        log = self._log.bind(peer=peer, problem=problem.value, count=condition.count, **omitted)
-        if phase is Phase.ENDED:
-            log.info("link_problem_ended", duration_s=condition.duration_s)
-            return
-        if THRESHOLDS[problem].share:
-            log = log.bind(share=round(self._watches[peer].shares[problem], 3))
-        if phase is Phase.BEGAN:
-            log.warning("link_problem_began", meaning=problem.meaning)
-        else:
-            log.warning("link_problem_continued", duration_s=condition.duration_s)
-
     def write_pause(self, pause_s: float, now: float) -> None:
-        """Note that the process was paused."""
-        self._paused_s += pause_s
-        self._pauses.note("", now)
-
-    def _write_pause(self, _: str, phase: Phase, condition: OpenCondition, omitted: dict[str, int]) -> None:
-        seconds = round(self._paused_s, 3)
-        if phase is Phase.ENDED:
-            self._paused_s = 0.0
-            if condition.count > 1:  # otherwise the first line has it all
-                self._log.info(
-                    "pauses_ended", count=condition.count, seconds=seconds, duration_s=condition.duration_s, **omitted
-                )
+        """Write that the process was paused."""
+        omitted = self._limits.take("pause", "", now)
+        if omitted is None:
+            self._limits.omit("pause", "")
         else:
-            self._log.warning("daemon_paused", count=condition.count, seconds=seconds, **omitted)
+            self._log.warning("daemon_paused", seconds=round(pause_s, 3), **omitted)
 
     def write_findings(self, findings: Iterable[Finding], now: float) -> None:
         """Note the present findings. Call it about once a second."""
@@ -259,81 +201,11 @@ def _session_facts(session: o.SessionEstablished) -> dict[str, object]:
     }
 
 
-# When a problem of a link is worth a line: what was lost, reordered or unanswered over the last minute.
-
-WINDOW_S: Final = 60.0
-STEP_S: Final = 5.0
-"""The window moves in steps of this."""
-
-
-class Threshold(NamedTuple):
-    """A problem is logged from this count in a minute, if it is also this share of the envelopes.
-
-    A problem that was logged has ended below half of both.
-    """
-
-    least: int
-    share: float = 0.0
-
-
-THRESHOLDS: Final[Mapping[LinkProblem, Threshold]] = {
-    LinkProblem.ENVELOPES_MISSING: Threshold(10, 0.05),
-    LinkProblem.ENVELOPES_OUT_OF_ORDER: Threshold(50, 0.25),  # jitter reorders frames that were sent in a burst
-    LinkProblem.PATHS_UNPROVEN: Threshold(5),  # more than a network that changes
-    LinkProblem.ECHOES_UNANSWERED: Threshold(60),  # each restart of the peer costs some 20 and 10
-    LinkProblem.HANDSHAKES_UNANSWERED: Threshold(60),
-    LinkProblem.COOKIES_TAKEN: Threshold(20),
-}
-
-
-class Growth(NamedTuple):
-    """How often a problem occurred."""
-
-    minute: int
-    """In the last minute."""
-    since: int
-    """Since the last measurement."""
-    share: float
-    """Of the envelopes of the last minute."""
-
-
 class LinkWatch:
-    """The totals of one link over the last minute."""
+    """What the log knows of one link."""
 
     def __init__(self) -> None:
         self.omitted_state: _State | None = None
         """The latest that a limit omitted."""
         self.repair: tuple[float, int] | None = None
         """When it began, and the bytes of repeats then; None while there is none."""
-        self.totals: Counter[LinkProblem] = Counter()
-        """All problems since the start."""
-        self.shares: dict[LinkProblem, float] = {}
-        """Of the envelopes, when a problem was noted last."""
-        self._received = 0
-        self._steps: list[tuple[float, Counter[LinkProblem], int]] = []  # when, and the totals then, if they changed
-
-    def measure(self, totals: Mapping[LinkProblem, int], received: int, now: float) -> dict[LinkProblem, Growth]:
-        """Compare with the totals of a minute ago. Call it about once a second."""
-        grown = {problem: total - self.totals[problem] for problem, total in totals.items()}
-        before = self.totals, self._received
-        if any(grown.values()):
-            self.totals = self.totals + Counter(grown)
-        self._received = received
-        if not self._steps or (now - self._steps[-1][0] >= STEP_S and before != self._steps[-1][1:]):
-            self._steps.append((now, *before))
-        while len(self._steps) > 1 and self._steps[1][0] <= now - WINDOW_S:
-            self._steps.pop(0)
-        _, then, received_then = self._steps[0]
-        arrived = received - received_then
-        missing = self.totals[LinkProblem.ENVELOPES_MISSING] - then[LinkProblem.ENVELOPES_MISSING]
-        sent = max(1, arrived + missing)
-        return {
-            problem: Growth(minute := self.totals[problem] - then[problem], since, minute / sent)
-            for problem, since in grown.items()
-        }
-
-
-def is_noteworthy(problem: LinkProblem, growth: Growth, *, is_logged: bool) -> bool:
-    """Whether the problem exceeds its threshold, or still exceeds half of it."""
-    threshold, scale = THRESHOLDS[problem], 0.5 if is_logged else 1.0
-    return growth.minute >= threshold.least * scale and growth.share >= threshold.share * scale

@@ -1,42 +1,27 @@
-"""What a daemon knows at one moment, in the words of the problems of :mod:`.diagnosis`. It changes nothing."""
+"""What a daemon knows at one moment, in the words that the findings of :mod:`.findings` need. It changes nothing."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
-from functools import cached_property, partial
-from ipaddress import ip_address
-from itertools import combinations
-from typing import Final, NamedTuple
+import errno
+from collections.abc import Iterable, Iterator, Mapping
+from functools import cached_property
+from typing import Any, Final
 
 from uavlinkd.config.keys import encode_key
 from uavlinkd.config.model import EndpointConfig
 from uavlinkd.core.drops import Detail, DropReason
-from uavlinkd.core.path import Path, SocketAddress, relay_name
+from uavlinkd.core.path import Path, SocketAddress
 from uavlinkd.endpoints.ports import Endpoint
-from uavlinkd.link.direct_search import is_private
+from uavlinkd.endpoints.url import EndpointKind
 from uavlinkd.link.evidence import ELSEWHERE, REPORTED, Sighting
 from uavlinkd.link.parts import DaemonParts
 from uavlinkd.link.peer_link import NOT_ANSWERING_S, PeerLink
 from uavlinkd.link.relay_link import RelayLink
-from uavlinkd.ops.findings import Severity
 from uavlinkd.ops.log import shown
+from uavlinkd.system.error_meanings import meaning_of
 
-
-class Found(NamedTuple):
-    """A problem that is there, and what the operator does: one sentence each, without a full stop."""
-
-    severity: Severity
-    """By this the alerts select."""
-    cause: str
-    """Its code in ``status --json``, in the log and in the label of the metric ``finding``."""
-    text: str
-    remedy: str
-
-
-security: Final = partial(Found, Severity.SECURITY)
-fault: Final = partial(Found, Severity.FAULT)
-warning: Final = partial(Found, Severity.WARNING)
-
+Fields = dict[str, Any]
+"""The values of a finding that its sentences name."""
 
 ICMP_S: Final = 1.0
 """Hosts send an ICMP message about our datagrams at most once in this time."""
@@ -46,10 +31,11 @@ UNREACHABLE: Final = ("EHOSTUNREACH", "ENETUNREACH", "EACCES")
 """Errors that ICMP messages report, except a closed port."""
 UNROUTED: Final = ("ENETUNREACH", "EHOSTUNREACH", "ENETDOWN", "EADDRNOTAVAIL", "EINVAL", "EMSGSIZE", "EAFNOSUPPORT")
 """Errors of sending that are certain: this machine's kernel reports them at once."""
-PASSES_S: Final = 2.0
-"""A relay forwards if a datagram came through it within this time."""
-TRIES: Final = 3
-"""A path is silent if so many datagrams were sent along it at least."""
+SILENT_S: Final = 5.0
+"""An endpoint without frames for this time is reported: MAVLink clients send a heartbeat every second. Its errors
+count for the same time. It is opened again more often."""
+_NOT_LISTENING: Final = "ECONNREFUSED"
+_KERNEL_ERRORS: Final = frozenset(errno.errorcode.values())
 
 
 class Moment:
@@ -58,12 +44,11 @@ class Moment:
     def __init__(self, daemon: DaemonParts, now: float) -> None:
         self.daemon = daemon
         self.now = now
+        self.fields: Fields = {"here": daemon.config.name}
         self.down = [link for link in daemon.links.values() if not link.peer.is_up]
         """The peers that are not up."""
         self.has_sole_waiting = sum(not link.config.addresses for link in self.down) == 1
         """Whether one peer without addresses is not up: a sender at an unknown address may be this one."""
-
-    # Where UDP gets an answer.
 
     def current(self, sighting: Sighting | None, kind: str, link: PeerLink | RelayLink) -> Sighting | None:
         """A sighting since the link went down. An ICMP message counts until two tries had none."""
@@ -73,9 +58,15 @@ class Moment:
         is_over = self.now - sighting.last_at > 2 * (tries.retry_at - tries.initiated_at) + ICMP_S
         return None if kind.startswith(REPORTED) and is_over else sighting
 
+    # Relays.
+
     def seen_at(self, relay: RelayLink, kind: str) -> Sighting | None:
         """Evidence at an address of a relay since that went silent."""
         return self.current(self.daemon.evidence.seen_at_relay(kind, relay, self.now), kind, relay)
+
+    def refused_by(self, relay: RelayLink) -> Sighting | None:
+        """A response of a relay that does not authenticate."""
+        return self.daemon.evidence.seen_at(DropReason.BAD_HANDSHAKE, ("relay", relay.config.name), self.now)
 
     def reported_at(self, path: Path) -> str:
         """The error that ICMP messages report about an address now; empty for none."""
@@ -89,71 +80,20 @@ class Moment:
     def reported(self, relay: RelayLink) -> tuple[str, Path] | None:
         """The first such error at an address of a relay."""
         errors = ((self.reported_at(path), path) for path in relay.peer.paths.configured)
-        return next((found for found in errors if found[0]), None)
-
-    def is_silent(self, relay: RelayLink) -> bool:
-        """Whether a relay does not answer, and no fact of this machine is known to be the reason."""
-        is_over = not relay.peer.is_up and self.now - relay.silent_since >= NOT_ANSWERING_S
-        place = "relay", relay.config.name
-        refused = self.daemon.evidence.seen_at(DropReason.BAD_HANDSHAKE, place, self.now)
-        certain = (self.seen_at(relay, error) for error in ("EPERM", *UNROUTED))
-        has_address = bool(relay.peer.paths.configured)  # by UDP or TLS
-        return is_over and has_address and refused is None and not any(certain)
+        return next((match for match in errors if match[0]), None)
 
     @cached_property
     def silent_relays(self) -> list[RelayLink]:
-        """Those of this daemon."""
-        return [relay for relay in self.daemon.relays.by_name.values() if self.is_silent(relay)]
+        """The relays that do not answer, while no fact of this machine is known to be the reason."""
+        return [relay for relay in self.daemon.relays.by_name.values() if self._is_silent(relay)]
 
-    @cached_property
-    def is_udp_blocked(self) -> bool:
-        """Whether it probably is: relays on two hosts are silent, none answers, and no ICMP message says why."""
-        relays = [relay for relay in self.silent_relays if hosts_of(relay)]
-        if len(self.silent_relays) < len(self.daemon.relays.by_name) or any(map(self.reported, relays)):
-            return False
-        is_far = any(one.isdisjoint(other) for one, other in combinations(map(hosts_of, relays), 2))
-        return is_far and not self.beside_relays
+    def _is_silent(self, relay: RelayLink) -> bool:
+        is_over = not relay.peer.is_up and self.now - relay.silent_since >= NOT_ANSWERING_S
+        certain = (self.seen_at(relay, error) for error in ("EPERM", *UNROUTED))
+        has_address = bool(relay.peer.paths.configured)  # by UDP or TLS
+        return is_over and has_address and self.refused_by(relay) is None and not any(certain)
 
-    @cached_property
-    def beside_relays(self) -> str:
-        """A partner that answers directly, as near as the silent relays."""
-        return self.other_answer(set[str]().union(*map(hosts_of, self.silent_relays)))
-
-    @cached_property
-    def answering(self) -> dict[str, str]:
-        """The hosts that answer directly: a peer or relay at each, by name and address."""
-        partners: list[PeerLink | RelayLink] = [*self.daemon.relays.by_name.values(), *self.daemon.links.values()]
-        return {
-            path.host: f"{partner.config.name} at {shown(path.address)}"
-            for partner in partners
-            for path in self.working(partner)
-        }
-
-    def working(self, partner: PeerLink | RelayLink) -> list[Path]:
-        """The paths along which a partner answers directly over UDP."""
-        states = partner.peer.paths.states if partner.peer.is_up else ()
-        return [state.path for state in states if state.works and state.is_validated and state.path.is_udp]
-
-    def other_answer(self, hosts: Collection[str]) -> str:
-        """A partner that answers at none of these hosts, but at one as near: UDP gets out."""
-        near = set(map(_nearness, hosts))
-        others = (who for host, who in self.answering.items() if host not in hosts and _nearness(host) in near)
-        return next(others, "")
-
-    def passes(self, relay: RelayLink) -> bool:
-        """Whether a relay forwards datagrams to this daemon."""
-        states = (state for link in self.daemon.links.values() for state in link.peer.paths.states)
-        return any(
-            relay_name(state.path.address) == relay.config.name and self.now - state.received_at < PASSES_S
-            for state in states
-        )
-
-    def silent_paths(self, relay: RelayLink) -> Iterator[Path]:
-        """The configured addresses of a relay from which no answer comes."""
-        for state in relay.peer.paths.states:
-            is_over = state.datagrams_sent >= TRIES and self.now - state.since >= NOT_ANSWERING_S
-            if state.is_configured and not state.works and not state.is_off and is_over and state.path.is_udp:
-                yield state.path
+    # System ids.
 
     def owner(self, system: int, other_than: str) -> str | None:
         """A peer, or an endpoint here, that has a MAVLink system id, except the one of this name."""
@@ -190,9 +130,17 @@ class PartFacts:
         """Its name among those that have system ids."""
         self.history = moment.daemon.history.part(kind, name)
         self.rules = rules
-        """Its policy, as the file has it,"""
-        self.rule = f"role {rules['role']}" if "role" in rules else "its policy"
-        """and in two words."""
+        """Its policy, as the file has it."""
+        self.is_certified = False
+        self.fields = moment.fields | {
+            "who": name,
+            "rule": f"role {rules['role']}" if "role" in rules else "its policy",
+        }
+
+    @cached_property
+    def blocked(self) -> list[str]:
+        """The directions in which its policy recently refused all frames."""
+        return self.history.blocked(self.now)
 
 
 class PeerFacts(PartFacts):
@@ -201,6 +149,7 @@ class PeerFacts(PartFacts):
     def __init__(self, moment: Moment, link: PeerLink) -> None:
         super().__init__(moment, "peer", link.name, link.config.policy)
         self.link = link
+        self.is_certified = link.config.settings.is_certified
         self.addresses = listed(map(str, link.config.addresses))
         """Those of the file."""
 
@@ -216,6 +165,35 @@ class PeerFacts(PartFacts):
             return None
         return self.moment.current(self.daemon.evidence.seen_at(reason, ELSEWHERE, self.now), reason, self.link)
 
+    @cached_property
+    def relay_problems(self) -> list[tuple[str, RelayLink]]:
+        """What is wrong with each relay of a peer that has no other path, while none of them is bound for it."""
+        by_name = self.daemon.relays.by_name
+        relays = [by_name[name] for name in self.link.config.relays if name in by_name]
+        if any(relay.peer.is_up and relay.state_for(self.link) == "bound" for relay in relays):
+            return []
+        problems = ((self._relay_problem(relay), relay) for relay in relays)
+        return [(problem, relay) for problem, relay in problems if problem]
+
+    def _relay_problem(self, relay: RelayLink) -> str:
+        sockets, is_waiting = self.daemon.peer_sockets, relay.state_for(self.link) == "waiting"
+        may_fail = ("EPERM", *(() if sockets.absent_addresses() else UNROUTED))
+        if not relay.peer.is_up and any(self.moment.seen_at(relay, error) for error in may_fail):
+            return "not_sent"
+        if not self.link.is_overdue(self.now) or (self.link.is_closed and is_waiting):
+            return ""
+        if is_waiting:
+            return "not_bound"
+        if sockets.unresolved(relay.name):
+            return "name_not_resolved"
+        if self.moment.refused_by(relay) is not None:
+            return "wrong_psk"
+        return "relay_not_answering" if relay in self.moment.silent_relays else ""
+
+    def relays_with(self, problem: str) -> list[RelayLink]:
+        """The relays of the peer with this problem."""
+        return [relay for one, relay in self.relay_problems if one == problem]
+
 
 class EndpointFacts(PartFacts):
     """A local endpoint."""
@@ -224,16 +202,41 @@ class EndpointFacts(PartFacts):
         super().__init__(moment, "endpoint", endpoint.name, config.policy)
         self.endpoint = endpoint
         self.config = config
+        self.fields["url"] = config.url
+
+    @cached_property
+    def silence(self) -> tuple[str, Fields]:
+        """Why no MAVLink comes from its client: a cause, with the fields of its sentences; "" while frames come."""
+        silent_s = self.now - self.history.silent_since
+        if silent_s < SILENT_S:
+            return "", {}
+        url, ports = self.config.url, self.endpoint.ports
+        failures = self.history.failures.within(SILENT_S, self.now)
+        error = next((name for name in failures if name in _KERNEL_ERRORS or name == "connect_timeout"), "")
+        # A client of `udpin` has sent MAVLink: the bytes are another sender's.
+        is_known = url.kind is EndpointKind.UDPIN and bool(ports)
+        if not is_known and self.history.garbage.within(SILENT_S, self.now):
+            return "garbage", {}
+        if ports and not (url.kind is EndpointKind.UDPOUT and error):
+            return "client_silent", {"clients": listed(port.name for port in ports), "silent_s": silent_s}
+        if url.kind is EndpointKind.SERIAL:
+            error = next(iter(failures), "")
+            meaning = meaning_of(error) or "plug the device in"
+            return "device_unavailable", {"error": f" ({error})" if error else "", "meaning": meaning}
+        if url.listens:
+            return "no_client", {"silent_s": silent_s}
+        if "not_resolved" in failures or (url.kind is EndpointKind.UDPOUT and not ports):
+            why, meaning = "its host has no address now", "write an IP address, or see `getent hosts NAME`"
+        elif error in ("", _NOT_LISTENING, "connect_timeout"):
+            why, meaning = "no process listens there", "start the client there, or correct the port"
+        else:
+            why, meaning = "it fails", meaning_of(error)
+        return "client_unreachable", {"why": f"{why} ({error})" if error else why, "meaning": meaning}
 
 
 def hosts_of(relay: RelayLink) -> set[str]:
-    """Those of its addresses, as they are resolved now."""
+    """The hosts of a relay's addresses, as they are resolved now."""
     return {path.host for path in relay.peer.paths.configured if path.is_udp}
-
-
-def _nearness(host: str) -> tuple[bool, bool]:
-    """On this machine, in a private network, or beyond."""
-    return ip_address(host).is_loopback, is_private(host)
 
 
 def at(sighting: Sighting) -> str:

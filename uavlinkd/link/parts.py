@@ -16,6 +16,7 @@ from uavlinkd.link.conditions import LineLimits
 from uavlinkd.link.drop_summary import DropSummary
 from uavlinkd.link.event_log import EventLog
 from uavlinkd.link.evidence import Evidence, History
+from uavlinkd.link.finding import Finding
 from uavlinkd.link.fleet_members import FleetMembers
 from uavlinkd.link.local_endpoints import LocalEndpoints
 from uavlinkd.link.peer_link import PeerLink
@@ -25,7 +26,6 @@ from uavlinkd.link.relays import Relays
 from uavlinkd.link.switch import Switch
 from uavlinkd.mavlink.payloads import screen
 from uavlinkd.mavlink.routing import Router
-from uavlinkd.ops.findings import Finding
 from uavlinkd.relay.service import RelayService, RelayShell
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.guard import FaultGuard

@@ -8,6 +8,7 @@ from operator import itemgetter, sub
 
 from uavlinkd.config.model import PeerConfig
 from uavlinkd.core.constants import CONFIGURED_PATHS, LOSS_WINDOW_S, NEVER
+from uavlinkd.core.drops import LinkProblem
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Output
 from uavlinkd.core.path import Path
@@ -23,7 +24,6 @@ from uavlinkd.mavlink.frames import Frame, SplitCounters
 from uavlinkd.mavlink.own_frames import LinkFigures, worst
 from uavlinkd.mavlink.payloads import REQUESTS
 from uavlinkd.mavlink.policy.delivery import Source
-from uavlinkd.ops.findings import LinkProblem
 
 NOT_ANSWERING_S = 3.0
 """A peer or relay that is silent for this long is reported. A normal start takes less, and tries are more often."""

@@ -49,10 +49,6 @@ LEAST_BITS_S: Final = 1000
 UNANSWERED: Final = 6
 """So many echo requests in a row, each after twice the time, show a queue that is longer than answers may take. Few
 noisy radios lose so many."""
-SLOW_SHARE: Final = 0.75
-"""A radio that carries less than this part of what the file says, while answers are late, is reported,"""
-SLOW_FOR_S: Final = 60.0
-"""for this long after the last late answer."""
 ENVELOPES: Final = 2
 """So many of the largest envelopes, one at each end, may precede a question or its answer without any queue in a
 modem."""
@@ -138,7 +134,6 @@ class SerialNetwork:
         self._log = log
         self._on_change: Callable[[], None] = lambda: None
         self._answered_at = 0.0
-        self._carried = -SLOW_FOR_S, 0.0  # when answers came late, and bits a second then
         self._seconds = deque[tuple[int, int, int, int]](maxlen=RECENT_S + 1)  # totals, one for each second
         # Imported only if configured: a daemon on UDP starts faster and stays smaller.
         from uavlinkd.endpoints.serial_line import SerialLine  # noqa: PLC0415
@@ -197,17 +192,8 @@ class SerialNetwork:
             self._answered_at = state.answered_at
             self.rate.add_round_trip(state.round_trip_s, state.answered_at)
         requests, is_best = peer.echo_requests, state is peer.paths.best and not state.is_off
-        if is_best and requests.was_late and len(self._seconds) > 1:
-            first, before, last = self._seconds[0], self._seconds[-2], self._seconds[-1]
-            if last[1] > before[1]:  # else the peer is gone, and says nothing about the radio
-                self._carried = now, 8 * (last[3] - first[3]) / (len(self._seconds) - 1)
         is_late = requests.was_late or requests.unanswered >= UNANSWERED
         self.rate.set_late(now, is_late=is_best and is_late)  # the requests go along the best path
-
-    def carried_bits_s(self, now: float) -> float | None:
-        """What the radio carried, both directions together, if answers came late recently and it is little."""
-        at, bits_s = self._carried
-        return bits_s if now <= at + SLOW_FOR_S and bits_s < SLOW_SHARE * self.config.air_bits_s else None
 
     @property
     def recent_reports(self) -> int:

@@ -17,18 +17,18 @@ from uavlinkd.core.path import Path, SocketAddress, relay_name
 from uavlinkd.core.path_state import PathState
 from uavlinkd.core.peer import Peer
 from uavlinkd.endpoints.ports import Endpoint
-from uavlinkd.link.diagnosis import find
+from uavlinkd.link.finding import Finding
+from uavlinkd.link.findings import find, has_no_client, stop_frames
 from uavlinkd.link.fleet_members import FleetMembers
-from uavlinkd.link.own_problems import codes_there, name_of_problem, stops_frames
 from uavlinkd.link.parts import DaemonParts
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.relay_link import RelayLink
-from uavlinkd.link.traffic_problems import has_no_client, is_contested
+from uavlinkd.link.signs import is_contested
+from uavlinkd.link.traffic_signs import codes_there, name_of_problem, stops_frames
 from uavlinkd.mavlink.dialect import command_name, name_of
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import ANY_OTHER, REFUSALS, Refusal
 from uavlinkd.ops import LOG_SCHEMA, STATUS_SCHEMA
-from uavlinkd.ops.findings import Finding
 from uavlinkd.ops.log import shown
 from uavlinkd.relay.service import RelayMember, RelayService
 from uavlinkd.system.addresses import Address
@@ -86,7 +86,7 @@ def _status(
         "name": daemon.config.name,
         "public_key": encode_key(node.public_key),
         "monotonic_s": now,
-        "frames_pass": all_up and not (blocked or is_cut_off or contested),
+        "frames_pass": all_up and not (stop_frames(findings) or is_cut_off or contested),
         "blocked": [dict(zip(("subject", "name", "direction"), key, strict=True)) for key in blocked],
         "has_no_client": is_cut_off,
         "contested": contested,

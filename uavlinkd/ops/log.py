@@ -33,6 +33,11 @@ def shown(address: SocketAddress) -> str:
     return str(Address.of(address)) if relay is None else f"relayed via {relay}"
 
 
+def titled(kind: str, name: str) -> str:
+    """A name behind its kind, unless it says that already: ``relay vps``, ``relay1``."""
+    return name if name.startswith(kind) else f"{kind} {name}"
+
+
 def order_fields(_: object, __: str, event: EventDict) -> EventDict:
     """Put the event and its level first, and the daemon and the time last, as a processor of structlog."""
     first = {field: event.pop(field) for field in _FIRST if field in event}

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.ops import status_words as words
-from uavlinkd.ops.findings import titled
+from uavlinkd.ops.log import titled
 from uavlinkd.ops.netcheck import addresses
 from uavlinkd.ops.status_words import Status
 

@@ -1,0 +1,396 @@
+"""The signs of findings: each function yields the fields of the sentences, once for each finding.
+
+A field named ``severity`` replaces that of the row.
+
+Any sender can forge a datagram or an ICMP message. So a finding from such evidence names its source, and has a remedy
+that is safe if the evidence is forged: no remedy accepts a key, a name or an address because it arrived.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Final
+
+from uavlinkd.authority.trust import BulletinVerdict
+from uavlinkd.config.keys import encode_key
+from uavlinkd.core import constants as c
+from uavlinkd.core.drops import Detail, DropReason
+from uavlinkd.core.path import RELAY_HOST, SocketAddress
+from uavlinkd.core.peer import Peer
+from uavlinkd.core.sessions import Twin
+from uavlinkd.link.evidence import ELSEWHERE, EVIDENCE_S, REPORTED, Sighting
+from uavlinkd.link.facts import UNROUTED, Fields, Moment, PeerFacts, at, details_at, hosts_of, listed
+from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.link.relay_link import RelayLink
+from uavlinkd.link.switch import Port
+from uavlinkd.ops.log import shown, titled
+from uavlinkd.system.error_meanings import CONNECTED, meaning_of, web_problem
+
+SECURITY_S: Final = 600.0
+"""A finding about an attack stays for this time after the last evidence."""
+CONFIRM_S: Final = 2.0
+"""A handshake that is not complete after this time is reported."""
+
+Signs = Iterator[Fields]
+
+
+# A key in two places.
+
+
+def own_key_elsewhere(moment: Moment) -> Signs:
+    stolen = moment.daemon.evidence.own_key_elsewhere
+    if stolen is not None and moment.now - stolen[0] <= SECURITY_S:
+        yield {"at": "an unknown address" if stolen[1] is None else shown(stolen[1])}
+
+
+def has_twin(peer: Peer, twin: Twin, now: float, within_s: float = SECURITY_S) -> bool:
+    """Whether the sessions with a peer showed a second process with a private key."""
+    return twin in peer.sessions.twins and now - peer.sessions.twins[twin] < within_s
+
+
+def is_contested(peer: Peer, now: float) -> bool:
+    """Whether two processes with one key displace each other now: each loses about half of the frames."""
+    return any(has_twin(peer, twin, now, EVIDENCE_S) for twin in Twin)
+
+
+def _places(peer: Peer) -> str:
+    """Where a peer answered."""
+    answered = (state for state in peer.paths.states if state.is_validated or state.is_known)
+    return listed(dict.fromkeys(shown(state.path.address) for state in answered)) or "an unknown address"
+
+
+def own_key_twice(moment: Moment) -> Signs:
+    """This daemon's key, as its peers state, and at a relay the keys of its members."""
+    peers = moment.daemon.node.peers.items()
+    if names := [name.removeprefix(RELAY_HOST) for name, peer in peers if has_twin(peer, Twin.OURS, moment.now)]:
+        yield {"facts": f"this daemon's private key: {listed(names)} states a session with another one"}
+    relay = moment.daemon.relay
+    members = [] if relay is None else [one for one in relay.members.values() if one.is_own]
+    if twins := [one for one in members if has_twin(one.peer, Twin.PEERS, moment.now)]:
+        names = [f"{one.settings.name}, from {_places(one.peer)}" for one in twins]
+        yield {"facts": f"the private key of a member: {listed(names)}"}
+
+
+def peers_key_twice(peer: PeerFacts) -> Signs:
+    core = peer.link.peer
+    if has_twin(core, Twin.PEERS, peer.now):
+        yield {"facts": f"{peer.name}'s private key: sessions came from {_places(core)}"}
+
+
+# The daemon.
+
+
+def _severe_if_down(moment: Moment) -> Fields:
+    return {} if moment.down else {"severity": "warning"}
+
+
+def listen_address_missing(moment: Moment) -> Signs:
+    if absent := moment.daemon.peer_sockets.absent_addresses():
+        yield {
+            "addresses": listed(map(str, absent)),
+            "wildcard": absent[0].wildcard(),
+            **_severe_if_down(moment),
+        }
+
+
+def network_absent(moment: Moment) -> Signs:
+    if gone := moment.daemon.peer_sockets.absent_networks():
+        advice = "; ".join(dict.fromkeys(gone.values()))
+        yield {"networks": "; ".join(gone), "advice": advice, **_severe_if_down(moment)}
+
+
+def raw_mavlink(moment: Moment) -> Signs:
+    raw = moment.daemon.evidence.seen_anywhere(DropReason.RAW_MAVLINK, moment.now)
+    if raw is not None and raw.address is not None:
+        yield {"at": at(raw)}
+
+
+def fault_inside(moment: Moment) -> Signs:
+    guard = moment.daemon.guard
+    if guard.faults and moment.now - guard.last_at <= SECURITY_S:
+        yield {"places": listed(f"{place} ({count}x)" for place, count in guard.faults.most_common())}
+
+
+def daemon_paused(moment: Moment) -> Signs:
+    paused = moment.daemon.history.paused
+    if paused is not None and moment.now - paused[0] <= EVIDENCE_S:
+        yield {"pause_s": paused[1]}
+
+
+def configuration_refused(moment: Moment) -> Signs:
+    if problems := moment.daemon.history.refused_file:
+        yield {"problems": listed(problems, 1), "file": moment.daemon.config.path}
+
+
+def frames_in_circle(moment: Moment) -> Signs:
+    """Ports from which frames come back that this daemon sent elsewhere."""
+    for port, circle in moment.daemon.switch.router.sendings.circles.items():
+        if moment.now - circle.returned_at <= EVIDENCE_S and (len(circle.systems) > 1 or circle.is_suspected):
+            ways = " or ".join(sorted(map(_port, circle.through - {port}))) or "it"
+            yield {"ways": ways, "back": _port(port)}
+
+
+def _port(port: Port) -> str:
+    return port.name if isinstance(port, PeerLink) else f"{port.endpoint.name} ({port.name})"
+
+
+def line_noise(moment: Moment) -> Signs:
+    for network in moment.daemon.peer_sockets.serial.networks:
+        if (noise := network.recent_noise) is not None:
+            damaged, whole = noise
+            yield {
+                "network": network.name,
+                "noise": damaged,
+                "pieces": damaged + whole,
+                "baud": network.line.url.baud,
+            }
+
+
+# The fleet.
+
+
+def own_certificate_revoked(moment: Moment) -> Signs:
+    if (fleet := moment.daemon.fleet) is not None and fleet.trust.own is not None:
+        serial = fleet.trust.own.certificate.serial
+        if fleet.trust.bulletin.refuses(serial):
+            yield {"number": fleet.trust.bulletin.number, "serial": serial}
+
+
+def bulletin_awaited(moment: Moment) -> Signs:
+    if (fleet := moment.daemon.fleet) is not None:
+        number, required = fleet.trust.bulletin.number, fleet.config.required_bulletin
+        if number < required:
+            yield {"number": number, "required": required}
+
+
+def fleet_state_degraded(moment: Moment) -> Signs:
+    if (fleet := moment.daemon.fleet) is not None and fleet.problem:
+        yield {"problem": fleet.problem}
+
+
+def bulletin_conflict(moment: Moment) -> Signs:
+    """By whom a bulletin came that contradicts that of this daemon."""
+    noticed = {} if moment.daemon.fleet is None else moment.daemon.fleet.noticed(moment.now)
+    for event in (BulletinVerdict.CONFLICT.value, BulletinVerdict.SHRINKS.value):
+        if event in noticed:
+            yield {"by": noticed[event][1]}
+            return
+
+
+MEMBER_REFUSALS: Final = (
+    *(DropReason.BAD_CERTIFICATE, DropReason.CERTIFICATE_REVOKED),
+    *(DropReason.MEMBER_CONFLICT, DropReason.ROLE_NOT_ACCEPTED),
+)
+
+
+def _senders(moment: Moment, reason: DropReason) -> dict[Detail, SocketAddress | None]:
+    sighting = None if moment.daemon.fleet is None else moment.daemon.evidence.seen_anywhere(reason, moment.now)
+    return {} if sighting is None else sighting.details
+
+
+def member_refused(reason: DropReason) -> Callable[[Moment], Signs]:
+    """Senders whose certificate this daemon refused for one reason."""
+
+    def signs(moment: Moment) -> Signs:
+        if senders := _senders(moment, reason):
+            yield {"senders": details_at(senders)}
+
+    return signs
+
+
+def not_a_member(moment: Moment) -> Signs:
+    """A sender that no other finding names, nor holds a certificate that counts."""
+    daemon = moment.daemon
+    if daemon.fleet is not None:
+        named = {address for reason in MEMBER_REFUSALS for address in _senders(moment, reason).values()}
+        held, unknown = daemon.fleet.trust.held, _senders(moment, DropReason.UNKNOWN_PEER)
+        unknown = {key: at for key, at in unknown.items() if key not in held and at not in named}
+    elif daemon.relay is not None:
+        sighting = daemon.evidence.seen_at(DropReason.UNKNOWN_PEER, ELSEWHERE, moment.now)
+        unknown = {} if sighting is None else sighting.details
+    else:
+        return
+    if unknown:
+        yield {"senders": details_at(unknown)}
+
+
+def revoked_but_pinned(peer: PeerFacts) -> Signs:
+    """A peer of the configuration, which no bulletin cuts off."""
+    fleet = peer.daemon.fleet
+    if fleet is not None and not peer.is_certified:
+        serial = fleet.exchange.serial(peer.link.key)
+        if serial and fleet.trust.bulletin.refuses(serial):
+            yield {"serial": serial}
+
+
+# Relays.
+
+
+def spare_relay_silent(moment: Moment) -> Signs:
+    """Relays that are silent while no peer needs them."""
+    needed = {name for link in moment.down for name in link.config.relays}
+    spare = (relay for relay in moment.silent_relays if relay.config.name not in needed)
+    return (_silent_relay(moment, relay) for relay in spare)
+
+
+def relay_silent(peer: PeerFacts) -> Signs:
+    return (_silent_relay(peer.moment, relay) for relay in peer.relays_with("relay_not_answering"))
+
+
+def _silent_relay(moment: Moment, relay: RelayLink) -> Fields:
+    error = moment.reported(relay)
+    why = "it is off, its address is wrong, a firewall drops UDP here or there, or keys or suites differ"
+    if error is not None:
+        why = f"{shown(error[1].address)}: {meaning_of(error[0]).partition(':')[0]} ({error[0]}, ICMP)"
+    elif relay.peer.received_at is not None:
+        why = "it did before, so it is off, or UDP to it or back is blocked"
+    states = moment.daemon.peer_sockets.web.states(relay.config.addresses)
+    problems = {url: web_problem("silent" if state == CONNECTED else state) for url, state in states.items()}
+    reasons = [f"by TLS ({url}) {what}" for url, (what, _) in problems.items()]
+    reasons += [f"by UDP {why}" if problems else why] if hosts_of(relay) else []
+    remedies = dict.fromkeys(remedy for _, remedy in problems.values() if remedy)
+    return {
+        "relay": titled("relay", relay.config.name),
+        "name": relay.config.name,
+        "addresses": listed(map(str, relay.config.addresses)),
+        "why": "; ".join(reasons),
+        "advice": "".join(f"{remedy}; or " for remedy in remedies),
+    }
+
+
+def not_bound(peer: PeerFacts) -> Signs:
+    for relay in peer.relays_with("not_bound"):
+        name = relay.config.name
+        advice = (
+            f"compare both public_key with `uavlinkd pubkey`; write a [[relay]] for {name} into its file, and a"
+            f" [[member]] for it into the file of the relay"
+        )
+        if peer.is_certified:
+            advice = "its certificate must not be revoked"
+        yield {"relay": titled("relay", name), "advice": advice}
+
+
+# A peer that is down: what is certain on this machine.
+
+
+def name_not_resolved(peer: PeerFacts) -> Signs:
+    relays = (relay.name for relay in peer.relays_with("name_not_resolved"))
+    for owner in (peer.name, *relays):
+        if names := sorted(peer.daemon.peer_sockets.unresolved(owner)):
+            yield {"names": ", ".join(names), "first": names[0]}
+
+
+def _sending(peer: PeerFacts) -> list[Callable[[str], Sighting | None]]:
+    """Where to look for errors of sending: the peer, and the relays to which nothing could be sent."""
+    return [peer.seen, *(partial(peer.moment.seen_at, relay) for relay in peer.relays_with("not_sent"))]
+
+
+def firewall_here(peer: PeerFacts) -> Signs:
+    sightings = (seen("EPERM") for seen in _sending(peer))
+    return ({"at": at(sighting)} for sighting in sightings if sighting is not None)
+
+
+def no_route(peer: PeerFacts) -> Signs:
+    sockets = peer.daemon.peer_sockets
+    if peer.name in sockets.without_socket:
+        listen = peer.daemon.config.listen
+        advice = "compare the address families with `ip -brief address`"
+        if listen and not sockets.networks.networks:
+            advice = f"add {listen[0].wildcard(of_other_version=True)} to listen"
+        yield {"at": peer.addresses, "why": "no socket of its address family", "advice": advice}
+    if not sockets.absent_addresses():
+        for seen in _sending(peer):
+            errors = ((error, sighting) for error in UNROUTED if (sighting := seen(error)) is not None)
+            if (first := next(errors, None)) is not None:
+                yield {"at": at(first[1]), "why": first[0], "advice": meaning_of(first[0])}
+
+
+# Hints: anything here may be forged.
+
+
+def wrong_key_here(peer: PeerFacts) -> Signs:
+    sighting = peer.handshake_seen(DropReason.UNKNOWN_PEER)
+    if not peer.is_certified and sighting is not None and (count := len(sighting.details)):
+        which = "the key" if count == 1 else f"{count} keys, so at least one is not {peer.name}:"
+        yield {"keys": f"{which} {details_at(sighting.details)}"}
+
+
+def wrong_key_there(peer: PeerFacts) -> Signs:
+    if (sighting := peer.handshake_seen(DropReason.BAD_MAC1)) is not None:
+        config = peer.daemon.config
+        advice = (
+            f'at {peer.name}, write public_key = "{encode_key(config.public_key)}" for {config.name}; if its key file'
+            " was replaced, restart this daemon"
+        )
+        if peer.is_certified:
+            advice = f"`uavlinkd fleet sign {peer.name}` prints a line for `uavlinkd enroll --finish` there"
+        yield {"at": at(sighting), "advice": advice}
+
+
+def other_version(peer: PeerFacts) -> Signs:
+    """Which side to update: also if the message is forged, an update is safe."""
+    if (sighting := peer.handshake_seen(DropReason.OTHER_VERSION)) is not None:
+        seen = sorted(version for version in sighting.details if isinstance(version, int))
+        older = [peer.name] if min(seen) < c.PROTOCOL_VERSION else []
+        older += [f"{peer.daemon.config.name}, this machine"] if max(seen) > c.PROTOCOL_VERSION else []
+        versions = " and ".join(f"uavlink/{version}" for version in seen)
+        yield {"at": at(sighting), "versions": versions, "ours": c.PROTOCOL_VERSION, "older": " and at ".join(older)}
+
+
+def wrong_psk(peer: PeerFacts) -> Signs:
+    """Responses of the peer, and of its relays, that this end refuses."""
+    if (sighting := peer.seen(DropReason.BAD_HANDSHAKE)) is not None:
+        yield {"sender": at(sighting)}
+    for relay in peer.relays_with("wrong_psk"):
+        if (refused := peer.moment.refused_by(relay)) is not None:
+            yield {"sender": f"the {titled('relay', relay.config.name)} at {at(refused)}"}
+
+
+def no_common_suite(peer: PeerFacts) -> Signs:
+    if (sighting := peer.seen(DropReason.SUITE_NOT_ACCEPTED)) is not None:
+        accepted = ", ".join(suite.name for suite in peer.link.config.settings.link.suites)
+        yield {"offered": ", ".join(map(str, sighting.details)), "accepted": accepted}
+
+
+def no_listener(peer: PeerFacts) -> Signs:
+    """It may be from before the peer started. A close explains it too."""
+    if not peer.link.is_closed and (sighting := peer.seen(f"{REPORTED}ECONNREFUSED")) is not None:
+        yield {"at": at(sighting)}
+
+
+def not_confirmed(peer: PeerFacts) -> Signs:
+    """The peer initiates, and has not confirmed the responses for :data:`CONFIRM_S`."""
+    core = peer.link.peer
+    since = core.received_at or -c.NEVER
+    begun = [at for one in core.sessions.unconfirmed.values() if (at := one.session.created_at) > since]
+    if begun and peer.now - min(begun) >= CONFIRM_S:
+        yield {}
+
+
+# Silence, without any other problem.
+
+
+def closed_by_peer(peer: PeerFacts) -> Signs:
+    if peer.link.is_overdue(peer.now) and peer.link.is_closed:
+        yield {"age_s": peer.now - peer.link.closed_at}
+
+
+def no_answer(peer: PeerFacts) -> Signs:
+    """A silent peer that has a configured place, or was up before."""
+    config, was_up = peer.link.config, peer.link.peer.received_at is not None
+    if peer.link.is_overdue(peer.now) and (was_up or config.addresses or config.relays):
+        bound = [name for name, relay in peer.daemon.relays.by_name.items() if relay.state_for(peer.link) == "bound"]
+        via = f" through the {titled('relay', bound[0])}, which answers" if bound else ""
+        more = ", or it has a bulletin that revokes this daemon (`uavlinkd fleet list` shows whether)"
+        yield {
+            "places": f"it any more{via}" if was_up else peer.addresses or f"it{via}",
+            "more": more if peer.is_certified else "",
+        }
+
+
+def not_connecting(peer: PeerFacts) -> Signs:
+    config = peer.link.config
+    is_passive = not config.addresses and not config.relays and peer.link.peer.received_at is None
+    if peer.link.is_overdue(peer.now) and is_passive:
+        yield {}

@@ -1,0 +1,225 @@
+"""The signs of findings about frames: what policies refuse, what peers report, and local clients that are silent.
+
+All of it is authentic, or happens on this machine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+from uavlinkd.core import constants as c
+from uavlinkd.core.peer import Peer
+from uavlinkd.core.refusals import Claim
+from uavlinkd.link.evidence import GateHistory
+from uavlinkd.link.facts import EndpointFacts, PartFacts, PeerFacts, listed
+from uavlinkd.link.signs import SECURITY_S, Signs
+from uavlinkd.mavlink.dialect import command_name, name_of
+from uavlinkd.mavlink.egress.lanes import EgressDrop
+from uavlinkd.mavlink.policy.gate import ANY_OTHER, REFUSALS, Refusal
+
+COMMANDS_S: Final = 300.0
+"""A refused command stays in the findings for this time: a person looks some time after the press of a button."""
+CLAIMS_S: Final = 60.0
+"""A peer's claim whose count grew within this time is a present problem."""
+REFUSED_S: Final = 10.0
+"""Other refusals stay for this time."""
+LOSS_LASTS_S: Final = 12.0
+"""A high loss is reported if it lasts for this time. An outage that is over counts as a loss for up to 10 s."""
+
+_BY_RULE: Final = frozenset({Refusal.MESSAGE_NOT_ALLOWED, Refusal.COMMAND_NOT_ALLOWED, Refusal.RATE_LIMITED})
+_FLIGHT_COMMANDS: Final = frozenset(
+    {"MAV_CMD_COMPONENT_ARM_DISARM", "MAV_CMD_NAV_TAKEOFF", "MAV_CMD_NAV_LAND", "MAV_CMD_NAV_RETURN_TO_LAUNCH"}
+)
+_CLAIMS_SHOWN: Final = 3
+
+
+def hidden_frame(part: PartFacts) -> Signs:
+    if part.now - part.history.incoming.hiding_at <= SECURITY_S:
+        yield {"count": part.history.incoming.reasons.within(SECURITY_S, part.now)[Refusal.HIDDEN_FRAME]}
+
+
+def freshness_unverified(peer: PeerFacts) -> Signs:
+    """Also without a peer's key, an attacker on the path can withhold answers."""
+    if (since := peer.link.peer.unverified_since) is not None:
+        yield {"age_s": peer.now - since}
+
+
+def high_loss(peer: PeerFacts) -> Signs:
+    """By direction: a network may lose in one only."""
+    directions = ("from it to here", "from here to it")
+    shares = [
+        f"{min(1.0, lost / max(1, sent)):.0%} {direction}"
+        for direction, (sent, lost), lossless_at in zip(
+            directions, peer.link.losses, peer.link.lossless_at, strict=False
+        )
+        if peer.now - lossless_at >= LOSS_LASTS_S
+    ]
+    if shares:
+        yield {"losses": " and ".join(shares)}
+
+
+def frames_unsent(peer: PeerFacts) -> Signs:
+    """That newer states replace older ones is no problem."""
+    dropped = peer.history.unsent.within(REFUSED_S, peer.now)
+    if count := sum(dropped.get(reason, 0) for reason in (EgressDrop.OVERFLOW, EgressDrop.STALE)):
+        yield {"count": count}
+
+
+# What a policy refuses.
+
+
+def foreign_system(part: PartFacts) -> Signs:
+    """Frames of systems that the part may not speak for."""
+    is_all = _is_only_foreign(part)
+    systems = part.history.incoming.systems.within(REFUSED_S, part.now)
+    if systems and (is_all or "in" not in part.blocked):
+        allowed = part.rules.get("system_ids")
+        owners = {system: part.moment.owner(system, part.owner) for system in sorted(systems)}
+        yield {
+            "which": "all" if is_all else "some",
+            "systems": listed(map(str, sorted(systems)), 8),
+            "ids": listed(map(str, allowed)) if isinstance(allowed, list | tuple) else str(allowed),
+            "where": "in its certificate" if part.is_certified else "here",
+            "advice": _advice(part, {system: owner for system, owner in owners.items() if owner}, min(systems)),
+            **({} if is_all else {"severity": "warning"}),
+        }
+
+
+def _advice(part: PartFacts, owners: dict[int, str], first: int) -> str:
+    """What else to do about frames of these systems, of which ``owners`` names some of others."""
+    if owners:  # never advise to trust one peer as another
+        whose = listed(f"{system} is {owner}'s" for system, owner in owners.items())
+        is_captured = f"; if no client there forwards such frames, treat {part.name} as captured"
+        return f": {whose}{is_captured if isinstance(part, PeerFacts) else ''}"
+    remedy = "write it into its system_ids"
+    if part.is_certified:
+        remedy = f"`uavlinkd fleet sign --replace {part.name} --id {first}` signs it again"
+    return f"; or, only if you know that {part.owner} has this id, {remedy}"
+
+
+def _is_only_foreign(part: PartFacts) -> bool:
+    reasons = part.history.incoming.reasons.within(REFUSED_S, part.now)
+    return "in" in part.blocked and {*reasons} == {Refusal.FOREIGN_SYSTEM}
+
+
+def all_refused(part: PartFacts) -> Signs:
+    """Frames in one direction, for another reason than their system."""
+    for direction, gate in (("in", part.history.incoming), ("out", part.history.outgoing)):
+        reasons = gate.reasons.within(REFUSED_S, part.now)
+        if reasons and direction in part.blocked and not (direction == "in" and _is_only_foreign(part)):
+            which = "from it" if direction == "in" else "to it"
+            yield {"which": which, "reasons": "; ".join(reason.meaning for reason in reasons)}
+
+
+def roles_exchanged(peer: PeerFacts) -> Signs:
+    """A peer with the role of a vehicle sends the heartbeat of a ground station."""
+    refused = peer.history.incoming.reasons.within(REFUSED_S, peer.now)
+    if peer.rules.get("role") == "vehicle" and Refusal.GROUND_STATION_NOT_ALLOWED in refused:
+        remedy = 'write role = "operator" if it is a ground station, "swarm-member" if both ends are vehicles'
+        if peer.is_certified:
+            remedy = f"sign it again with `uavlinkd fleet sign --replace {peer.name} --role operator`"
+        yield {"advice": remedy, **({} if peer.blocked else {"severity": "warning"})}
+
+
+def commands(direction: str) -> Callable[[PartFacts], Signs]:
+    """Commands from or to the part that its role or lists refuse, those of a flight first."""
+
+    def signs(part: PartFacts) -> Signs:
+        gate = part.history.incoming if direction == "in" else part.history.outgoing
+        if names := _commands(gate, part.now):
+            yield {"commands": names}
+
+    return signs
+
+
+def _commands(gate: GateHistory, now: float) -> str:
+    counts = [(key, count) for key, count in gate.commands.within(COMMANDS_S, now).items() if key[2] in _BY_RULE]
+    counts.sort(key=lambda entry: _rank(entry[0][1]))
+    return listed(f"{_command(msgid, number)} {count:,}x" for (msgid, number, _), count in counts)
+
+
+def _rank(number: int) -> int:
+    """What a person looks for comes first: a list shows only its beginning, and others can make it long."""
+    return 2 if number == ANY_OTHER else int(command_name(number) not in _FLIGHT_COMMANDS)
+
+
+def _command(msgid: int, number: int) -> str:
+    if number == ANY_OTHER:
+        return "other commands"
+    return f"{name_of(msgid)} ({command_name(number).removeprefix('MAV_CMD_')})"
+
+
+# What a peer reports: a claim of its own. Nothing acts on it.
+
+
+def refused_there(peer: PeerFacts) -> Signs:
+    claims = [claim for claim in peer.link.peer.refusal_claims.recent() if peer.now - claim.changed_at <= CLAIMS_S]
+    if claims:
+        claims.sort(key=lambda claim: not claim.refused.command)
+        kinds = "; ".join(_refused_kind(claim, peer.now) for claim in claims[:_CLAIMS_SHOWN])
+        more = len(claims) - _CLAIMS_SHOWN
+        yield {"kinds": f"{kinds}; and {more} more kinds of frames" if more > 0 else kinds}
+
+
+def _refused_kind(claim: Claim, now: float) -> str:
+    refused, refusal = claim.refused, REFUSALS.get(claim.refused.reason)
+    meaning = "a reason that this version does not know" if refusal is None else refusal.meaning
+    command = f" {command_name(refused.command).removeprefix('MAV_CMD_')}" if refused.command else ""
+    frames = "frame" if refused.total == 1 else "frames"
+    age = now - claim.changed_at
+    return f"{name_of(refused.message)}{command} ({meaning}, {refused.total:,} {frames}, {age:.0f} s ago)"
+
+
+PROBLEMS: Final = {
+    1: ("all_refused", "its policy refuses all frames of a client"),
+    2: ("cut_off", "no endpoint has a client"),
+    3: ("no_client", "an endpoint has no client"),
+    4: ("client_silent", "a client sends no MAVLink"),
+    5: ("device_unavailable", "a serial device cannot be opened"),
+    6: ("garbage", "bytes that are not MAVLink arrive at an endpoint"),
+    7: ("network_absent", "a network is absent"),
+    8: ("radio_disturbed", "a radio's line is disturbed"),
+    9: ("daemon_paused", "its process was paused"),
+    11: ("key_twice", "two machines use one private key"),
+}
+"""The codes of problem reports with their names and meanings, the most important first."""
+CUT_OFF: Final = 2
+_STOPS_FRAMES: Final = frozenset({1, CUT_OFF})
+
+
+def codes_there(peer: Peer, now: float) -> tuple[int, ...]:
+    """What a peer says about itself now: nothing if it is not up, or did not repeat it."""
+    claim = peer.problem_claim
+    return claim.codes if peer.is_up and now - claim.received_at <= c.PROBLEMS_LAST_S else ()
+
+
+def stops_frames(peer: Peer, now: float) -> bool:
+    """Whether a peer says that frames stop there."""
+    return not _STOPS_FRAMES.isdisjoint(codes_there(peer, now))
+
+
+def name_of_problem(code: int) -> str:
+    """The name of a code; a number for one that only a newer version knows."""
+    return PROBLEMS[code][0] if code in PROBLEMS else f"problem_{code}"
+
+
+def problems_there(peer: PeerFacts) -> Signs:
+    if codes := codes_there(peer.link.peer, peer.now):
+        meanings = [PROBLEMS[code][1] if code in PROBLEMS else f"problem {code}" for code in codes]
+        is_severe = stops_frames(peer.link.peer, peer.now)
+        yield {"meanings": "; ".join(meanings), **({"severity": "fault"} if is_severe else {})}
+
+
+# Local endpoints.
+
+
+def is_silent_by(cause: str) -> Callable[[EndpointFacts], Signs]:
+    """Whether this is why no MAVLink comes from the client of an endpoint."""
+
+    def signs(endpoint: EndpointFacts) -> Signs:
+        why, fields = endpoint.silence
+        if why == cause:
+            yield fields
+
+    return signs
