@@ -36,7 +36,12 @@ ALONE = ("pressure", "faults", "daemon", "link")
 LONG = ("natlab", "faults", "modem", "compose", "daemon")
 """Folders of machines and of real daemons. Marked ``long``, except tests with the marker ``short``."""
 
-settings.register_profile("busy machine", settings(), deadline=None, suppress_health_check=[HealthCheck.too_slow])
+EXAMPLES = int(os.environ.get("UAVLINKD_EXAMPLES", "25"))
+"""How many examples each property is tried with. `.ci/run` has more for the core."""
+
+settings.register_profile(
+    "busy machine", max_examples=EXAMPLES, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
 settings.load_profile("busy machine")
 
 

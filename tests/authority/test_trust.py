@@ -238,7 +238,7 @@ def test_bulletin_that_may_not_be_verified() -> None:
 SERIALS = range(2, 12)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(st.lists(st.tuples(st.sampled_from(SERIALS), st.integers(1, 3), st.integers(1, 40)), max_size=12))
 def test_any_history_of_certificates(history: list[tuple[int, int, int]]) -> None:
     """No two held ones have a name or a system id in common, and the serial for a key never falls."""

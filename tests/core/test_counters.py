@@ -26,7 +26,7 @@ STEP = st.one_of(
 )
 
 
-@settings(max_examples=300)
+@settings(max_examples=75)
 @given(st.integers(0, 2 * W), st.lists(STEP, max_size=80))
 @example(0, [0, W, -W, 1 - W, 0])
 @example(7, [2**31, -1, 1, -W + 1, -W, 3 * W, -W, 1 - W])

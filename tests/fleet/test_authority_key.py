@@ -104,6 +104,7 @@ def test_key_without_a_passphrase_is_named(file: Path, capsys: pytest.CaptureFix
     assert main(["fleet", "add", "v7"]) == 0
 
 
+@pytest.mark.long
 def test_passphrase_typed_twice_on_a_terminal(tmp_path: Path) -> None:
     """The terminal does not show it, also if it is typed before the prompt. Only there, the paper copy is printed."""
     for answers, reason in (

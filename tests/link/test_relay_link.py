@@ -212,7 +212,7 @@ assignments: st.SearchStrategy[Assignment] = st.tuples(
 )
 
 
-@settings(max_examples=300)
+@settings(max_examples=75)
 @given(st.lists(assignments, max_size=12))
 def test_random_assignments_follow_the_rules(history: list[Assignment]) -> None:
     """Both directions agree. A relay loses no handle to another one, and gets each that no other has."""

@@ -187,7 +187,7 @@ def test_bad_checksum_in_an_envelope_costs_that_frame_alone(version: int, signed
 
 
 @given(data=st.one_of(mixtures, st.binary(max_size=600)))
-@settings(max_examples=400)
+@settings(max_examples=100)
 def test_every_byte_is_accounted_for(data: bytes) -> None:
     """Of any bytes, each is in a frame or counted as garbage; a stream and a datagram agree; nothing raises."""
     for split in (split_datagram, split_payload, split_stream):
@@ -258,7 +258,7 @@ def test_stream_forgets_at_its_end() -> None:
 
 
 @given(data=mixtures, cuts=st.lists(st.integers(0, 400), max_size=12))
-@settings(max_examples=400)
+@settings(max_examples=100)
 def test_chunks_change_nothing(data: bytes, cuts: list[int]) -> None:
     """A stream in chunks leads to the same frames, counters and rest as in one chunk."""
     whole = StreamSplitter()

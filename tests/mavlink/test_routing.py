@@ -121,7 +121,7 @@ Step = tuple[str, tuple[int, int], tuple[int, int], float]
 
 
 @given(STEPS, st.booleans(), st.sampled_from(["", "p", "bpq"]))
-@settings(max_examples=300)
+@settings(max_examples=75)
 def test_router_does_what_the_rules_say(steps: list[Step], relays: bool, without: str) -> None:
     """Against a model that remembers everything and applies the rules to it."""
     with patch.object(routing, "ROUTE_LIFETIME_S", 1e9):

@@ -181,7 +181,7 @@ ACTS = st.lists(st.tuples(KINDS, PLACES, st.floats(0, 2)), max_size=25)
 
 
 @given(st.integers(2, 4), BRIDGES, ACTS, st.booleans())
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_every_sending_is_delivered_once(
     clients: int, bridges: list[tuple[int, int, float]], acts: list[tuple[str, int, float]], is_local: bool
 ) -> None:

@@ -14,7 +14,7 @@ from tests.network.network import share_a_session
 from uavlinkd.core.drops import DropReason
 from uavlinkd.lab.mitm.radio import RadioSettings
 
-SEEDS = int(os.environ.get("UAVLINKD_CHAOS_SEEDS", "8"))
+SEEDS = int(os.environ.get("UAVLINKD_CHAOS_SEEDS", "3"))
 USABLE = RadioSettings(delay_s=0.05)
 HEALED_S = 6.0
 """Until all links that members call are up, and all members have the newest bulletin."""

@@ -23,7 +23,7 @@ EVER_S = VOUCHED_S + c.LATE_AFTER_S
 """and in any combination: confirmed, then overtaken for the longest time."""
 VERIFIED_S = c.LATE_AFTER_S + c.HOLD_S
 """How long after its request an answer verifies the frames that follow in order."""
-SEEDS = int(os.environ.get("UAVLINKD_CHAOS_SEEDS", "12"))
+SEEDS = int(os.environ.get("UAVLINKD_CHAOS_SEEDS", "4"))
 """Number of random histories of delays."""
 REKEYS = Link(timers=Timers(rekey_after_s=1.0, reject_after_s=20.0))
 PLAIN = Link()
@@ -34,7 +34,7 @@ def ages(flow: Flow) -> list[float]:
 
 
 @pytest.mark.parametrize("link", [PLAIN, REKEYS], ids=["one session", "rekeys"])
-@pytest.mark.parametrize("hold_s", [1.0, 3.0, 10.0, 30.0])
+@pytest.mark.parametrize("hold_s", [1.0, 3.0, 30.0])
 def test_overtaken_envelopes_are_delivered_in_time_or_never(hold_s: float, link: Link) -> None:
     """A fifth of all is held: up to two seconds late it is delivered, later it is refused as delayed."""
     with Network(f"hold some {hold_s}", RadioSettings(delay_s=0.02)) as network:
@@ -56,8 +56,7 @@ def test_overtaken_envelopes_are_delivered_in_time_or_never(hold_s: float, link:
         assert share_a_session(a, b)
 
 
-@pytest.mark.parametrize("interval_s", [0.02, 0.3, 1.0])
-@pytest.mark.parametrize("hold_s", [2.5, 5.0, 20.0])
+@pytest.mark.parametrize(("hold_s", "interval_s"), [(2.5, 0.02), (2.5, 1.0), (5.0, 0.3), (20.0, 0.3)])
 def test_a_recorded_blackout_delivers_nothing_stale(hold_s: float, interval_s: float) -> None:
     """Everything is held and released at once: only recent frames are delivered, and the link continues."""
     with Network(f"hold all {hold_s} {interval_s}", RadioSettings(delay_s=0.02)) as network:
@@ -125,8 +124,7 @@ def test_reordering_within_two_seconds_loses_nothing(
             assert receiver.drops["delayed"] == receiver.drops["doubtful"] == 0
 
 
-@pytest.mark.parametrize("delay_s", [0.005, 0.2, 0.45])
-@pytest.mark.parametrize("interval_s", [1.9, 2.1, 4.0, 9.0])
+@pytest.mark.parametrize(("interval_s", "delay_s"), [(1.9, 0.45), (2.1, 0.2), (4.0, 0.005), (9.0, 0.45)])
 def test_honest_links_with_rare_frames_lose_nothing(interval_s: float, delay_s: float) -> None:
     """Rare frames with silence between them: each is delivered, after another round trip if the sender is asked."""
     with Network(f"slow talk {interval_s} {delay_s}", RadioSettings(delay_s=delay_s, jitter_s=0.01)) as network:

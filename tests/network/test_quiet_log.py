@@ -252,15 +252,13 @@ class HonestPair(Network):
         self.at(self.now + 1.0, self._tick)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("loss", "events"),
     [
-        (0.02, (RESTART,)),
-        *(
-            pytest.param(loss, events, marks=pytest.mark.long)
-            for loss in (0.0, 0.02, 0.1)
-            for events in ((RESTART,), (ADDRESS,), (OUTAGE,), (STALL,), (ADDRESS, OUTAGE, RESTART, STALL))
-        ),
+        (0.0, (ADDRESS, RESTART)),
+        (0.02, (OUTAGE, STALL)),
+        (0.1, (ADDRESS, OUTAGE, RESTART, STALL)),
     ],
 )
 def test_nothing_honest_is_an_alarm(loss: float, events: tuple[str, ...]) -> None:

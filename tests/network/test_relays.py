@@ -276,7 +276,9 @@ FAILURES: dict[str, Callable[[int], Relayed]] = {
 }
 
 
-TRIES = int(os.environ.get("UAVLINKD_RELAY_TRIES", "2"))
+SHORT = "one of two relays dies"
+
+TRIES = int(os.environ.get("UAVLINKD_RELAY_TRIES", "1"))
 SEEDS = int(os.environ.get("UAVLINKD_CHAOS_SEEDS", "8"))
 FIRST_FRAME_S = 1.0
 BACK_S = 2.0
@@ -285,7 +287,8 @@ NATS_GAP_S = 0.6
 """Until the failure is seen 0.35 s, then four hops to the relay and back, and three along it."""
 
 
-@pytest.mark.parametrize("batch", [pytest.param(0, marks=pytest.mark.long), 1])
+@pytest.mark.long
+@pytest.mark.parametrize("batch", [0, 1])
 def test_links_along_relays_are_back_soon_after_any_history(batch: int) -> None:
     """Relays die, NATs forget, members roam, data is replayed and forged: links are back. Filters hold."""
     for seed in (19, *range(20, 20 + SEEDS // 4))[batch::2]:
@@ -336,7 +339,9 @@ def test_link_is_back_soon_after_a_nat_has_forgotten_its_mappings(*, of_station:
     assert max(rebound_s(seed, of_station=of_station) for seed in range(TRIES)) < BACK_S
 
 
-@pytest.mark.parametrize("name", FAILURES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name == SHORT else pytest.mark.long) for name in FAILURES]
+)
 def test_no_critical_frame_is_lost_when_a_relay_or_a_network_dies(name: str) -> None:
     """Another one carries copies. The stream stops shortly."""
     for seed in range(TRIES):
@@ -370,12 +375,14 @@ def test_relay_that_forges_the_addresses_of_its_members_prevents_no_direct_path(
         assert pair.is_direct()
 
 
+@pytest.mark.long
 def test_one_copy_for_each_relay_is_too_few(monkeypatch: pytest.MonkeyPatch) -> None:
     """It goes to one network of the peer: the figures show the loss when that network dies."""
     monkeypatch.setattr(c, "RELAYED_COPIES", 1)
     assert sum(one_network_of_two_dies(seed).critical_lost for seed in range(2))
 
 
+@pytest.mark.long
 def test_relay_that_connects_members_that_did_not_both_ask_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     """Planted: one wish is enough."""
     bind = Bindings.bind

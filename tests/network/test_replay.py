@@ -50,7 +50,7 @@ def _triangle(network: Network) -> tuple[Drone, Drone, Drone]:
     return drones
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2))])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.long)])
 def test_replay_storm_delivers_nothing_twice_and_leaves_the_links_as_they_are(seed: int) -> None:
     """500 replays a second against three linked drones: every frame once and in time, nothing lost."""
     with Network(f"storm {seed}", RadioSettings(delay_s=0.02)) as network:
@@ -76,19 +76,18 @@ def test_replay_storm_delivers_nothing_twice_and_leaves_the_links_as_they_are(se
 )
 def test_link_comes_back_after_a_restart_amid_a_replay_storm(knows: str) -> None:
     """The restarted drone remembers no initiation; hundreds of old ones do not block its link."""
-    for seed in range(3):
-        with Network(f"storm and restart {knows} {seed}", RadioSettings(delay_s=0.02)) as network:
-            a, b = network.pair(FAST_REKEY, a_knows=knows != "other", b_knows=knows != "restarted")
-            network.talk(a, b)
-            recorder = Recorder(network)
-            network.run(30)
-            initiations = [datagram for datagram in recorder.recorded if datagram[0][0] == 1]
-            assert len(initiations) >= 15
-            begin = network.now
-            a.start(0.0)
-            recorder.recorded = initiations * 4 + recorder.recorded[-1000:]
-            _storm(network, recorder, per_s=200, duration_s=10)
-            network.run_until(partial(share_a_session, a, b), within_s=3)
-            network.run(begin + 10 - network.now)
-            for flow in (network.flow(a, b), network.flow(b, a)):
-                assert not flow.lost(begin + 3, network.now - 0.1), f"{flow.sender} to {flow.receiver}"
+    with Network(f"storm and restart {knows}", RadioSettings(delay_s=0.02)) as network:
+        a, b = network.pair(FAST_REKEY, a_knows=knows != "other", b_knows=knows != "restarted")
+        network.talk(a, b)
+        recorder = Recorder(network)
+        network.run(30)
+        initiations = [datagram for datagram in recorder.recorded if datagram[0][0] == 1]
+        assert len(initiations) >= 15
+        begin = network.now
+        a.start(0.0)
+        recorder.recorded = initiations * 4 + recorder.recorded[-1000:]
+        _storm(network, recorder, per_s=200, duration_s=10)
+        network.run_until(partial(share_a_session, a, b), within_s=3)
+        network.run(begin + 10 - network.now)
+        for flow in (network.flow(a, b), network.flow(b, a)):
+            assert not flow.lost(begin + 3, network.now - 0.1), f"{flow.sender} to {flow.receiver}"

@@ -94,6 +94,7 @@ def _death(seed: int) -> tuple[float, float]:
         return since_s, flow.longest_gap(died - 1, network.now)
 
 
+@pytest.mark.long
 def test_deaths_of_a_path_while_the_other_one_returns_leave_short_gaps() -> None:
     """The best one is asked as often as beside a usable one, so its death is seen soon."""
     deaths = [_death(seed) for seed in range(DEATHS)]
@@ -120,6 +121,7 @@ def _linked(network: Network) -> tuple[Drone, Drone]:
     return vehicle, station
 
 
+@pytest.mark.long
 def test_peer_that_closed_is_found_along_the_metered_path_alone() -> None:
     """The mesh worked until the station closed its sessions, and is gone when it is back: LTE connects them."""
     for seed in range(5):

@@ -127,7 +127,7 @@ steps: st.SearchStrategy[Step] = st.one_of(
 )
 
 
-@settings(max_examples=150)
+@settings(max_examples=40)
 @given(st.integers(0, 1000), st.lists(steps, max_size=40))
 def test_random_histories_follow_the_rules(seed: int, history: list[Step]) -> None:
     """Members bind, lose paths, let wishes expire, and are removed and added again. Routes follow."""

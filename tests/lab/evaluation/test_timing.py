@@ -16,6 +16,7 @@ from uavlinkd.lab.evaluation.timing_report import TimingFindings, timing_problem
 from uavlinkd.lab.evaluation.timing_run import TIMING, measure_paper, paper_points
 
 
+@pytest.mark.long
 async def test_handshake_of_daemons_is_timed() -> None:
     """From the initiation to the delivered frame."""
     handshake = await time_handshake(X25519)
@@ -25,6 +26,7 @@ async def test_handshake_of_daemons_is_timed() -> None:
     assert handshake["datagrams"][0] >= 3
 
 
+@pytest.mark.long
 async def test_failed_measurement_is_a_record_with_its_reason() -> None:
     """And a problem of the run. Here a suite that the daemon refuses: the log of the process names the key."""
     record = await measured("handshake", {}, time_handshake(replace(X25519, name="x448")))
@@ -37,6 +39,7 @@ def point(dh_bits: int, group: str = "made") -> dict[str, Value]:
     return {"dh_bits": dh_bits, "group": group}
 
 
+@pytest.mark.long
 async def test_exchange_of_the_paper_is_measured_in_a_process(capfd: pytest.CaptureFixture[str]) -> None:
     """Or recorded with the limit, or with the status of a process that failed: RFC 7919 has no group of 512 bits."""
     done = await measure_paper(point(512), 60, b"data")

@@ -138,7 +138,7 @@ def test_flood_keeps_its_rate_and_makes_up_for_little() -> None:
 
 
 @pytest.mark.parametrize("name", ATTACKS)
-@settings(max_examples=15)
+@settings(max_examples=5)
 @given(data=st.data())
 def test_no_datagram_raises(name: str, data: st.DataObject) -> None:
     """Any datagram and any answer are handled."""

@@ -23,7 +23,7 @@ def in_the_air(altitude_m: float = 10.0) -> Vehicle:
     return vehicle
 
 
-@settings(max_examples=30)  # each example is a flight of minutes
+@settings(max_examples=8)  # each example is a flight of minutes
 @given(
     north=st.floats(-300, 300),
     east=st.floats(-300, 300),

@@ -212,7 +212,7 @@ def test_memory_is_bounded_under_a_flood_of_replaceable_frames() -> None:
     assert len(lanes.queues[Lane.STATES].line) <= 2 * lanes.count + 65
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(
     seed=st.integers(0, 2**32),
     budget=st.sampled_from([0, 1000, 4000, 64_000, 1_000_000]),

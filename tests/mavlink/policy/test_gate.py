@@ -362,7 +362,7 @@ frames = st.sampled_from(
 
 
 @given(allow=st.lists(entries, max_size=4), more=entries, one=frames)
-@settings(max_examples=400)
+@settings(max_examples=100)
 def test_lists_are_monotonic(allow: list[Any], more: Any, one: Frame) -> None:
     """One more allowed entry never refuses a frame."""
     gate = incoming(allow_in=allow)
