@@ -9,6 +9,7 @@ from __future__ import annotations
 from ipaddress import ip_address, ip_network
 from typing import Final
 
+from tests.core import inside
 from tests.core.harness import AT_A, ELSEWHERE, Pair, quiet
 from tests.fuzz.engine import Run, Script, play
 from tests.fuzz.insiders import Insider
@@ -119,7 +120,7 @@ class Named(Insider):
         """Those of every peer, and of the candidates."""
         super().check_bounds()
         assert len(self.peer.paths.candidates) <= c.CANDIDATES, "too many candidates"
-        assert len(self.peer.paths._asked) <= c.CANDIDATES, "too many questions wait"
+        assert inside.asked_candidates(self.peer.paths) <= c.CANDIDATES, "too many questions wait"
         assert len(self.search.theirs) <= c.CANDIDATES
 
 

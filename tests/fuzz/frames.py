@@ -11,7 +11,9 @@ from typing import Final, cast
 from fastcrc.crc16 import mcrf4xx
 
 from tests.fuzz.engine import Run, Script
+from tests.link.inside import most_flows
 from tests.link.test_switch import Client, policy
+from tests.mavlink.inside import gate_tables, most_addresses, remembered_frames
 from uavlinkd.link import switch as switching
 from uavlinkd.link.drop_summary import DropSummary
 from uavlinkd.link.switch import Port, Switch
@@ -262,16 +264,19 @@ def _check_received(clients: list[Client], source: int, frames: list[Frame]) -> 
 
 
 def _check_tables(router: Router[Port], switch: Switch, policies: list[Policy]) -> None:
-    for received_at in router._received_at.values():
-        assert len(received_at) <= routing.MAX_ADDRESSES_PER_PORT, "too many addresses"
-    assert len(router.sendings._seen) <= sendings.MAX_FRAMES_REMEMBERED
-    for flows in (known.flows for known in switch._ports.values()):
-        assert len(flows) <= switching.MAX_FLOWS
+    assert most_addresses(router) <= routing.MAX_ADDRESSES_PER_PORT, "too many addresses"
+    assert remembered_frames(router) <= sendings.MAX_FRAMES_REMEMBERED
+    assert most_flows(switch) <= switching.MAX_FLOWS
     for client_policy in policies:
         for gate in (client_policy.incoming, client_policy.outgoing):
             assert len(gate.refused) <= gates.MAX_COUNTED + len(Refusal), "too many separate counters"
-            assert len(gate._decisions) <= gates.MAX_DECISIONS
-            assert len(gate._buckets) <= gates.MAX_BUCKETS
+            _check_memory(gate)
+
+
+def _check_memory(gate: gates.Gate) -> None:
+    decisions, buckets = gate_tables(gate)
+    assert decisions <= gates.MAX_DECISIONS
+    assert buckets <= gates.MAX_BUCKETS
 
 
 def make_gate() -> Run:
@@ -295,7 +300,6 @@ def make_gate() -> Run:
                 assert refusal or claims is None or frame.header.system in claims, "spoke as another system"
                 assert refusal or frame.header.msgid != SETUP_SIGNING, "a signing key may pass"
         assert len(gate.refused) <= gates.MAX_COUNTED + len(Refusal)
-        assert len(gate._decisions) <= gates.MAX_DECISIONS
-        assert len(gate._buckets) <= gates.MAX_BUCKETS
+        _check_memory(gate)
 
     return run

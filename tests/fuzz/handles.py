@@ -12,6 +12,7 @@ from tests.core.harness import AT_A, ELSEWHERE, KEY_A, KEY_C, quiet
 from tests.fuzz.engine import Run, Script, play
 from tests.fuzz.insiders import Insider
 from tests.fuzz.stages import NOW, copier, pair_of
+from tests.link.inside import handle_tables
 from uavlinkd.config.model import PeerAddress, RelayConfig
 from uavlinkd.core import constants as c
 from uavlinkd.core.drops import DropReason
@@ -94,8 +95,8 @@ class Assigned(Insider):
         """Those of every peer, and of the handles; and which data is accepted."""
         super().check_bounds()
         most = len(self.peer.paths.states) * len(WANTED) * c.HANDLES_PER_PAIR
-        assert len(self._handles._inward) <= most, "too many handles"
-        assert len(self._handles._outward) <= most, "handles in one direction only"
+        assert len(handle_tables(self._handles)[0]) <= most, "too many handles"
+        assert len(handle_tables(self._handles)[1]) <= most, "handles in one direction only"
         for handle in range(HANDLES):
             for at in (AT_A, ELSEWHERE):
                 taken = self._handles.unwrap(at.socket, wrap(handle, b"\x40"), at.address)

@@ -11,12 +11,12 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Final
 
+from tests.core import inside
 from tests.core.harness import AT_A, AT_B, ELSEWHERE, KEY_A, KEY_B, KEY_C, Pair, datagrams, of, only, with_macs
 from tests.fuzz.engine import Run, Script
 from tests.fuzz.stages import GROUPS, LINKS, NOW, SeededEntropy, copier, pair_of
 from uavlinkd.core import constants as c
 from uavlinkd.core import handshake, noise, wire
-from uavlinkd.core.admission import Admission
 from uavlinkd.core.crypto import KeyPair
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.limits import TokenBucket
@@ -49,7 +49,7 @@ def write(
             message += sealed
             state = state._replace(symmetric=symmetric)
         else:
-            state = state._mix(token)
+            state = inside.mix(state, token)
     symmetric, sealed = state.symmetric.encrypt_and_hash(payload)
     return state._replace(symmetric=symmetric), message + sealed
 
@@ -110,9 +110,9 @@ def _refill(pair: Pair, now: float) -> None:
     """An unlimited budget: the targets test the code behind it."""
     for pending in pair.a.peer.initiator.pending.values():
         if (key := pending.initiated.state.e1) is not None:
-            key._computed = None
+            inside.forget_secret(key)
     for node in (pair.a.node, pair.b.node):
-        node._handshakes.admission = Admission(node._is_known, now)
+        inside.refill(node, now)
         for peer in node.peers.values():
             peer.group_work = peer.proven_group_work = TokenBucket(*c.GROUP_WORK_PER_PEER, now)
             peer.answers = peer.answers_while_up = TokenBucket(*c.ANSWERS, now)
@@ -194,7 +194,7 @@ def _check_bounds(pair: Pair) -> None:
         for peer in side.node.peers.values():
             assert len(peer.sessions.unconfirmed) <= 2 * c.UNCONFIRMED_PER_KIND, "too many unconfirmed sessions"
             owned += len(peer.sessions.unconfirmed) + len(peer.initiator.pending) + len(peer.sessions.confirmed)
-        assert len(side.node._indices.owners) == owned, "an index without an owner"
+        assert inside.owned_indices(side.node) == owned, "an index without an owner"
 
 
 def make() -> Run:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import Final
 
+from tests.core import inside
 from tests.core.harness import AT_A, ELSEWHERE, FRAME, KEY_A, KEY_B, Pair, of, unsealed
 from tests.fuzz.engine import Run, Script, play
 from tests.fuzz.stages import LINKS, NOW, SeededEntropy, copier, pair_of
@@ -239,16 +240,16 @@ class Insider:
         assert len(sessions.unconfirmed) <= 2 * c.UNCONFIRMED_PER_KIND, "too many unconfirmed sessions"
         assert len(peer.initiator.pending) <= c.PENDING_PER_PEER, "too many initiations"
         owned = len(sessions.confirmed) + len(sessions.unconfirmed) + len(peer.initiator.pending)
-        assert len(self.node._indices.owners) == owned, "an index without an owner"
-        assert len(peer.remembered) == len(self.node._handshakes.remembered) <= c.REMEMBERED_MOST
+        assert inside.owned_indices(self.node) == owned, "an index without an owner"
+        assert len(peer.remembered) == inside.remembered_initiations(self.node) <= c.REMEMBERED_MOST
         assert len(peer.echo_requests) <= 64, "too many echo requests"
         assert len(peer.refusal_claims.recent()) <= c.REFUSALS_KEPT, "too many claims"
         assert len(peer.problem_claim.codes) <= c.PROBLEMS_PER_REPORT, "too many problems"
-        assert len(peer.own_refusals._totals) <= c.REFUSALS_KEPT, "too many refusals"
+        assert inside.counted_refusals(peer) <= c.REFUSALS_KEPT, "too many refusals"
         for session in sessions.confirmed:
-            held = session.held
-            assert held.size <= c.HELD_BYTES or len(held._frames) == 1, "too much is held"
-            assert len(session._received_history._steps) <= 16, "too many steps"
+            is_one = inside.held_frames(session) == 1
+            assert session.held.size <= c.HELD_BYTES or is_one, "too much is held"
+            assert inside.history_steps(session) <= 16, "too many steps"
 
     def check_sequel(self) -> None:
         """After any script, an honest handshake later makes a link that carries frames in both directions."""

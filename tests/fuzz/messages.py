@@ -10,6 +10,7 @@ from typing import Final
 from websockets.uri import parse_uri
 from websockets.utils import accept_key
 
+from tests.endpoints.inside import held_bytes
 from tests.endpoints.web_streams import REQUEST, Owner, frame
 from tests.fuzz.engine import Run, Script
 from uavlinkd.endpoints.web_stream import MAX_MESSAGE, WebStream, client_protocol, server_protocol
@@ -79,7 +80,7 @@ class _End:
         while at < len(data) and not self.stream.lost:
             size = 1 + (cuts[number % len(cuts)] if cuts else 255)
             self.stream.on_bytes(data[at : at + size], now, 0)
-            assert len(self.stream._protocol.reader.buffer) <= MAX_HELD, "more is held than a header or a message"
+            assert held_bytes(self.stream) <= MAX_HELD, "more is held than a header or a message"
             at, number = at + size, number + 1
 
     def close(self) -> None:

@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Final
 
+from tests.core import inside
 from tests.core.harness import ONLY_COUNTED, exchange, of, state_of
 from tests.fuzz.engine import Run, Script
 from tests.fuzz.stages import LINKS, PSK, Stage, copier, idle, initiator, responder, session, with_suite
@@ -20,7 +21,6 @@ from uavlinkd.core import constants as c
 from uavlinkd.core import wire
 from uavlinkd.core.cookie import MacKeys, mac1_of
 from uavlinkd.core.drops import DropReason
-from uavlinkd.core.limits import SourceLimiter, TokenBucket
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Dropped, Output, SessionEstablished, Transmit
 from uavlinkd.core.path import Path
@@ -212,11 +212,8 @@ class Outsider:
 
 def _refill(node: Node, now: float) -> None:
     """Full budgets, and no drops. The budgets are small, so that scripts reach requests for cookies."""
-    admission = node._handshakes.admission
-    admission._initiations, admission._responses = TokenBucket(1.0, BUDGET, now), TokenBucket(1.0, BUDGET, now)
-    # All scripts without a sequel share these: the clock stands still, and a fast machine runs many.
-    admission._read = TokenBucket(*c.INITIATIONS_READ, now)
-    admission._known_read = SourceLimiter(*c.INITIATIONS_READ_PER_KNOWN)
+    # All scripts without a sequel share the budgets: the clock stands still, and a fast machine runs many.
+    inside.give_small_budgets(node, BUDGET, now)
     node.drops.clear()
     for peer in node.peers.values():
         peer.traffic.drops.clear()

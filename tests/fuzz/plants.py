@@ -7,6 +7,7 @@ import tomllib
 from collections.abc import Callable
 from typing import Any, Final, NamedTuple
 
+from tests.core import inside
 from uavlinkd.authority import constants as fleet_constants
 from uavlinkd.authority import enrolment, trust
 from uavlinkd.config import checks as config_checks
@@ -99,7 +100,7 @@ def _delivers_control(right: Any) -> Any:
 
 def _keeps_every_claim(_: Any) -> Any:
     def note(claims: refusals.RefusalClaims, report: refusals.RefusalReport, now: float) -> None:
-        claims._claims.update({refused[:3]: refusals.Claim(refused, now) for refused in report.entries})
+        inside.believe(claims, report, now)
 
     return note
 

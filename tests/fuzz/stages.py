@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from types import BuiltinFunctionType, FunctionType, ModuleType
 from typing import Any, Final, TypeVar
 
+from tests.core import inside
 from tests.core.harness import AT_A, AT_B, ELSEWHERE, KEY_C, PLAIN, UNUSED_INDEX, Pair, Side, datagrams, only, quiet
 from uavlinkd.core import wire
 from uavlinkd.core.cookie import MacKeys, mac1_of
@@ -106,12 +107,8 @@ def pair_of(link_a: Link = PLAIN, link_b: Link | None = None, seed: int = 1, psk
 
 def _make_small(pair: Pair, seed: int) -> None:
     for number, side in enumerate((pair.a, pair.b)):
-        entropy = SeededEntropy(seed + number)
-        node = side.node
         # The generator of the harness would make copies slow.
-        node._entropy = node._handshakes.cookies._entropy = node._indices._entropy = entropy
-        for peer in node.peers.values():
-            peer.entropy = peer.initiator._entropy = entropy
+        inside.set_entropy(side.node, SeededEntropy(seed + number))
 
 
 def _cookie_for(message: bytes, receiver: bytes, index: int) -> bytes:

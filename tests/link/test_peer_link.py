@@ -32,7 +32,7 @@ from uavlinkd.config.build import verify_interval_s
 from uavlinkd.config.model import PeerAddress
 from uavlinkd.config.model import PeerConfig as Peer
 from uavlinkd.core import handshake
-from uavlinkd.core.constants import KNOWN_FEATURES, MIN_ENVELOPE_LIMIT, NEVER
+from uavlinkd.core.constants import KNOWN_FEATURES, NEVER
 from uavlinkd.core.cookie import MacKeys
 from uavlinkd.core.outputs import Output, Transmit
 from uavlinkd.core.path import Path
@@ -111,8 +111,6 @@ def test_a_budget_that_comes_with_a_reload_pays_for_nothing_before_it() -> None:
     outputs.clear()
     peer_link.send(heartbeat(), PASSES, 2.0, 0.0)
     assert len(of(outputs, Transmit)) == 1
-    assert peer_link.output.egress is not None
-    assert peer_link.output.egress._shape.payload_limit == pair.b.session.payload_limit_of(MIN_ENVELOPE_LIMIT)
 
 
 def test_a_peer_whose_addresses_are_other_ones_is_not_called_at_those_before() -> None:

@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import pytest
 
+from tests.core import inside
 from tests.link.two_radios import End, Network, Radio
 from tests.samples import attitude, blank, command, heartbeat, manual_control, read_by_name, value
 from uavlinkd.core.path_state import PathCondition, PathState
@@ -106,14 +107,14 @@ def test_no_stick_position_is_spared_while_the_best_path_is_not_healthy(
     pair = network(FAST, SLOW, SLOW)
     paths = pair.alpha.peer.paths
     best, _, last = paths.states
-    last._set(PathCondition.DOWN, "unanswered", pair.now)
+    inside.set_condition(last, PathCondition.DOWN, pair.now)
     if sign == "loss":
         monkeypatch.setattr(PathState, "loss_out", BEGIN_LOSS)
     elif sign == "repair":
         pair.alpha.link.output.repair.is_on = True
     else:
-        best._set(PathCondition.SUSPECT, "unanswered", pair.now)
-    paths._set_routes(pair.now)
+        inside.set_condition(best, PathCondition.SUSPECT, pair.now)
+    inside.set_routes(paths, pair.now)
     pair.alpha.send(manual_control(1))
     pair.alpha.send(manual_control(2))
     assert set(radios_of(pair.alpha, manual_control(2))[manual_control(2).raw]) == {0, 1, 2}

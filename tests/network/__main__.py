@@ -17,7 +17,7 @@ from dataclasses import fields
 from itertools import count
 from multiprocessing import get_context
 
-from tests.network.bounds import LIMITS
+from tests.core.bounds import LIMITS
 from tests.network.histories import Played, play
 
 _REPORT_INTERVAL_S = 30.0

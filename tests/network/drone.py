@@ -9,8 +9,8 @@ from random import Random
 from typing import TYPE_CHECKING
 
 from tests.admitting import Admit, AdmittingNode
+from tests.core.bounds import Sizes, check
 from tests.network.air import Address, Endpoint, Hop
-from tests.network.bounds import Sizes, check
 from tests.network.nat import Nat
 from tests.network.serial_line import BUDGET_BITS_S
 from uavlinkd.core.cookie import MacKeys

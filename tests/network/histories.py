@@ -22,8 +22,8 @@ from functools import partial
 from random import Random
 from typing import NamedTuple
 
+from tests.core.bounds import Sizes
 from tests.network.air import Endpoint, Hop
-from tests.network.bounds import Sizes
 from tests.network.drone import Drone, share_a_session
 from tests.network.fleet import Fleet, Pair, Route
 from tests.network.flow import Flow

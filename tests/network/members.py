@@ -15,6 +15,7 @@ from typing import Final
 import structlog
 
 from tests.authority.signing import AUTHORITY, bulletin
+from tests.link.inside import handle_tables, set_own_sockets
 from tests.network.air import Address
 from tests.network.drone import Drone
 from tests.network.network import Network
@@ -352,17 +353,17 @@ class Member(Drone):
         """What a daemon reads of its machine for the search of direct paths."""
         assert self.relays is not None
         places = enumerate(self.addresses) if self.searches else ()
-        self.relays._looked_at = math.inf
-        self.relays._own = [
+        own = [
             OwnSocket(number, is_ipv6=False, places=(address,), leads_to=lambda host: False)
             for number, address in places
         ]
+        set_own_sockets(self.relays, own)
 
     def check_bounds(self) -> None:
         super().check_bounds()
         if self.node is None or self.relays is None:
             return
-        handles = self.relays.handles
-        assert len(handles._inward) == len(handles._outward)
+        inward, outward = handle_tables(self.relays.handles)
+        assert len(inward) == len(outward)
         to_relays = len(self.uses) * len(self.addresses)
-        assert len(handles._outward) <= to_relays * len(self.acquaintances) * c.HANDLES_PER_PAIR
+        assert len(outward) <= to_relays * len(self.acquaintances) * c.HANDLES_PER_PAIR

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from random import Random
 
 from tests.authority.signing import FLEET, signed
+from tests.link.inside import handle_tables
 from tests.network.air import Address, Hop
 from tests.network.drone import Drone
 from tests.network.fleet import Fleet, Pair, Route
@@ -109,7 +110,7 @@ class RelayFleet(Fleet):
         """The unwanted member gets no handle, and no session with a drone."""
         assert self.unwanted.node is not None
         assert self.unwanted.relays is not None
-        assert not self.unwanted.relays.handles._outward
+        assert not handle_tables(self.unwanted.relays.handles)[1]
         for drone in self.drones:
             assert not self.unwanted.peer(drone).is_up
             assert isinstance(drone, Member)

@@ -13,23 +13,17 @@ import traceback
 from collections import Counter
 from dataclasses import dataclass, field
 from random import Random
-from typing import Any
 
 import pytest
 
+from tests.core.plants import LIVENESS_FAULTS
 from tests.network.air import Hop
 from tests.network.attackers import Recorder
 from tests.network.drone import share_a_session
 from tests.network.network import Network, every_second_may_be_old
 from tests.network.vehicle import add_vehicle, hop
-from uavlinkd.core import constants as c
-from uavlinkd.core import freshness, receive, send
 from uavlinkd.core.path import Path
-from uavlinkd.core.paths import PathSet
-from uavlinkd.core.peer import Peer
-from uavlinkd.core.session import Session
 from uavlinkd.core.settings import Class, Link, Redundancy, Timers
-from uavlinkd.core.timers import Timer
 from uavlinkd.lab.mitm.radio import RadioSettings
 
 WITHIN_S = 0.5
@@ -240,46 +234,9 @@ def test_one_honest_path_delivers_every_critical_frame_in_time(batch: range) -> 
     assert total.judged > 20 * len(batch)
 
 
-_set_routes, _ask_for_echo, _reply = PathSet._set_routes, send.ask_for_echo, receive._reply
-
-
-def _only_paths_that_work(paths: PathSet, now: float) -> None:
-    _set_routes(paths, now)
-    critical = paths.routes[Class.CRITICAL]
-    working = tuple(state for state in critical if state is paths.best or state.works)
-    paths.routes = {**paths.routes, Class.CRITICAL: working}
-
-
-def _nothing(*_: Any) -> list[Any]:
-    return []
-
-
-def _asks_along_the_best(peer: Peer, session: Session, now: float, *_: Any) -> list[Any]:
-    return _ask_for_echo(peer, session, now, peer.paths.echo_route)
-
-
-def _answers_along_the_best(peer: Peer, session: Session, request: Any, _: Any, now: float) -> list[Any]:
-    return _reply(peer, session, request, peer.paths.echo_route, now)
-
-
-def _judges_paths_of_peers_that_are_up(peer: Peer) -> None:
-    is_probed = peer.is_up and peer.sending_session() is not None
-    peer.timers.set(Timer.PATHS, peer.paths.next_at if is_probed else c.NEVER)
-
-
-PLANTS: dict[str, tuple[Any, str, Any]] = {
-    "copies only along paths that work": (PathSet, "_set_routes", _only_paths_that_work),
-    "questions along the best path": (freshness, "ask_for_echo", _asks_along_the_best),
-    "answers along the best path": (receive, "_reply", _answers_along_the_best),
-    "no answers to copies of requests": (receive, "_answer_copy", _nothing),
-    "slots end when paths go down": (c, "FORMER_PATH_S", 0.0),
-    "a network that appears waits for a session": (Peer, "set_paths_timer", _judges_paths_of_peers_that_are_up),
-}
-
-
 @pytest.mark.long
-@pytest.mark.parametrize(("where", "name", "plant"), PLANTS.values(), ids=PLANTS)
-def test_a_planted_fault_is_found(monkeypatch: pytest.MonkeyPatch, where: Any, name: str, plant: Any) -> None:
+@pytest.mark.parametrize("fault", LIVENESS_FAULTS)
+def test_a_planted_fault_is_found(monkeypatch: pytest.MonkeyPatch, fault: str) -> None:
     """Within some hundred histories, the rarest one within some thousand."""
-    monkeypatch.setattr(where, name, plant)
+    monkeypatch.setattr(*LIVENESS_FAULTS[fault])
     assert any(play(seed).violations for seed in range(6000))

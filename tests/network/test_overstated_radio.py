@@ -17,6 +17,7 @@ from typing import Any, cast
 import pytest
 import structlog
 
+from tests.endpoints.inside import set_device
 from tests.link.two_radios import End, Network, Radio
 from tests.network.test_slow_radio import Offered, attitudes, heartbeats, up_within
 from uavlinkd.config.model import NetworkConfig
@@ -65,9 +66,8 @@ class OverstatedRadio(Network):
             stall = StallWatch(0.0, lambda pause_s: None)
             serial = self.serial[end] = SerialNetworks([config], 0, end.node, stall, structlog.get_logger())
             (network,) = serial.networks
-            cast(Any, network.line)._device = SimpleNamespace(
-                fileno=partial(int, number), num_unwritten_bytes=partial(self._unwritten, place)
-            )
+            device = SimpleNamespace(fileno=partial(int, number), num_unwritten_bytes=partial(self._unwritten, place))
+            set_device(network.line, device)
             end.budgets.update(serial.budgets(0.0))
             end.node.facts.envelope_limits = {0: network.envelope_limit}
             end.node.facts.set_point_to_point({0: end.peer})

@@ -6,14 +6,13 @@ import os
 
 import pytest
 
+from tests.core import inside
 from uavlinkd.core import constants as c
-from uavlinkd.core.cookie import MacKeys
 from uavlinkd.core.crypto import KeyPair, Secret
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Deliver, Transmit
 from uavlinkd.core.path import Path
-from uavlinkd.core.peer import Peer
 from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.lab.evaluation.impostors import Achieved, Disguise, Impostor, StolenIdentity
 from uavlinkd.lab.evaluation.ledger import numbered_frame
@@ -120,20 +119,10 @@ def test_the_right_keys_succeed() -> None:
     assert not victim.node.drops
 
 
-class TakesAnyKey(dict[bytes, Peer]):
-    """A table of peers without the check of the static key: every initiator is its first peer."""
-
-    def get(self, key: bytes, _default: object = None) -> Peer:
-        """Ignore the key, and answer with the initiator's key."""
-        peer = next(iter(self.values()))
-        peer.initiator._mac_keys = MacKeys(key)
-        return peer
-
-
 def test_a_victim_without_the_static_key_check_takes_an_impostor_for_its_peer() -> None:
     """The same keys, refused above, get a session and deliver frames as b: the check made the difference."""
     victim = Victim()
-    victim.node._handshakes.peers = TakesAnyKey(victim.node._handshakes.peers)
+    inside.take_any_key(victim.node)
     achieved = victim.suffer(impostor(OWN, PSK), 1.0)
     assert achieved.sessions == 1
     assert achieved.frames_sent > 0

@@ -1,0 +1,26 @@
+"""What tests of other rooms see and set inside the daemon: only this folder names its private attributes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence, Sized
+
+from uavlinkd.link.direct_search import OwnSocket
+from uavlinkd.link.relay_link import RelayHandles
+from uavlinkd.link.relays import Relays
+from uavlinkd.link.switch import Switch
+
+
+def handle_tables(handles: RelayHandles) -> tuple[Sized, Sized]:
+    """The relay handles of what arrives, and those of what is sent."""
+    return handles._inward, handles._outward
+
+
+def set_own_sockets(relays: Relays, own: Sequence[OwnSocket]) -> None:
+    """Give the search of direct paths the sockets of this machine, and let it look at the machine no more."""
+    relays._looked_at, relays._own = math.inf, list(own)
+
+
+def most_flows(switch: Switch) -> int:
+    """The number of flows that are remembered of the port with the most."""
+    return max((len(known.flows) for known in switch._ports.values()), default=0)
