@@ -6,10 +6,10 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +19,12 @@ from tests.fleet.vehicles import NAMES, create, loaded, unasked
 from tests.waiting import PATIENCE_S
 from uavlinkd.authority.enrolment import FleetError, Request, parse_reply
 from uavlinkd.config import keys
+from uavlinkd.config.model import ConfigError
 from uavlinkd.core.certificates import MemberRole
 from uavlinkd.fleet import operations, transaction
 from uavlinkd.fleet.authority_key import AUTHORITY_FILE, SUCCESSOR_FILE
 from uavlinkd.fleet.files import reply_for
-from uavlinkd.fleet.manifest import Fleet, FleetSettings, check_settings, fill, parse_addresses, read_manifest
+from uavlinkd.fleet.manifest import Fleet, FleetSettings, fill, parse_addresses, read_manifest, toml_text
 from uavlinkd.fleet.signing import Identity
 from uavlinkd.fleet.transaction import lock
 from uavlinkd.lab.child_processes import end_with_parent
@@ -176,7 +177,6 @@ def test_fleet_is_made_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.M
         (FleetSettings(), {"drones": 1, "stations": 1}, "ground-station would find no other member"),
         (FleetSettings(), {"at": (Address("10.13.0.254", 5790),)}, "more --station-address than --ground-stations"),
         (FleetSettings(suite="rot13"), {}, "suite .* does not exist: use one of x25519"),
-        (FleetSettings(control_socket="{x}"), {}, "--control-socket.*only braces"),
     ],
 )
 def test_impossible_fleets_are_refused(
@@ -254,21 +254,24 @@ def test_key_of_another_authority_is_refused(folder: Path, tmp_path: Path) -> No
         operations.revoke(folder, "drone1", unasked)
 
 
-def test_edits_of_the_user_are_kept(folder: Path) -> None:
-    """Changed keys and comments in a file are kept when contacts and its own key change."""
+def test_values_of_the_user_are_kept(folder: Path) -> None:
+    """When contacts and its own key change. The file is written whole, without comments."""
     path = folder / "drone1" / "drone1.toml"
     text = path.read_text().replace("[fleet]\n", '[fleet]  # ours\ndeny = ["drone9",\n  "drone8"]\n')
     path.write_text(text.replace("confidential = true", "confidential = false  # amateur radio"))
-    path.write_text(path.read_text() + "\n[log]\nlevel = 'warning'  # quiet\n")
+    rates = '\n[[fleet_role]]\nname = "vehicle"\n[fleet_role.rate_in]\n"ATTITUDE" = 2.5\n'
+    path.write_text(path.read_text() + rates + "[log]\nlevel = 'warning'  # quiet\n")
+    before = tomllib.loads(path.read_text())
     operations.add(folder, "other", RELAY, unasked)
     operations.add(folder, "drone1", Identity(), unasked, replaces=True)
     operations.revoke(folder, "relay", unasked, resign=True)
-    after = path.read_text()
-    for kept in ("[fleet]  # ours", "confidential = false  # amateur radio", "level = 'warning'  # quiet"):
-        assert kept in after
-    table = tomllib.loads(after)
-    assert table["fleet"]["deny"] == ["drone9", "drone8"]
-    assert [contact["addresses"] for contact in table["contact"]] == [["198.51.100.9:5790"]]
+    after = tomllib.loads(path.read_text())
+    assert after["fleet"].pop("deny") == ["drone9", "drone8"]
+    assert [contact["addresses"] for contact in after.pop("contact")] == [["198.51.100.9:5790"]]
+    changed = {"authority", "successor", "certificate", "bulletin", "call"}
+    assert set(after.pop("fleet")) <= changed
+    assert after == {key: value for key, value in before.items() if key not in ("fleet", "contact")}
+    assert "#" not in path.read_text().partition("\n\n")[2]
     check_fleet(folder)
 
 
@@ -312,15 +315,52 @@ def test_url_of_a_relay_reaches_the_members(tmp_path: Path) -> None:
     assert [str(address) for address in relay.addresses] == ["relay.example.org:5790", url]
 
 
-def test_files_that_cannot_be_edited_safely_are_refused(folder: Path) -> None:
-    """The command changes nothing if editing by lines would change something else."""
+@pytest.mark.parametrize("text", ["[fleet", "fleet = 1"])
+def test_file_that_is_no_configuration_is_not_changed(folder: Path, text: str) -> None:
+    """The command names its member among those that need a line, and it refuses to write the file."""
     path = folder / "drone3" / "drone3.toml"
-    path.write_text(path.read_text().replace("[link]", '[link]\nx = """\n[[contact]]\n[x]\n"""', 1))
-    with refused(folder, "cannot be kept"):
-        operations.add(folder, "other", RELAY, unasked)
-    path.write_text("[fleet")
-    with refused(folder, r"drone3\.toml: it is not a configuration"):
-        operations.add(folder, "other", RELAY, unasked)
+    path.write_text(text)
+    assert operations.add(folder, "other", RELAY, unasked).elsewhere == ("drone3",)
+    assert path.read_text() == text
+    before = snapshot(folder)
+    with pytest.raises((FleetError, ConfigError)):
+        operations.add(folder, "drone3", Identity(), unasked, replaces=True)
+    assert snapshot(folder) == before
+
+
+def test_any_table_is_written_as_it_was_read() -> None:
+    """Keys that need quotes, control characters, empty lists, and tables in tables."""
+    table = {
+        "name": 'a "b"\\\n\x1f é',
+        "none": [],
+        "link": {"a key": {"b.c": [1, 2.5, True, {"d": "\t"}]}},
+        "empty": {},
+        "peer": [{"name": "one"}, {}],
+    }
+    assert tomllib.loads(toml_text(table)) == table
+
+
+def test_two_commands_create_one_fleet(tmp_path: Path) -> None:
+    """The second waits for the first, and neither deletes what the other one writes."""
+    started = threading.Barrier(2)
+    refusals: list[str] = []
+
+    def init() -> None:
+        started.wait(PATIENCE_S)
+        try:
+            create(tmp_path / "fleet", drones=2, relays=(Address("198.51.100.7", 5790),))
+        except FleetError as error:
+            refusals.append(str(error))
+
+    threads = [threading.Thread(target=init) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(refusals) == 1
+    assert "exists already" in refusals[0]
+    check_fleet(tmp_path / "fleet")
+    assert [path.name for path in tmp_path.iterdir()] == ["fleet"]
 
 
 ACTIONS: dict[str, Callable[[Path], object]] = {
@@ -406,30 +446,9 @@ def test_rotated_key_is_removed_everywhere(folder: Path) -> None:
         assert path == "fleet.toml" or to_base64(old.public_key).encode() not in content
 
 
-@pytest.mark.parametrize(
-    ("template", "text"),
-    [("", ""), ("10.13.0.{n}:5790", "10.13.0.7:5790"), ("{name}.local:{n}{n}", "{n}.local:77"), ("%s {n}", "%s 7")],
-)
-def test_number_and_name_are_put_in(template: str, text: str) -> None:
-    """``{n}`` and ``{name}`` are replaced. Other text is kept, and braces in a name too."""
-    assert fill(template, 7, "{n}") == text
-
-
-@pytest.mark.parametrize(
-    "template",
-    [
-        *("{name.__class__}", "{name.__class__.__mro__}", "{n.real}", "{0}", "{}", "{name!r}", "{n:>9999999}"),
-        *("{name[0]}", "{ n }", "{N}", "{{n}}", "{n", "n}"),
-    ],
-)
-def test_anything_else_in_braces_is_refused(template: str) -> None:
-    """Attributes, items, positions, conversions, widths and unpaired braces; the error names the option."""
-    with pytest.raises(FleetError, match=r"\{n\} and \{name\}"):
-        fill(template, 7, "scout")
-    for key in ("control_socket", "drone_url", "ground_station_url"):
-        settings: dict[str, str] = {key: f"/run/{template}"}
-        with pytest.raises(FleetError, match=f"--{key.replace('_', '-')}"):
-            check_settings(replace(FleetSettings(), **settings))  # type: ignore[arg-type]
+def test_number_and_name_are_put_in() -> None:
+    """``{n}`` and ``{name}`` are replaced. Other braces are kept: no attribute of an object is read."""
+    assert fill("{name}.local:{n}{n}, {name.__class__} {0}", 7, "scout") == "scout.local:77, {name.__class__} {0}"
 
 
 @pytest.mark.long

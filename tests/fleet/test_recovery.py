@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import io
 import json
 import shutil
 import tarfile
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from tests.fleet.conftest import Say
 from tests.fleet.vehicles import create, loaded
 from uavlinkd.authority.trust import BulletinVerdict, Trust
-from uavlinkd.cli import main
 from uavlinkd.fleet.authority_key import load_key, paper_copy
 from uavlinkd.fleet.manifest import Fleet, read_manifest
 from uavlinkd.fleet.recovery import SERIALS_LEFT_OUT
 from uavlinkd.system.addresses import Address
-
-Say = Callable[..., str]
 
 
 @pytest.fixture
@@ -39,19 +35,6 @@ def lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Fleet, str]:
     shutil.copy(tmp_path / "fleet" / "drone1" / "drone1.toml", tmp_path)
     shutil.rmtree(tmp_path / "fleet")
     return fleet, paper
-
-
-@pytest.fixture
-def say(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Say:
-    """Runs a command; returns its standard output, or its error after `refused: `."""
-
-    def run(command: str, text: str = "") -> str:
-        monkeypatch.setattr("sys.stdin", io.StringIO(text))
-        status = main(command.split())
-        out, err = capsys.readouterr()
-        return out if status == 0 else f"refused: {err}"
-
-    return run
 
 
 RESTORE = "fleet restore --no-passphrase"

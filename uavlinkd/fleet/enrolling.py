@@ -23,7 +23,7 @@ from uavlinkd.config.load import read_toml
 from uavlinkd.core.certificates import Certificate, parse_bulletin, parse_certificate
 from uavlinkd.core.crypto import x25519_public_key
 from uavlinkd.core.drops import Drop
-from uavlinkd.fleet.files import config_file, edited, key_file, listen_on, write_config
+from uavlinkd.fleet.files import config_file, key_file, listen_on, new_table, with_fleet, written
 from uavlinkd.fleet.manifest import FleetSettings
 from uavlinkd.fleet.transaction import aside_of, changing, recover
 from uavlinkd.mavlink.dialect import SYSTEM_ID
@@ -81,7 +81,7 @@ def finish(line: str, config: Path | None, folder: Path | None, url: str | None,
     certificate = parse_certificate(reply.certificate)
     place = MemberFiles(config or Path(config_file(certificate.name)), folder)
     table = place.table()
-    former_ids = _check_present(table.get("fleet"), reply, certificate, place.config)
+    _check_present(table.get("fleet"), reply, certificate, place.config)
     own = str(table.get("private_key_file", key_file(certificate.name)))
     former = place.key(own)
     path, contacts = _verified(reply, certificate.name, [place.key(_other(own)), former])
@@ -96,19 +96,18 @@ def finish(line: str, config: Path | None, folder: Path | None, url: str | None,
         if table:
             if url is not None and url not in _urls(table):
                 raise FleetError(f"{place.config} exists: write the url into its [[endpoint]], and leave --url out")
-            top = {"private_key_file": name, **({"listen": listen} if listen else {})}
-            text = edited(place.config, reply, top, former_ids)
+            table |= {"private_key_file": name, **({"listen": list(listen)} if listen else {})}
         else:
             settings = FleetSettings(
                 control_socket="{name}.sock" if folder is None else "/run/uavlinkd/{name}/control.sock"
             )
             if url is not None:
                 settings = replace(settings, drone_url=url, ground_station_url=url)
-            text = write_config(reply, settings, name, listen)
+            table = new_table(reply, settings, name, listen)
         has_former = path != former and former.exists()
         if has_former:
             changes.keep(former)
-        changes.write(place.config, text, place.environ())
+        changes.write(place.config, written(with_fleet(table, reply)), place.environ())
         if has_former:
             former.unlink(missing_ok=True)
     fingerprint = fingerprint_of(reply.authority)
@@ -127,10 +126,10 @@ def _urls(table: dict[str, Any]) -> list[Any]:
     return [each.get("url") for each in endpoints if isinstance(each, dict)] if isinstance(endpoints, list) else []
 
 
-def _check_present(fleet: Any, reply: Reply, certificate: Certificate, config: Path) -> tuple[int, int] | None:
-    """Check that a line is not older than the file, nor of another fleet. Returns the present system ids."""
+def _check_present(fleet: Any, reply: Reply, certificate: Certificate, config: Path) -> None:
+    """Check that a line is not older than the file, nor of another fleet."""
     if fleet is None:
-        return None
+        return
     try:
         authority, signed, published = (from_base64(fleet[key]) for key in ("authority", "certificate", "bulletin"))
         present, bulletin, new = parse_certificate(signed), parse_bulletin(published), parse_bulletin(reply.bulletin)
@@ -149,7 +148,6 @@ def _check_present(fleet: Any, reply: Reply, certificate: Certificate, config: P
             f"the line was used or is old: {config} has serial {present.serial} and bulletin {number} already:"
             f" `uavlinkd fleet sign {certificate.name}` prints a newer one"
         )
-    return present.system_ids
 
 
 def _verified(reply: Reply, name: str, paths: list[Path]) -> tuple[Path, list[str]]:

@@ -1,17 +1,10 @@
-"""The text of a member's configuration, and the fleet's part in one that a person edited.
-
-A change replaces a few lines, which keeps comments and order. The parsed result is then compared with the parsed
-original after the same change. If they differ, FleetError refuses the change: a multi-line string may contain a
-``[[contact]]``.
-"""
+"""The configuration of a member: written whole, from the fleet's present facts and the values that a person wrote."""
 
 from __future__ import annotations
 
-import re
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 from uavlinkd.authority.enrolment import Contact, FleetError, Reply, ids_of
@@ -19,13 +12,9 @@ from uavlinkd.core.certificates import MemberRole, parse_certificate
 from uavlinkd.core.drops import Drop
 from uavlinkd.core.path import WEB_HOST
 from uavlinkd.core.suites import SUITES_BY_NAME
-from uavlinkd.fleet.manifest import Fleet, FleetFileError, FleetSettings, Member, fill, toml_lines
+from uavlinkd.fleet.manifest import Fleet, FleetSettings, Member, fill, toml_text
 from uavlinkd.system.addresses import parse_place
 from uavlinkd.system.base64_text import from_base64, to_base64
-
-_HEADER = re.compile(r"[ \t]*(\[{1,2})[ \t]*([A-Za-z0-9_-]+)[ \t]*\]|[ \t]*\[")
-_KEY = re.compile(r"[ \t]*(?:\"([^\"]*)\"|'([^']*)'|([A-Za-z0-9_-]+))[ \t]*=")
-_CONTACT = "[[contact"
 
 Table = dict[str, Any]
 
@@ -76,74 +65,54 @@ def listen_on(reply: Reply) -> list[str]:
     return list(dict.fromkeys(listen))
 
 
-def write_config(reply: Reply, settings: FleetSettings, private_key_file: str, listen: Sequence[str]) -> str:
-    """The text of a new configuration. In ``settings``, only the templates count."""
+def new_table(reply: Reply, settings: FleetSettings, private_key_file: str, listen: Sequence[str]) -> Table:
+    """A new configuration without the fleet's facts. In ``settings``, only the templates count."""
     certificate = parse_certificate(reply.certificate)
-    name, role, ids, first = certificate.name, certificate.role, ids_of(certificate), certificate.system_ids[0]
+    name, role, first = certificate.name, certificate.role, certificate.system_ids[0]
     is_vehicle = role is MemberRole.VEHICLE
-    top = {
+    table: Table = {
         "name": name,
         "private_key_file": private_key_file,
         "listen": list(listen),
         "control_socket": fill(settings.control_socket, first, name),
+        "link": {"suites": [reply.suite.name]},
     }
-    endpoint = {
-        "name": "autopilot" if is_vehicle else "ground-control",
-        "url": fill(settings.drone_url if is_vehicle else settings.ground_station_url, first, name),
-        "system_ids": list(certificate.systems),
-        "role": "observer" if role is MemberRole.OBSERVER else None,
-    }
-    lines = [
-        f"# {name}: {role.name.lower()}{f', MAVLink system id {ids}' if ids else ''}.",
-        "# Later commands change [fleet] and [[contact]], and keep your other edits.",
-        "",
-        *toml_lines(top),
-        "",
-        "[link]",
-        *toml_lines({"suites": [reply.suite.name]}),
-        *([] if role is MemberRole.RELAY else ["", "[[endpoint]]", *toml_lines(endpoint)]),
-    ]
-    return with_fleet("\n".join(lines) + "\n", reply)
+    if role is not MemberRole.RELAY:
+        endpoint = {
+            "name": "autopilot" if is_vehicle else "ground-control",
+            "url": fill(settings.drone_url if is_vehicle else settings.ground_station_url, first, name),
+            "system_ids": list(certificate.systems),
+            **({"role": "observer"} if role is MemberRole.OBSERVER else {}),
+        }
+        table["endpoint"] = [endpoint]
+    return table
 
 
-def is_outdated(path: Path, reply: Reply) -> bool:
-    """Whether a configuration has another certificate than the present one, or other contacts."""
-    try:
-        table = _parsed(path.read_text(encoding="utf-8-sig"))
-        present = [contact["certificate"] for contact in table.get("contact", ())]
-    except (ValueError, TypeError, LookupError, FleetError):  # a person's: it is not changed without need
-        return False
-    wanted = [to_base64(contact.certificate) for contact in reply.contacts]
-    return (table.get("fleet", {}).get("certificate"), present) != (to_base64(reply.certificate), wanted)
+def with_fleet(table: Table, reply: Reply) -> Table:
+    """A configuration with the fleet's present facts and contacts.
 
-
-def edited(path: Path, reply: Reply, top: Table | None = None, former_ids: tuple[int, int] | None = None) -> str:
-    """A member's configuration as :func:`with_fleet` changes it."""
-    try:
-        return with_fleet(path.read_text(encoding="utf-8-sig"), reply, top, former_ids)
-    except ValueError:
-        raise FleetFileError(f"{path} cannot be read: it is not text") from None
-    except FleetError as error:
-        raise FleetError(f"{path}: {error}") from None
-
-
-def with_fleet(text: str, reply: Reply, top: Table | None = None, former_ids: tuple[int, int] | None = None) -> str:
-    """A configuration with the fleet's present facts and contacts; ``top``: these keys at its top too.
-
-    Endpoints with the ids of the former certificate, ``former_ids``, get those of the present one.
-
-    A file that gets its first ``[fleet]`` also gets ``confidential``: relays could read the frames otherwise.
+    Endpoints with the ids of the certificate before get those of the present one. A file that gets its first
+    ``[fleet]`` also gets ``confidential``: relays could read the frames otherwise.
     """
-    facts: dict[str, Table] = {
-        "": top or {},
-        "fleet": {
-            "authority": to_base64(reply.authority),
-            "successor": to_base64(reply.successor),
-            "certificate": to_base64(reply.certificate),
-            "bulletin": to_base64(reply.bulletin),
-        },
+    sections = [table.get(section, {}) for section in ("fleet", "link", "relay_server")]
+    if not all(isinstance(section, dict) for section in sections):
+        raise FleetError("it is not a configuration: correct it, or move it away")
+    fleet, link, relay_server = sections
+    added: Table = {}
+    if "fleet" not in table:
+        added["link"] = {**link, "confidential": True}
+        if MemberRole.VEHICLE in reply.calls:
+            fleet = {"call": sorted(role.name.lower() for role in reply.calls)}
+    if reply.relays:
+        added["relay_server"] = relay_server
+    facts = {
+        "authority": to_base64(reply.authority),
+        "successor": to_base64(reply.successor),
+        "certificate": to_base64(reply.certificate),
+        "bulletin": to_base64(reply.bulletin),
     }
-    table = _parsed(text)
+    if "endpoint" in table and "fleet" in table:
+        added["endpoint"] = _endpoints(table, reply)
     contacts = [
         {
             "public_key": to_base64(contact.public_key),
@@ -153,31 +122,42 @@ def with_fleet(text: str, reply: Reply, top: Table | None = None, former_ids: tu
         }
         for contact in reply.contacts
     ]
-    if "fleet" not in table:
-        facts["link"] = {"confidential": True}
-        if MemberRole.VEHICLE in reply.calls:
-            facts["fleet"]["call"] = sorted(role.name.lower() for role in reply.calls)
-    if reply.relays and "relay_server" not in table:
-        facts["relay_server"] = {}
-    after = "".join(piece for piece in _sections(text) if not _is_section(piece, _CONTACT))
-    if former_ids is not None:
-        after = _with_ids(after, table, former_ids, parse_certificate(reply.certificate).system_ids)
-    for section, values in facts.items():
-        after = _with_keys(after, section, values)
-        (table if not section else table.setdefault(section, {})).update(values)
-    table["contact"] = contacts
-    after = after.rstrip("\n") + "\n"
-    after += "".join("\n".join(["\n[[contact]]", *toml_lines(contact)]) + "\n" for contact in contacts)
-    if _parsed(after) != (table if contacts else {key: table[key] for key in table if key != "contact"}):
-        raise FleetError("its edits cannot be kept: move it away, and run the command again to write a new one")
-    return after
+    if contacts:
+        added["contact"] = contacts
+    kept = {key: value for key, value in table.items() if key != "contact"}
+    return {**kept, "fleet": fleet | facts, **added}
+
+
+def written(table: Table) -> str:
+    """The text of a configuration."""
+    certificate = parse_certificate(from_base64(table["fleet"]["certificate"]))
+    ids = ids_of(certificate)
+    head = (
+        f"# {certificate.name}: {certificate.role.name.lower()}{f', MAVLink system id {ids}' if ids else ''}.\n"
+        "# Later commands write this file whole: they keep your values, but no comments.\n\n"
+    )
+    text = head + toml_text(table)
+    if tomllib.loads(text) != table:
+        raise FleetError("its values cannot be kept: move it away, and run the command again to write a new one")
+    return text
+
+
+def _endpoints(table: Table, reply: Reply) -> Any:
+    """The endpoints, with other system ids where those were all of the certificate before."""
+    endpoints = table["endpoint"]
+    try:
+        before = list(parse_certificate(from_base64(table["fleet"]["certificate"])).systems)
+        now = list(parse_certificate(reply.certificate).systems)
+        return [each | {"system_ids": now} if each.get("system_ids") == before else each for each in endpoints]
+    except (LookupError, TypeError, ValueError, AttributeError, Drop):
+        return endpoints
 
 
 def _addresses(contact: Contact, table: Table) -> list[Any]:
     """The signed addresses, and what a person wrote beside them: those of one network, and URLs if none is signed."""
     has_url = any(parse_place(text).resource for text in contact.addresses)
-    written = _written(table.get("contact"), parse_certificate(contact.certificate).name)
-    kept = [one for one in written if isinstance(one, dict) or (str(one).startswith(WEB_HOST) and not has_url)]
+    by_hand = _written(table.get("contact"), parse_certificate(contact.certificate).name)
+    kept = [one for one in by_hand if isinstance(one, dict) or (str(one).startswith(WEB_HOST) and not has_url)]
     replaced = [one.get("address") for one in kept if isinstance(one, dict)]
     return [*(text for text in contact.addresses if text not in replaced), *kept]
 
@@ -189,62 +169,3 @@ def _written(contacts: Any, name: str) -> list[Any]:
             if parse_certificate(from_base64(contact["certificate"])).name == name:
                 return list(contact["addresses"])
     return []
-
-
-def _parsed(text: str) -> Table:
-    try:
-        table = tomllib.loads(text)
-    except ValueError:
-        table = {}
-    sections = [table.get(section, {}) for section in ("fleet", "link", "relay_server")]
-    if not table or not all(isinstance(section, dict) for section in sections):
-        raise FleetError("it is not a configuration: correct it, or move it away")
-    return table
-
-
-def _with_ids(text: str, table: Table, before: tuple[int, int], now: tuple[int, int]) -> str:
-    old, new = (list(range(first, last + 1)) for first, last in (before, now))
-    present = table.get("endpoint")
-    endpoints: Iterator[Table] = iter(present if isinstance(present, list) else ())
-    pieces = _sections(text)
-    for number, piece in enumerate(pieces):
-        if _is_section(piece, "[[endpoint") and (endpoint := next(endpoints, {})).get("system_ids") == old:
-            pieces[number] = _with_keys(piece, "[endpoint", {"system_ids": new})
-            endpoint["system_ids"] = new
-    return "".join(pieces)
-
-
-def _with_keys(text: str, section: str, values: Table) -> str:
-    """Set keys of a section, which is added if it is missing. The new lines are where the first of them was."""
-    pieces = _sections(text)
-    places = [number for number, piece in enumerate(pieces) if _is_section(piece, f"[{section}" if section else "")]
-    if not places:
-        pieces.append(f"\n[{section}]\n")
-    place = places[0] if places else -1
-    kept: list[str] = []
-    at: int | None = None
-    for line in pieces[place].splitlines(keepends=True):
-        match = _KEY.match(line)
-        if match is not None and next(filter(None, match.groups()), "") in values:
-            at = len(kept) if at is None else at
-        else:
-            kept.append(line)
-    if at is None:  # behind the last line that is not blank
-        at = max((number + 1 for number, line in enumerate(kept) if line.strip()), default=0)
-    pieces[place] = "".join([*kept[:at], *(f"{line}\n" for line in toml_lines(values)), *kept[at:]])
-    return "".join(pieces)
-
-
-def _sections(text: str) -> list[str]:
-    """The text, split before each line that starts with ``[``. The first piece is before any section."""
-    pieces: list[list[str]] = [[]]
-    for line in text.rstrip("\n").split("\n"):
-        if _HEADER.match(line):
-            pieces.append([])
-        pieces[-1].append(f"{line}\n")
-    return ["".join(piece) for piece in pieces]
-
-
-def _is_section(piece: str, header: str) -> bool:
-    match = _HEADER.match(piece)
-    return ("" if match is None else f"{match[1]}{match[2]}") == header

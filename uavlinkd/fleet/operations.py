@@ -16,10 +16,9 @@ import os
 import secrets
 import shutil
 import tarfile
-import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,6 +26,8 @@ from typing import Any
 from uavlinkd.authority.enrolment import FleetError, Request
 from uavlinkd.authority.trust import BulletinVerdict
 from uavlinkd.config import keys
+from uavlinkd.config.load import read_toml
+from uavlinkd.config.model import ConfigError
 from uavlinkd.core.certificates import MemberRole
 from uavlinkd.core.crypto import Secret, SigningKey, sha256, signing_key_pem
 from uavlinkd.fleet import authority_key, files, signing
@@ -43,7 +44,7 @@ from uavlinkd.fleet.manifest import (
 )
 from uavlinkd.fleet.recovery import recovered
 from uavlinkd.fleet.signing import Identity
-from uavlinkd.fleet.transaction import FileChanges, changing, is_unlocked, lock, recover
+from uavlinkd.fleet.transaction import FileChanges, changing, lock, recover
 from uavlinkd.ops.control import ask as ask_daemon
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.base64_text import to_base64
@@ -94,24 +95,27 @@ def init(
             full = name if len(each) == 1 and role is not MemberRole.VEHICLE else f"{name}{number}"
             private_keys[full] = keys.generate_private_key()
             fleet = signing.certify(fleet, signer, _public(private_keys[full]), full, Identity(role, None, addresses))
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise _exists(folder)
+    passphrase = None if ask is None else ask(AUTHORITY_FILE)
+    building = folder.with_name(f".{folder.name}.new")
     try:
-        _remove_half_made(folder)
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise _exists(folder)
-        passphrase = None if ask is None else ask(AUTHORITY_FILE)
         folder.parent.mkdir(parents=True, exist_ok=True)
-        prefix = f".{folder.name}-"
-        with tempfile.TemporaryDirectory(prefix=prefix, dir=folder.parent, ignore_cleanup_errors=True) as name:
-            building = Path(name)
-            with lock(building), changing() as changes:
-                for file, key in ((AUTHORITY_FILE, private), (SUCCESSOR_FILE, successor)):
-                    changes.write_secret(building / file, signing_key_pem(key, passphrase, os.urandom))
-                for member in fleet.members:
-                    _write_key(changes, building, member, private_keys[member.name])
-                    _write_config(changes, building, fleet, member)
-                changes.write(building / FILE_NAME, write_manifest(fleet))
-            building.chmod(0o755)
-            building.rename(folder)
+        with lock(folder.parent):
+            shutil.rmtree(building, ignore_errors=True)  # of a command that was killed
+            building.mkdir(mode=0o700)
+            try:
+                with changing() as changes:
+                    for file, key in ((AUTHORITY_FILE, private), (SUCCESSOR_FILE, successor)):
+                        changes.write_secret(building / file, signing_key_pem(key, passphrase, os.urandom))
+                    for member in fleet.members:
+                        _write_key(changes, building, member, private_keys[member.name])
+                        _write_config(changes, building, fleet, member)
+                    changes.write(building / FILE_NAME, write_manifest(fleet))
+                building.chmod(0o755)
+                building.rename(folder)
+            finally:
+                shutil.rmtree(building, ignore_errors=True)
     except OSError as error:
         if error.errno in (errno.EEXIST, errno.ENOTEMPTY):  # another command created it meanwhile
             raise _exists(folder) from None
@@ -289,14 +293,6 @@ def _recover(folder: Path) -> None:
     recover({path.with_name(path.name[1:-4]) for path in beside})
 
 
-def _remove_half_made(folder: Path) -> None:
-    """Remove what a killed `init` of this folder left. One that still works holds its lock."""
-    for half_made in folder.parent.glob(f".{folder.name}-*"):
-        with suppress(OSError):
-            if is_unlocked(half_made):
-                shutil.rmtree(half_made)
-
-
 def _signer(folder: Path, fleet: Fleet, ask: Passphrase) -> SigningKey:
     signer = SigningKey(authority_key.load_key(folder / AUTHORITY_FILE, ask))
     if signer.public != fleet.authority.public:
@@ -319,10 +315,10 @@ def _write_config(changes: FileChanges, folder: Path, fleet: Fleet, member: Memb
     path, key = folder / member.name / files.config_file(member.name), files.key_file(member.name)
     reply = files.reply_for(fleet, member)
     if path.exists():
-        text = files.edited(path, reply, {"private_key_file": key})
+        table = read_toml(path) | {"private_key_file": key}
     else:
-        text = files.write_config(reply, fleet.settings, key, files.listen_on(reply))
-    changes.write(path, text, {})
+        table = files.new_table(reply, fleet.settings, key, files.listen_on(reply))
+    changes.write(path, files.written(files.with_fleet(table, reply)), {})
 
 
 def _save(
@@ -331,13 +327,26 @@ def _save(
     """Write the manifest, then the configurations that are here and have another certificate or other contacts."""
     if fleet is not before:
         changes.write(folder / FILE_NAME, write_manifest(fleet))
-    has_new_contacts = before.reachable != fleet.reachable
     elsewhere: tuple[str, ...] = ()
     for member in (member for member in fleet.current if member.name != but):
         path, reply = folder / member.name / files.config_file(member.name), files.reply_for(fleet, member)
-        if path.exists() and (has_new_contacts or files.is_outdated(path, reply)):
-            changes.write(path, files.edited(path, reply))
-            changed += (member.name,)
-        elif has_new_contacts and not path.parent.exists():
+        if not path.exists():
+            if before.reachable != fleet.reachable and not path.parent.exists():
+                elsewhere += (member.name,)
+            continue
+        try:
+            present = read_toml(path)
+            table = files.with_fleet(present, reply)
+            is_present = _without_bulletin(present) == _without_bulletin(table)
+        except (ConfigError, FleetError):  # a person's: its owner corrects it, and has it written then
             elsewhere += (member.name,)
+            continue
+        if not is_present:
+            changes.write(path, files.written(table))
+            changed += (member.name,)
     return Result(fleet, changed, elsewhere)
+
+
+def _without_bulletin(table: files.Table) -> files.Table:
+    """A bulletin alone changes no file: it passes from member to member."""
+    return {**table, "fleet": {**table.get("fleet", {}), "bulletin": ""}}

@@ -126,20 +126,6 @@ def changing() -> Iterator[FileChanges]:
     changes.finish()
 
 
-def is_unlocked(folder: Path) -> bool:
-    """Whether no command holds the lock of a folder."""
-    import fcntl  # noqa: PLC0415  Windows has no such module
-
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    finally:
-        os.close(descriptor)
-    return True
-
-
 @contextmanager
 def lock(folder: Path) -> Iterator[None]:
     """Hold the lock of a fleet's folder. If another command holds it, say so on standard error and wait: neither must
