@@ -135,57 +135,25 @@ async def test_a_peer_that_is_taken_out_is_cut_off_at_once(stage: Stage) -> None
     await a.until_linked()
 
 
-async def test_endpoints_swap_ports_and_change_names(stage: Stage) -> None:
-    """A socket whose address stays is handed over: what clients sent meanwhile is not lost."""
-    a, b = stage.pair()
-    first, second = a.add_endpoint("first"), a.add_endpoint("second")
-    listener = a.add_endpoint("tcp", f"tcpin:127.0.0.1:{first[1]}")
-    into_b = b.add_endpoint("one")
-    await stage.start(a, b)
-    at_b = await client_at(stage, b, "one", into_b)
-    one, two, _ = a.config["endpoint"]
-    one["url"], two["url"] = two["url"], one["url"]
-    assert await reload(a) == []
-    at_first = await client_at(stage, a, "second", first)
-    at_second = await client_at(stage, a, "first", second)
-    for table in a.config["endpoint"]:
-        table["name"] += "-of-old"
-    at_b.clear()
-    reloading = asyncio.create_task(reload(a))
-    said: list[bytes] = []
-    while not reloading.done() or len(said) < COUNT:
-        said.append(frame(len(said)))
-        at_first.send(said[-1], first)
-        await asyncio.sleep(0.002)
-    assert await reloading == []
-    at_first.send(last := frame(len(said)), first)
-    await at_b.until_received(last)
-    assert_same(at_b.received, b"".join([*said, last]))
-    status = await a.until(lambda status: str(at_first) in status["endpoints"]["second-of-old"]["clients"])
-    assert set(status["endpoints"]) == {"first-of-old", "second-of-old", "tcp-of-old"}
-    _, writer = await asyncio.open_connection(*listener)
-    writer.write(heartbeat())
-    await a.until(lambda status: len(status["endpoints"]["tcp-of-old"]["clients"]) == 1)
-    writer.close()
-    at_second.send(other := frame(len(said) + 1), second)
-    await at_b.until_received(other)
-
-
-async def test_an_endpoint_that_cannot_be_opened_refuses_the_whole_file(stage: Stage) -> None:
-    """The message names the file, the key and the remedy; the endpoint that could be opened is closed again."""
+async def test_a_change_of_an_endpoint_needs_a_restart(stage: Stage) -> None:
+    """The message names the key and the remedy. The peers of the same file do not change either."""
     a, b = stage.pair()
     into_a = a.add_endpoint("one")
     await stage.start(a, b)
-    taken = await stage.client()
-    free = a.add_endpoint("two")
-    a.add_endpoint("three", url_of(taken.address))
-    problems = await reload(a)
-    assert len(problems) == 1
-    assert problems[0].startswith(f"{a.config_file}: endpoint.url (three): cannot listen on {taken}: Address already")
-    assert "write another port; if it is this daemon, restart it" in problems[0]
-    assert set((await a.status())["endpoints"]) == {"one"}
-    await stage.client(*free)  # a port in use
-    await client_at(stage, a, "one", into_a)
+    a.add_endpoint("two")
+    a.config["peer"] = []
+    (problem,) = await reload(a)
+    assert problem.startswith(f"{a.config_file}: endpoint: has changed")
+    assert problem.endswith("restart the daemon")
+    status = await a.status()
+    assert set(status["endpoints"]) == {"one"}
+    assert set(status["peers"]) == {b.name}
+    a.config["endpoint"].pop()
+    a.config["endpoint"][0]["rate_in"] = {"HEARTBEAT": 0}
+    assert await reload(a) == []
+    client = await stage.client()
+    client.send(heartbeat(), into_a)
+    await a.until(lambda status: status["endpoints"]["one"]["refused"] != {})
 
 
 async def test_reloads_are_made_one_after_the_other(stage: Stage) -> None:

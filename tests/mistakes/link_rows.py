@@ -94,7 +94,7 @@ LINK_ROWS = (
         command=r"tag_bits: must be 64, 96 or 128",
         signs=_here("configuration_refused", r"`uavlinkd check --config .*` prints, and run `uavlinkd reload`"),
     ),
-    Mistake("51", scenes.reload_listen, command=r"routing: cannot change while the daemon runs: restart it"),
+    Mistake("51", scenes.reload_listen, command=r"routing: has changed, .*: restart the daemon"),
     Mistake(
         "52",
         scenes.without_restart,

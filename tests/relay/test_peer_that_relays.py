@@ -10,8 +10,6 @@ from tests.daemon.fleet import AN_OPERATOR, a_member, a_vehicle
 from tests.daemon.frames import heartbeat
 from tests.daemon.harness import Stage
 from tests.daemon.process import DaemonProcess, Status
-from tests.daemon.test_reload import reload
-from uavlinkd.core.relay_records import RELAYED
 
 
 class Fleet:
@@ -75,30 +73,3 @@ async def test_vehicles_reach_each_other_through_their_ground_station(stage: Sta
     assert station["drops"] == {}
     await fleet.a.until_logged("relay_up", relay="gcs")
     await fleet.a.until_logged("peer_up", peer="station")
-
-
-async def test_roles_come_and_go_while_the_link_is_up(stage: Stage, fleet: Fleet) -> None:
-    """The station stays a peer: both ends make new keys when it becomes a relay, and no link is lost."""
-    relays, peers = fleet.a.config.pop("relay"), fleet.a.config["peer"]
-    fleet.a.config["peer"] = peers[:1]
-    await stage.start(*fleet.daemons, linked=False)
-    await fleet.a.until(lambda status: status["peers"]["station"]["state"] == "up")
-    fleet.a.config |= {"relay": relays, "peer": peers}
-    assert await reload(fleet.a) == []
-    await fleet.a.until(lambda status: is_relayed(status, "drone2"))
-    fleet.a.config |= {"relay": [], "peer": peers[:1]}
-    assert await reload(fleet.a) == []
-    status = await fleet.a.status()
-    assert status["relays"] == {}
-    assert status["peers"]["station"]["state"] == "up"
-    stranger, station = await stage.client(), await fleet.station.status()
-    host, _, port = station["relay"]["members"]["drone1"]["addresses"][0].rpartition(":")
-    before = (await fleet.a.status())["drops"].get("malformed", 0)
-
-    def is_counted(status: Status) -> bool:  # as at a daemon that never had relays
-        stranger.send(bytes((RELAYED,)) + bytes(16), (host, int(port)))  # a paused daemon drops it unread
-        return bool(status["drops"].get("malformed", 0) > before)
-
-    await fleet.a.until(is_counted)
-    for daemon in (fleet.a, fleet.station):
-        assert len(daemon.events("peer_up", peer=peers[0]["name"] if daemon is fleet.a else "drone1")) == 1

@@ -170,22 +170,3 @@ async def test_names_and_keys_of_members_may_go_to_others(relay: DaemonProcess, 
     made = drone.peer.traffic.handshakes
     await drone.until(lambda: drone.peer.traffic.handshakes > made)
     await connect(drone, station)
-
-
-async def test_relay_with_another_key_is_asked_for_the_same_peers(
-    stage: Stage, relay: DaemonProcess, make_member: MakeMember
-) -> None:
-    """Although nothing changes about the peers."""
-    station, drone = make_member("station"), stage.daemon("drone0")
-    relay.config["member"].append({"name": "drone0", "public_key": drone.public_key})
-    peer = {"name": "station", "public_key": encode_key(station.key), "role": "all", "system_ids": "all"}
-    before = encode_key(KeyPair(bytes([7]) * 32).public)
-    host, port = relay.sockaddr
-    drone.config["peer"] = [peer]
-    drone.config["relay"] = [{"name": "vps", "public_key": before, "addresses": [f"{host}:{port}"]}]
-    await relay.start()
-    await drone.start()
-    await drone.ready()
-    drone.config["relay"][0]["public_key"] = relay.public_key
-    assert await reload(drone) == []
-    await relay.until(lambda status: member_of(status, "drone0")["waiting"] == 1)

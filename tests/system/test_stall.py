@@ -81,20 +81,6 @@ def test_queue_that_is_empty_after_a_pause_is_not_stale(watch: StallWatch, queue
     assert queue.backlog.begin(PAUSED_UNTIL) == 1
 
 
-def test_new_queue_is_stale_while_another_is(watch: StallWatch, queue: Queue) -> None:
-    """A reload may share a socket before it is read. After all are read, a new one is not stale."""
-    queue.sender.send(b"old")
-    watch.turn(PAUSED_UNTIL)
-    heir = Queue(watch)
-    assert heir.backlog.left
-    for stale in (queue, heir):
-        stale.backlog.end(0, is_empty=True)
-    late = Queue(watch)
-    assert not late.backlog.left
-    heir.close()
-    late.close()
-
-
 def test_device_opened_before_a_pause_is_stale(monkeypatch: pytest.MonkeyPatch, watch: StallWatch) -> None:
     """It may have sent bytes meanwhile."""
     monkeypatch.setattr("uavlinkd.system.stall.monotonic", lambda: PAUSED_UNTIL)

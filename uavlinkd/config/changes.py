@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
 from typing import TypeVar
 
-from uavlinkd.config.model import Config, ConfigError, EndpointConfig, FleetConfig, PeerConfig, Problem, RelayConfig
+from uavlinkd.config.model import Config, ConfigError, EndpointConfig, FleetConfig, PeerConfig, Problem
 from uavlinkd.relay.forwarding import MemberSettings
 
 _FIXED = {
@@ -17,31 +17,27 @@ _FIXED = {
     "control_socket": "control_socket",
     "log": "log",
     "relays_frames": "routing",
+    "relays": "relay",
 }
-"""Fields that cannot change while the daemon runs, with the key of each in the file."""
-_NEEDS_RESTART = "cannot change while the daemon runs: restart it, or put the old value back"
-_Section = TypeVar("_Section", PeerConfig, EndpointConfig, MemberSettings, RelayConfig)
+"""Fields of the configuration that cannot change while the daemon runs, with the key of each in the file."""
+_NEEDS_RESTART = "has changed, and a reload changes peers, members and policies only: restart the daemon"
+_Section = TypeVar("_Section", PeerConfig, EndpointConfig, MemberSettings)
 
 
 @dataclass(frozen=True, slots=True)
 class ConfigChanges:
-    """Removed, added and changed peers, endpoints, members and relays.
+    """Removed, added and changed peers and members, and endpoints with another policy.
 
-    A peer or relay with new keys or link settings is removed and added.
+    A peer with new keys or link settings is removed and added.
     """
 
     removed_peers: tuple[str, ...]
     added_peers: tuple[PeerConfig, ...]
     changed_peers: tuple[PeerConfig, ...]
-    closed_endpoints: tuple[str, ...]
-    opened_endpoints: tuple[EndpointConfig, ...]
     changed_endpoints: tuple[EndpointConfig, ...]
     removed_members: tuple[str, ...]
     added_members: tuple[MemberSettings, ...]
     changed_members: tuple[MemberSettings, ...]
-    removed_relays: tuple[str, ...]
-    added_relays: tuple[RelayConfig, ...]
-    changed_relays: tuple[RelayConfig, ...]
     changed_fleet: tuple[str, ...]
     """Fields of :class:`.FleetConfig`."""
 
@@ -69,19 +65,17 @@ def compare(old: Config, new: Config) -> ConfigChanges:
         new.fleet and (new.fleet.authority, new.fleet.state_file)
     ):
         fixed.append("fleet.authority")
+    if [replace(one, policy={}) for one in old.endpoints] != [replace(one, policy={}) for one in new.endpoints]:
+        fixed.append("endpoint")
+    peers = _compare(old.peers, new.peers, _is_same_peer)
+    if {peer.name for peer in peers[1]} & {relay.peer for relay in new.relays} and "relay" not in fixed:
+        fixed.append("relay")  # its session is that of the peer
     if fixed:
         raise ConfigError(tuple(Problem(str(new.path), key, _NEEDS_RESTART) for key in fixed))
-    peers = _compare(old.peers, new.peers, _is_same_peer)
-    new_peers = {peer.name for peer in peers[1]}
-
-    def is_same_relay(before: RelayConfig, relay: RelayConfig) -> bool:
-        return (relay.settings, relay.peer) == (before.settings, before.peer) and relay.peer not in new_peers
-
     return ConfigChanges(
         *peers,
-        *_compare(old.endpoints, new.endpoints, lambda before, endpoint: before.url == endpoint.url),
+        tuple(one for one, before in zip(new.endpoints, old.endpoints, strict=True) if one != before),
         *_compare(_members(old), _members(new), lambda before, member: True),
-        *_compare(old.relays, new.relays, is_same_relay),
         tuple(
             field.name
             for field in fields(FleetConfig)

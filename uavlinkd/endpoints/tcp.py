@@ -103,10 +103,6 @@ class TcpServer(StreamEndpoint):
         self._resume: asyncio.TimerHandle | None = None
         self._backlog = Backlog(handler.stall, listener.fileno(), lambda: _BACKLOG + 1)
 
-    def share_socket(self) -> socket.socket:
-        """A duplicate of the socket, for another endpoint in place of this one. Each endpoint closes its own."""
-        return self.listener.dup()
-
     def start(self) -> None:
         asyncio.get_running_loop().add_reader(self.listener.fileno(), lambda: self.on_acceptable(monotonic()))
 

@@ -244,10 +244,6 @@ class UdpServer(UdpEndpoint):
     client forgotten until its next frame. Such an attacker could forge the client's frames too.
     """
 
-    def share_socket(self) -> socket.socket:
-        """A duplicate of the socket, for another endpoint in place of this one. Each endpoint closes its own."""
-        return self._sock.dup()
-
     def do_housekeeping(self, now: float) -> None:
         """Forget idle clients, and report those that became silent."""
         super().do_housekeeping(now)

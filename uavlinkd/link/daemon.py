@@ -13,8 +13,7 @@ import structlog
 
 from uavlinkd.config.changes import compare
 from uavlinkd.config.load import load_in_thread
-from uavlinkd.config.model import Config, ConfigError, Problem
-from uavlinkd.endpoints.sockets import BindError
+from uavlinkd.config.model import Config, ConfigError
 from uavlinkd.link.carrier import FrameCarrier
 from uavlinkd.link.findings import find, has_no_client, own_codes
 from uavlinkd.link.local_endpoints import PilotNotes
@@ -200,17 +199,13 @@ class Daemon:
     async def _apply_file(self) -> None:
         """Read the configuration again and apply its changes. Everything else stays as it is.
 
-        Raises ConfigError: the new file is wrong, changes what only a restart can change, or has an endpoint that
-        cannot be opened. The old configuration stays in force, as a whole.
+        Raises ConfigError: the new file is wrong, or changes what only a restart can change. The old configuration
+        stays in force, as a whole.
         """
-        before, local = self.parts.config, self.parts.local
+        before = self.parts.config
         try:
             config = await load_in_thread(before.path, os.environ)
             changes = compare(before, config)
-            try:
-                local.open(changes.opened_endpoints, leaving=changes.closed_endpoints)
-            except BindError as error:
-                raise ConfigError((Problem(str(config.path), "", str(error)),)) from None
         except ConfigError as error:
             self.parts.history.refused_file = problems = [printable(line) for line in str(error).split("\n")]
             self.log.error("configuration_refused", problems=problems)
@@ -218,11 +213,8 @@ class Daemon:
         self.parts.history.refused_file = []
         try:
             self.carrier.peers.follow(config, changes)
-            for name in changes.closed_endpoints:
-                local.close_one(name)
-            local.start()
-            for endpoint_config in changes.changed_endpoints:
-                local.change(endpoint_config)
+            for endpoint in changes.changed_endpoints:
+                self.parts.local.set_policy(endpoint.name, endpoint.make_policy())
         except Exception as error:  # neither configuration is in force: start again with the file
             report(error, most=1)
             raise

@@ -1,8 +1,8 @@
-"""The local endpoints of a daemon: opened, changed and closed as the configuration says, with their policies."""
+"""The local endpoints of a daemon, with their policies."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Final, NamedTuple
 
 from uavlinkd.config.model import EndpointConfig
@@ -12,7 +12,7 @@ from uavlinkd.core.settings import Class
 from uavlinkd.endpoints.ports import Endpoint, LocalPort, PortHandler
 from uavlinkd.endpoints.sockets import BindError, udp_socket
 from uavlinkd.endpoints.udp import UdpClient, UdpServer
-from uavlinkd.endpoints.url import EndpointKind, EndpointUrl, NetworkUrl, SerialUrl
+from uavlinkd.endpoints.url import EndpointKind, NetworkUrl, SerialUrl
 from uavlinkd.link.event_log import EventLog
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.switch import Switch
@@ -38,27 +38,20 @@ from uavlinkd.system.stall import StallWatch
 # ruff: noqa: PLC0415
 
 
-def open_endpoint(config: EndpointConfig, handler: PortHandler, instead_of: Endpoint | None = None) -> Endpoint:
+def open_endpoint(config: EndpointConfig, handler: PortHandler) -> Endpoint:
     """Open the endpoint: a socket that listens is bound. It begins to work when it is started.
 
-    ``instead_of``: an endpoint with the same URL that is about to be closed. Raises BindError if the daemon cannot
-    listen on its address.
+    Raises BindError if the daemon cannot listen on its address.
     """
     match config.url:
         case NetworkUrl(EndpointKind.UDPIN, address):
-            sock = (
-                instead_of.share_socket()
-                if isinstance(instead_of, UdpServer)
-                else udp_socket(address, may_come_later=True)
-            )
-            return UdpServer(config.name, sock, handler)
+            return UdpServer(config.name, udp_socket(address, may_come_later=True), handler)
         case NetworkUrl(EndpointKind.UDPOUT, address):
             return UdpClient(config.name, address, handler)
         case NetworkUrl(EndpointKind.TCPIN, address):
             from uavlinkd.endpoints.tcp import TcpServer, tcp_listener
 
-            sock = instead_of.share_socket() if isinstance(instead_of, TcpServer) else tcp_listener(address)
-            return TcpServer(config.name, sock, handler)
+            return TcpServer(config.name, tcp_listener(address), handler)
         case NetworkUrl(EndpointKind.TCP, address):
             from uavlinkd.endpoints.tcp import TcpClient
 
@@ -71,7 +64,7 @@ def open_endpoint(config: EndpointConfig, handler: PortHandler, instead_of: Endp
 
 
 class LocalEndpoints:
-    """Opens and closes the endpoints, adds their clients to the switch, and sends them RADIO_STATUS."""
+    """Opens the endpoints, adds their clients to the switch, and sends them RADIO_STATUS."""
 
     def __init__(self, name: str, switch: Switch, events: EventLog, stall: StallWatch) -> None:
         """``name``: the daemon, as the source of its own frames."""
@@ -83,72 +76,47 @@ class LocalEndpoints:
         """Of :class:`uavlinkd.endpoints.ports.PortHandler`, without a call in between."""
         self._switch = switch
         self._events = events
-        self._opened: list[tuple[Endpoint, EndpointConfig]] = []  # and not started yet
-        self._urls: dict[str, EndpointUrl] = {}
         self._sources: dict[str, tuple[RadioStatusSource | None, StatusTextSource | None]] = {}
         self._own = Source(name, Policy({}, is_local=True).incoming)
-        self._gather_s = 0.0
 
     # From the configuration.
 
-    def open(self, configs: Sequence[EndpointConfig], leaving: Collection[str] = ()) -> None:
-        """Bind endpoints. :meth:`start` starts them.
+    def open(self, configs: Iterable[EndpointConfig]) -> None:
+        """Bind the endpoints. :meth:`start` starts them.
 
-        One with the URL of an endpoint in ``leaving``, which is about to be closed, takes over its socket. So
-        endpoints can be renamed, or swap ports. Raises BindError: one cannot be opened. Then none is, and the others
-        are as they were. The message names the key.
+        Raises BindError: one of them cannot be opened. The message names the key.
         """
-        shared = {self._urls[one.name]: one for one in self.endpoints if one.name in leaving}
         for config in configs:
             try:
-                self._opened.append((open_endpoint(config, self, shared.get(config.url)), config))
+                self.endpoints.append(open_endpoint(config, self))
             except (BindError, OSError) as error:
-                for endpoint, _ in self._opened:
-                    endpoint.close()
-                self._opened.clear()
-                is_own = bool(self.endpoints) and isinstance(error, BindError) and error.is_taken
-                remedy = "; if it is this daemon, restart it" if is_own else ""
-                raise BindError(f"endpoint.url ({config.name}): {error}{remedy}") from None
+                raise BindError(f"endpoint.url ({config.name}): {error}") from None
+            self.policies[config.name] = config.make_policy()
+            self._sources[config.name] = (
+                RadioStatusSource() if config.radio_status else None,
+                StatusTextSource() if config.status_text else None,
+            )
 
     def start(self) -> None:
-        """Start the endpoints that :meth:`open` has bound."""
-        for endpoint, config in self._opened:
-            self.endpoints.append(endpoint)
-            self.change(config)
-            endpoint.gather(self._gather_s)
-            endpoint.start()
-        self._opened.clear()
-
-    def change(self, config: EndpointConfig) -> None:
-        """Apply other rules to an endpoint. Its clients stay connected."""
-        policy = self.policies[config.name] = config.make_policy()
-        self._urls[config.name] = config.url
+        """Start the endpoints."""
         for endpoint in self.endpoints:
-            if endpoint.name == config.name:
+            endpoint.start()
+
+    def set_policy(self, name: str, policy: Policy) -> None:
+        """Apply another policy to an endpoint. Its clients stay connected."""
+        self.policies[name] = policy
+        for endpoint in self.endpoints:
+            if endpoint.name == name:
                 for port in endpoint.ports:
                     self._switch.set_policy(port, policy)
-        self._sources[config.name] = (
-            RadioStatusSource() if config.radio_status else None,
-            StatusTextSource() if config.status_text else None,
-        )
-
-    def close_one(self, name: str) -> None:
-        """Close an endpoint that is no longer configured."""
-        endpoint = next(endpoint for endpoint in self.endpoints if endpoint.name == name)
-        self.endpoints.remove(endpoint)
-        for port in endpoint.ports:
-            self._switch.remove(port)
-        endpoint.close()
-        del self.policies[name], self._sources[name], self._urls[name]
 
     def close(self) -> None:
         """Close all endpoints."""
-        for endpoint in (*self.endpoints, *(opened for opened, _ in self._opened)):
+        for endpoint in self.endpoints:
             endpoint.close()
 
     def gather(self, seconds: float) -> None:
         """From now on, frames may wait this long before they are read: all peers make them wait anyway."""
-        self._gather_s = seconds
         for endpoint in self.endpoints:
             endpoint.gather(seconds)
 

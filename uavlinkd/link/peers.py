@@ -71,25 +71,17 @@ class Peers:
 
     def follow(self, config: Config, changes: ConfigChanges) -> None:
         """Apply the changes of a new configuration."""
-        parts, perform = self._parts, self._carriage.perform
+        parts = self._parts
         keys = {peer.name: peer.settings.public_key for peer in parts.config.peers}
         parts.config = config
         if parts.fleet is not None and config.fleet is not None:
             parts.fleet.follow(config, config.fleet, monotonic())
-        for name in changes.removed_relays:
-            if (used := parts.relays.by_name.get(name)) is not None:  # else a bulletin revoked it
-                if parts.fleet is not None:
-                    parts.fleet.forget(used.peer.settings.public_key)
-                perform(parts.relays.remove(name, monotonic()))
         for name in changes.removed_peers:
             if (link := parts.links.get(name)) is not None and link.key == keys[name]:
                 self.remove_peer(name)
         # First of all give up names and keys: what is added may have them.
         if parts.relay is not None and config.relay_server is not None:
             parts.relay.release(config.relay_server.by_key, config.keys_of_others, monotonic())
-        for relay in changes.changed_relays:
-            if relay.name in parts.relays.by_name:
-                parts.relays.change(relay)
         for peer in changes.changed_peers:
             if (link := parts.links.get(peer.name)) is not None and link.key == peer.settings.public_key:
                 self.change_peer(peer)

@@ -113,15 +113,6 @@ class Relays:
         self._sockets.stop_following(relay.name)
         return relay.leave(now)
 
-    def change(self, config: RelayConfig) -> None:
-        """Its addresses changed."""
-        relay = self.by_name[config.name]
-        if relay.link is None:
-            self._sockets.stop_following(relay.name)  # the addresses of before
-        relay.config = config
-        if relay.link is None:
-            self._sockets.follow(relay)
-
     def follow_links(self, now: float) -> None:
         """The relays, the peers or their relays changed."""
         for name, relay in self.by_name.items():

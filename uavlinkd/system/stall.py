@@ -78,8 +78,7 @@ class Backlog:
     def __init__(self, watch: StallWatch, fd: int, capacity: Callable[[], int], opened_in: int | None = None) -> None:
         """``capacity`` returns how much the queue can hold now, in the units of :meth:`end`.
 
-        ``opened_in`` is the epoch in which the other side could first send, if that was before now. While another
-        queue is stale, a new one is stale too: it may be the same socket, shared on a reload.
+        ``opened_in`` is the epoch in which the other side could first send, if that was before now.
         """
         self.fd = fd
         self.read_at = 0.0
@@ -87,8 +86,7 @@ class Backlog:
         self._watch = watch
         self._capacity = capacity
         self.left = 0  # how much of the queue may still be from before a pause
-        is_older = opened_in is not None and opened_in != watch.turn(monotonic())
-        if is_older or any(backlog.left for backlog in watch.backlogs):
+        if opened_in is not None and opened_in != watch.turn(monotonic()):
             self.mark()
         watch.backlogs.add(self)
 
