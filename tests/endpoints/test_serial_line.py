@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import termios
 import threading
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import closing
@@ -17,7 +16,7 @@ from tests.endpoints.test_serial import Autopilot
 from tests.waiting import PATIENCE_S, until
 from uavlinkd.endpoints import serial, serial_line
 from uavlinkd.endpoints.line_framing import LineDecoder, encode
-from uavlinkd.endpoints.serial_line import CTS_STUCK, LINE_FULL, CtsHold, SerialLine
+from uavlinkd.endpoints.serial_line import LINE_FULL, SerialLine
 from uavlinkd.endpoints.url import SerialUrl
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.stall import StallWatch
@@ -93,7 +92,7 @@ async def test_datagrams_go_in_both_directions(other: Other, line: SerialLine, r
     assert other.raw == b"".join(map(encode, sent))
     os.write(other.master, b"".join(map(encode, sent)))
     await until(lambda: received.datagrams == sent)
-    assert (line.reason, line.uses_cts, received.changes) == ("", False, 1)
+    assert (line.reason, received.changes) == ("", 1)
 
 
 async def test_device_that_is_absent_unplugged_and_plugged_in(
@@ -126,31 +125,7 @@ async def test_line_is_written_at_the_rate_of_the_air(other: Other, line: Serial
     assert [datagram[0] for datagram in other.datagrams()] == [1, 2, 3, 4, 5]
 
 
-async def test_modem_that_withholds_cts_for_good_is_ignored(
-    other: Other, line: SerialLine, received: Received, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Its wire is not connected after all. The next modem is tried again."""
-    monkeypatch.setattr(serial_line, "STUCK_S", 0.05)
-    monkeypatch.setattr(serial_line, "_has_cts", lambda device: True)
-    await plugged_in(other, line)
-    assert line.uses_cts
-    monkeypatch.setattr(line._device, "num_unwritten_bytes", lambda: 7)
-    line.bytes_s = 50
-    for number in range(3):
-        line.send(bytes([number + 1]) * 30)
-    await until(lambda: line.failures[CTS_STUCK] == 1 and line.is_open)
-    assert [line.uses_cts] == [False]
-    assert line.cts.total_s > 0.05
-    line.send(b"passes")
-    await until(lambda: b"passes" in other.datagrams())
-    other.unplug()
-    await until(lambda: not line.is_open)
-    await plugged_in(other, line)
-    assert [line.uses_cts] == [True]
-    assert received.changes == 5
-
-
-HANGS = ("open", "get_modem_pins", "tcsetattr", "reset_write_buffer", "close")
+HANGS = ("open", "reset_write_buffer", "close")
 
 
 @pytest.mark.parametrize("call", HANGS)
@@ -171,8 +146,7 @@ async def test_adapter_that_hangs_does_not_stop_the_event_loop(
 
         return call
 
-    of: Any = termios if call == "tcsetattr" else type(serial_for_url("/dev/null", 57600))
-    monkeypatch.setattr(serial_line, "_has_cts", lambda device: bool(device.get_modem_pins()))
+    of: Any = type(serial_for_url("/dev/null", 57600))
     try:
         if call in ("reset_write_buffer", "close"):
             await plugged_in(other, line)
@@ -218,14 +192,3 @@ async def test_end_of_the_daemon_does_not_wait_for_an_adapter_that_hangs(
     await until(lambda: other.datagrams() == [b"first", b"waits for the radio"])
     may_close.set()
     await until(closed.is_set)
-
-
-def test_time_counts_between_looks_that_find_bytes() -> None:
-    """From the first look that finds them to the one that finds none."""
-    cts = CtsHold()
-    for now, is_held in ((1.0, False), (2.0, True), (2.5, True), (4.0, False), (9.0, False)):
-        cts.note(now, is_held=is_held)
-    assert cts.total_s == 2.0
-    cts.note(10.0, is_held=True)
-    assert cts.total_s == 2.0
-    assert cts.note(13.0, is_held=True) == 3.0

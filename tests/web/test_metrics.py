@@ -79,11 +79,10 @@ FINDING = {
 }
 LINE: dict[str, Any] = {
     "rate_bits_s": 9600,
-    "uses_cts": True,
     "discarded": numbered("bad_crc", "too_long"),
     "discarded_bytes": numbered("bad_crc", "too_long"),
     "failures": numbered("LINE_FULL"),
-    **numbered("cts_held_s", "datagrams_received", "bytes_received", "bytes_written", "reports"),
+    **numbered("datagrams_received", "bytes_received", "bytes_written", "reports"),
     "radio": {"remrssi": 255, "txbuf": 98, **numbered("rssi", "noise", "remnoise", "rxerrors", "fixed")},
 }
 MEMBER = numbered("bound", "waiting", "binds_ignored", "datagrams", "bytes", "over_limit")
@@ -113,7 +112,7 @@ STATUS: dict[str, Any] = {
     "networks": {
         "lte": {"is_present": True, "serial": None},
         "sik": {"is_present": True, "serial": LINE},
-        "quiet": {"is_present": False, "serial": {**LINE, "uses_cts": False, "radio": None}},
+        "quiet": {"is_present": False, "serial": {**LINE, "radio": None}},
     },
     "frames_pass": False,
     "findings": [FINDING, FINDING | {"text": "other evidence of the same"}],

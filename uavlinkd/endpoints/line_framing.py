@@ -15,12 +15,12 @@ A SiK modem with ``MAVLINK=1`` or ``2`` puts a RADIO_STATUS frame a second betwe
     MAVLink 2   0xFD | 9 | 0 | 0 | seq | system | component | message 3 | payload 9 | checksum 2  21 bytes
     payload     rxerrors u16 | fixed u16 | rssi | remrssi | txbuf | noise | remnoise
 
-It takes part in no security: any device on the line can forge it. It is for people only.
+It takes part in no security: any device on the line can forge it. People see it, and this end sends more slowly while
+it says that the modem's send buffer is full.
 """
 
 from __future__ import annotations
 
-import re
 from binascii import crc_hqx
 from collections import Counter
 from enum import StrEnum
@@ -38,9 +38,6 @@ MAX_DATAGRAM: Final = 2048  # the longest datagram on a line: more than the long
 MAX_ENCODED: Final = MAX_DATAGRAM + CRC_BYTES + (MAX_DATAGRAM + CRC_BYTES + 253) // 254
 """The longest datagram in COBS, without delimiters. A receiver holds at most this and one chunk."""
 
-REPORTS_CUT_OUT: Final = 2
-"""So many reports are cut out of one broken datagram: a modem sends one a second, an attacker could fill the line."""
-
 REPORT_STARTS: Final = bytes((MAVLINK1, MAVLINK2))  # a report starts with one of these bytes
 _CRC_EXTRA: Final = {109: 185, 166: 21}  # by message: RADIO_STATUS, and RADIO of old firmware
 _HEADERS: Final = {MAVLINK1: (17, 5, {1: 9}), MAVLINK2: (21, 7, {1: 9, 2: 0, 3: 0, 8: 0, 9: 0})}
@@ -49,7 +46,6 @@ _FIGURES: Final = Struct("<HH5B")
 RADIO_FIGURES: Final = ("rxerrors", "fixed", "rssi", "remrssi", "txbuf", "noise", "remnoise")
 """What a modem says about the radio link. Units as in MAVLink: rssi and noise as the modem counts them; ``txbuf`` is
 the free room in its send buffer, in per cent. 255 in ``rssi`` and others: unknown."""
-_REPORT_START: Final = re.compile(b"[" + re.escape(REPORT_STARTS) + b"]")
 
 
 def report_bytes(data: bytes, at: int) -> int | None:
@@ -99,20 +95,18 @@ def _crc(datagram: bytes) -> bytes:
 class LineDecoder:
     """Finds the datagrams in a byte stream, however it is cut into chunks. Any bytes are accepted.
 
-    After an error, the next delimiter ends what is broken. Reports of the modem between
-    datagrams are skipped. If a datagram is broken because the modem put a report into it, the report is cut out.
+    After an error, the next delimiter ends what is broken. Reports of the modem between datagrams are skipped. A
+    datagram into which the modem put a report is lost.
     """
 
     def __init__(self) -> None:
         self._rest = b""
-        self._cuts = 0  # reports that were cut out of the piece that begins now
         self._is_skipping = False  # up to the next delimiter: what precedes it is too long
         self.datagrams = 0  # how many arrived whole
         self.discarded = Counter[Noise](dict.fromkeys(Noise, 0))
         """Pieces between two delimiters that are not a datagram."""
         self.discarded_bytes = Counter[Noise](dict.fromkeys(Noise, 0))  # their bytes
         self.reports = 0  # reports of the modem
-        self.reports_inside = 0  # those of them that were inside a datagram
         self.report: dict[str, int] | None = None  # the last one
 
     @property
@@ -148,27 +142,17 @@ class LineDecoder:
             elif piece:
                 result = _decode(piece)
                 if isinstance(result, Noise):
-                    is_searched = self._cuts < REPORTS_CUT_OUT and len(piece) <= MAX_ENCODED
-                    start, size = _find_report(data, at, end) if is_searched else (0, 0)
-                    if size is None:
-                        break
-                    if size:
-                        self._note(data[start : start + size])
-                        self.reports_inside += 1
-                        data, at = data[at:start] + data[start + size :], 0
-                        self._cuts += 1
-                        continue
                     self._discard(result, len(piece))
                 else:
                     datagrams.append(result)
-            at, self._cuts = end + 1, 0
+            at = end + 1
         self._keep(data[at:])
         self.datagrams += len(datagrams)
         return datagrams
 
     def reset(self) -> None:
         """Forget the bytes that wait: the device was closed."""
-        self._rest, self._is_skipping, self._cuts = b"", False, 0
+        self._rest, self._is_skipping = b"", False
 
     def _discard(self, noise: Noise, size: int) -> None:
         self.discarded[noise] += 1
@@ -202,12 +186,3 @@ def _decode(piece: bytes) -> bytes | Noise:
     if len(content) < CRC_BYTES or crc != _crc(datagram):
         return Noise.BAD_CRC
     return datagram if len(datagram) <= MAX_DATAGRAM else Noise.TOO_LONG
-
-
-def _find_report(data: bytes, at: int, end: int) -> tuple[int, int | None]:
-    """Place and length of the first report that begins in a broken piece; as :func:`.report_bytes`."""
-    for match in _REPORT_START.finditer(data, at, end):
-        size = report_bytes(data, match.start())
-        if size != 0:
-            return match.start(), size
-    return 0, 0

@@ -76,11 +76,9 @@ class Opener:
     Both may block: a thread does it, and a device that hangs occupies this thread only.
     """
 
-    def __init__(self, name: str, url: SerialUrl, prepare: Callable[[BaseSerial], None] | None = None) -> None:
-        """``prepare`` is called in the thread with a device that was opened. It may raise an OSError."""
+    def __init__(self, name: str, url: SerialUrl) -> None:
         self.is_closed = False
         self._url = url
-        self._prepare = prepare
         self._thread = Threads(1, name)
 
     async def keep_open(
@@ -113,8 +111,6 @@ class Opener:
         if self.is_closed:  # while it was being opened
             discard(device)
             raise OSError("closed")
-        if self._prepare is not None:
-            self._prepare(device)
         return device
 
 

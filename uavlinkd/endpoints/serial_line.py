@@ -3,17 +3,14 @@
 A modem takes bytes faster than its radio carries them, and holds the rest in a queue that it does not report. So the
 line is written at the rate of this end's part of the air. It accepts no more than :data:`QUEUE_S`.
 
-A USB adapter that hangs must not stop the daemon. Opening, closing, TIOCMGET and tcsetattr wait for answers of the
-adapter, and tcsetattr locks out reads and writes meanwhile. So a worker thread calls them, while the event loop does
-not use the device. The event loop itself reads and writes with O_NONBLOCK, and asks TIOCOUTQ. That does not block:
-Linux answers it from the driver's memory, as it does for each poll of the device (``n_tty_poll``).
+A USB adapter that hangs must not stop the daemon. Opening and closing wait for answers of the adapter, so a worker
+thread does it. The event loop itself reads and writes with O_NONBLOCK.
 """
 
 from __future__ import annotations
 
 import asyncio
 import os
-import termios
 from collections import Counter, deque
 from collections.abc import Callable
 from contextlib import suppress
@@ -22,7 +19,7 @@ from math import inf
 from threading import Thread
 from typing import Final
 
-from serialx import BaseSerial, PinState
+from serialx import BaseSerial
 
 from uavlinkd.endpoints.line_framing import LineDecoder, encode
 from uavlinkd.endpoints.ports import failure_name
@@ -37,40 +34,8 @@ MODEM_S: Final = 0.25  # the modem gets no more than the air carries in this tim
 QUEUE_S: Final = 0.25  # so much may wait here for the modem, and `QUEUE_BYTES` more
 QUEUE_BYTES: Final = 320  # an initiation and a response of a handshake wait here, however slow the radio is
 READ_BYTES: Final = 4096
-STUCK_S: Final = 5.0
-"""The modem withholds CTS for longer: the wire is broken or not connected. Then the daemon opens the device again,
-and ignores CTS until the device is lost for another reason."""
-WIRE_LATE_S: Final = 0.05  # a USB adapter reports later than this wire's rate shows that bytes were sent
 CLOSE_S: Final = 0.5  # at the end of the daemon, the last datagram has this time to leave the kernel
 LINE_FULL: Final = "LINE_FULL"  # in place of an error's name: a datagram was dropped, too much waits
-CTS_STUCK: Final = "CTS_STUCK"  # in place of an error's name: see `STUCK_S`
-_BITS_PER_BYTE: Final = 10  # with start and stop bit
-
-
-class CtsHold:
-    """Looks at a line in which the modem can stop this end by the CTS wire."""
-
-    def __init__(self) -> None:
-        self.total_s = 0.0  # the time for which the modem held this end, until the last look
-        self._since: float | None = None
-        self._noted_at = 0.0
-
-    def note(self, now: float, *, is_held: bool) -> float:
-        """A look: ``is_held`` if the kernel has bytes that the wire should have carried by now.
-
-        Returns for how long they are held.
-        """
-        if self._since is not None:
-            self.total_s += now - self._noted_at
-        if not is_held:
-            self._since = None
-        elif self._since is None:
-            self._since = now
-        self._noted_at = now
-        return 0.0 if self._since is None else now - self._since
-
-    def end(self) -> None:
-        self._since = None
 
 
 class SerialLine:
@@ -94,8 +59,6 @@ class SerialLine:
         """Failures to open it, lost connections and dropped datagrams, by the name of the error."""
         self.reason = "it was not opened yet"  # why it is not open
         self.error = ""  # the name of the error behind that
-        self.uses_cts = False  # whether the modem can stop this end by the CTS wire
-        self.cts = CtsHold()
         self.bytes_received = 0
         self.bytes_written = 0
         self._name = name
@@ -109,11 +72,9 @@ class SerialLine:
         self._queue: deque[bytes] = deque()
         self._queued_bytes = 0
         self._sent_by = -inf  # when the air will have carried all written bytes
-        self._wire_by = -inf  # when the wire to the modem will have carried them
-        self._ignores_cts = False
         self._timer: asyncio.TimerHandle | None = None
         self._task: asyncio.Task[None] | None = None
-        self._opener = Opener(f"line-{name}", url, self._prepare)
+        self._opener = Opener(f"line-{name}", url)
 
     @property
     def is_open(self) -> bool:
@@ -172,13 +133,7 @@ class SerialLine:
 
     def _write_next(self, device: BaseSerial, now: float) -> bool:
         """Pass a datagram to the kernel if the radio has little to send. Returns whether the next one may follow."""
-        in_kernel = device.num_unwritten_bytes()
-        is_held = self.uses_cts and in_kernel > 0 and now > self._wire_by + WIRE_LATE_S
-        if self.cts.note(now, is_held=is_held) > STUCK_S:
-            self._lose(CTS_STUCK)
-            return False
-        # For so long the radio has something to send; at least as long as the kernel holds bytes.
-        held_s = max(0.0, self._sent_by - now, in_kernel / self.bytes_s)
+        held_s = max(0.0, self._sent_by - now)  # for so long the radio has something to send
         over_s = held_s + len(self._queue[0]) / self.bytes_s - MODEM_S
         if held_s > 0 and over_s > 0:
             wait_s = min(held_s, over_s) + LATE_S
@@ -194,7 +149,6 @@ class SerialLine:
             self.failures[LINE_FULL] += 1
         self.bytes_written += count
         self._sent_by = max(self._sent_by, now) + count / self.bytes_s
-        self._wire_by = max(self._wire_by, now) + count * _BITS_PER_BYTE / self.url.baud
         return True
 
     # The device.
@@ -202,8 +156,9 @@ class SerialLine:
     async def _use(self, device: BaseSerial, epoch: int) -> None:
         self._lost.clear()
         self._device = device
+        os.set_blocking(device.fileno(), False)
         self.reason = ""
-        self._sent_by = self._wire_by = -inf
+        self._sent_by = -inf
         self.decoder.reset()
         self._backlog = Backlog(self._stall, device.fileno(), lambda: TERMINAL_BYTES, epoch)
         asyncio.get_running_loop().add_reader(device.fileno(), self._on_readable)
@@ -214,11 +169,6 @@ class SerialLine:
         self.error = error
         self.reason = f"{self.url.device} cannot be opened ({error})"
         self.failures[error] += 1
-
-    def _prepare(self, device: BaseSerial) -> None:
-        """Use CTS if the modem has it; in the opener's thread."""
-        os.set_blocking(device.fileno(), False)
-        self.uses_cts = not self._ignores_cts and _has_cts(device) and _set_cts(device, on=True)
 
     def _on_readable(self) -> None:
         device, backlog, now = self._device, self._backlog, monotonic()
@@ -246,7 +196,6 @@ class SerialLine:
     def _lose(self, reason: str) -> None:
         self.error = reason
         self.failures[reason] += 1
-        self._ignores_cts = reason == CTS_STUCK
         self._detach(f"{self.url.device} was lost ({reason})")
         self._lost.set()
         self._on_change()
@@ -261,32 +210,11 @@ class SerialLine:
             self._backlog.close()
         self._device = self._backlog = None
         self.reason = reason
-        self.cts.end()
         self._queue.clear()
         self._queued_bytes = 0
 
 
-def _has_cts(device: BaseSerial) -> bool:
-    """Whether the modem holds CTS. A device without such wires has none, and a modem that is not ready lowers it."""
-    try:
-        return device.get_modem_pins().cts is PinState.HIGH
-    except OSError:
-        return False
-
-
-def _set_cts(device: BaseSerial, *, on: bool) -> bool:
-    """Have the kernel stop writing while the modem lowers CTS, or not. Returns whether it does so now."""
-    try:
-        settings = termios.tcgetattr(device.fileno())
-        settings[2] = settings[2] | termios.CRTSCTS if on else settings[2] & ~termios.CRTSCTS
-        termios.tcsetattr(device.fileno(), termios.TCSANOW, settings)
-    except (OSError, termios.error):
-        return False
-    return on
-
-
 def _close(device: BaseSerial) -> None:
     """Close the device once the kernel has written what it holds."""
-    _set_cts(device, on=False)  # otherwise the kernel waits up to half a minute for the modem
     with suppress(OSError):
         device.close()

@@ -233,7 +233,7 @@ class Daemon:
             run(self._do_housekeeping_of_relay, parts.relay, now)
         sockets, links = parts.peer_sockets, list(parts.links.values())
         run(sockets.do_housekeeping)
-        if rates := sockets.serial.follow_rates(sockets.budgets, links, now):
+        if rates := sockets.serial.follow_rates(sockets.budgets, now):
             run(parts.node.set_rates, rates, now)
         run(parts.relays.do_housekeeping, now)
         for link in links:

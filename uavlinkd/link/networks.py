@@ -176,7 +176,7 @@ class Network:
     )
     """What a person can do while it is absent."""
 
-    def status(self, _now: float) -> dict[str, object]:
+    def status(self) -> dict[str, object]:
         """As plain values."""
         ports = [one.port for one in self.sockets if one.index is not None]
         return network_status(self.config, self.presence, ports)

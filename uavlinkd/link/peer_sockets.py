@@ -167,9 +167,9 @@ class PeerSockets:
         absent = [network for network in self._networks() if not network.presence.hosts]
         return {f"{network.config.name} ({network.presence.reason})": network.remedy for network in absent}
 
-    def network_status(self, now: float) -> dict[str, object]:
+    def network_status(self) -> dict[str, object]:
         """Each network by name, as plain values."""
-        return {network.config.name: network.status(now) for network in self._networks()}
+        return {network.config.name: network.status() for network in self._networks()}
 
     def _networks(self) -> Iterator[Network | SerialNetwork]:
         yield from self.networks.networks

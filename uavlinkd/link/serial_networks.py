@@ -1,8 +1,7 @@
 """The serial networks: their devices, as senders and receivers of datagrams beside the UDP sockets.
 
 Each has one socket number, and one path: to the peer at the other end of the line. The file says what its radio
-carries. It may carry less: at a distance, with interference, or because the file is wrong. Then the modem's queue
-grows, and with it the time until an answer. :class:`LineRate` reduces the rate then.
+carries.
 """
 
 from __future__ import annotations
@@ -19,7 +18,6 @@ from uavlinkd.core.constants import LINE_BYTES
 from uavlinkd.core.node import Node
 from uavlinkd.core.path import SERIAL_HOST, Path, SocketAddress
 from uavlinkd.core.path_measures import limit_at
-from uavlinkd.core.path_state import PathState
 from uavlinkd.core.peer import Peer
 from uavlinkd.endpoints.sockets import Presence
 from uavlinkd.link.conditions import LineLimits
@@ -34,88 +32,12 @@ RECENT_S: Final = 10
 NOISE_PIECES: Final = 10
 """Damaged pieces in :data:`RECENT_S` that are reported, if they are more than :data:`NOISE_SHARE` of all."""
 NOISE_SHARE: Final = 0.1
-LATER_S: Final = 0.5
-"""A round trip that is longer than the shortest one by more than this shows a queue in a modem."""
-SHORTEST_OF_S: Final = 60.0
-"""The shortest round trip of this time counts."""
-GROWTH: Final = 1.05
-"""Factor per second by which a reduced rate grows."""
-GROWN_AFTER_S: Final = 60.0
-"""It grows from the lowest to the full rate in less. A longer gap, such as a suspend, would overflow the power."""
-LEAST_SHARE: Final = 1 / 16
-"""The rate falls to this part of the full one at most,"""
-LEAST_BITS_S: Final = 1000
-"""and not below this: heartbeats and commands still pass."""
-UNANSWERED: Final = 6
-"""So many echo requests in a row, each after twice the time, show a queue that is longer than answers may take. Few
-noisy radios lose so many."""
-ENVELOPES: Final = 2
-"""So many of the largest envelopes, one at each end, may precede a question or its answer without any queue in a
-modem."""
-
-
-class LineRate:
-    """The rate at which this end sends: less if its modem turns out to queue. Sans-IO: ``now`` is monotonic seconds.
-
-    ``full_bits_s``: that of the configuration. ``envelope_bytes``: the largest envelope with its framing.
-    """
-
-    __slots__ = ("_at", "_bits_s", "_envelope_bits", "_halved_at", "_is_late", "_shortest", "full_bits_s")
-
-    def __init__(self, full_bits_s: float, envelope_bytes: int, now: float) -> None:
-        self.full_bits_s = full_bits_s
-        self._envelope_bits = 8 * envelope_bytes
-        self._bits_s = full_bits_s
-        self._at = now
-        self._is_late = False
-        self._halved_at = now - SHORTEST_OF_S
-        self._shortest = deque[tuple[float, float]]()  # times and round trips, both ascending
-
-    @property
-    def least_bits_s(self) -> float:
-        """It is no lower."""
-        return max(LEAST_SHARE * self.full_bits_s, min(LEAST_BITS_S, self.full_bits_s))
-
-    def bits_s(self, now: float) -> float:
-        """The rate now."""
-        if self._is_late:
-            return self.least_bits_s
-        if self._bits_s < self.full_bits_s and now > self._at:
-            self._bits_s = min(self.full_bits_s, self._bits_s * GROWTH ** min(now - self._at, GROWN_AFTER_S))
-        self._at = max(self._at, now)
-        return self._bits_s
-
-    def add_round_trip(self, round_trip_s: float, now: float) -> bool:
-        """Note the time until the answer to a probe. Returns whether the rate was halved for it."""
-        shortest = self._shortest
-        while shortest and shortest[0][0] < now - SHORTEST_OF_S:
-            shortest.popleft()
-        # At a low rate, an envelope alone takes longer than 0.5 s.
-        allowed_s = LATER_S + ENVELOPES * self._envelope_bits / self.bits_s(now)
-        is_late = bool(shortest) and round_trip_s > shortest[0][1] + allowed_s
-        while shortest and shortest[-1][1] >= round_trip_s:
-            shortest.pop()
-        shortest.append((now, round_trip_s))
-        # The answers to questions from before the last halving still show the queue that caused it.
-        if not is_late or now - self._halved_at <= round_trip_s:
-            return False
-        self._halve(now)
-        return True
-
-    def set_late(self, now: float, *, is_late: bool) -> None:
-        """Note whether answers to echo requests come too late, or not at all.
-
-        Until one comes in time, the rate is the least one, so that the queue empties. Then it is half of that before.
-        """
-        if is_late and not self._is_late:
-            self._halve(now)
-        elif self._is_late:  # it does not grow meanwhile
-            self._at = max(self._at, now)
-        self._is_late = is_late
-
-    def _halve(self, now: float) -> None:
-        self._bits_s = max(self.least_bits_s, self.bits_s(now) / 2)
-        self._halved_at = now
+FULL_BELOW: Final = 20
+"""A modem's send buffer with less free room than this, in per cent, is full."""
+BACK_OFF_S: Final = 2
+"""A report of the modem counts for this time: the modem sends one a second."""
+BACKED_OFF: Final = 0.25
+"""While the buffer is full, this end sends at this part of the rate, so that the buffer empties."""
 
 
 class SerialNetwork:
@@ -128,13 +50,13 @@ class SerialNetwork:
         self.number = number
         self.path = Path(number, (SERIAL_HOST, 0))
         self.envelope_limit = limit_at(config.budget_bits_s)
-        self.rate = LineRate(config.budget_bits_s, self.envelope_limit + LINE_BYTES, monotonic())
         self._receive: Receive = lambda *_: None
         self._states = states
         self._log = log
         self._on_change: Callable[[], None] = lambda: None
-        self._answered_at = 0.0
-        self._seconds = deque[tuple[int, int, int, int]](maxlen=RECENT_S + 1)  # totals, one for each second
+        self._full_s = 0
+        """For so many seconds more the modem's send buffer counts as full."""
+        self._seconds = deque[tuple[int, int, int]](maxlen=RECENT_S + 1)  # totals, one for each second
         # Imported only if configured: a daemon on UDP starts faster and stays smaller.
         from uavlinkd.endpoints.serial_line import SerialLine  # noqa: PLC0415
 
@@ -172,8 +94,11 @@ class SerialNetwork:
 
     def do_housekeeping(self) -> None:
         """Note what was received. Write to the log what it does not say yet about the device."""
-        decoder, size = self.line.decoder, self.line.bytes_written + self.line.bytes_received
-        self._seconds.append((decoder.line_noise, decoder.datagrams, decoder.reports, size))
+        decoder = self.line.decoder
+        self._full_s = max(0, self._full_s - 1)
+        if decoder.report is not None and decoder.reports > (self._seconds[-1][2] if self._seconds else 0):
+            self._full_s = BACK_OFF_S if decoder.report["txbuf"] < FULL_BELOW else 0
+        self._seconds.append((decoder.line_noise, decoder.datagrams, decoder.reports))
         self._log.note(self.presence, monotonic())
 
     @property
@@ -186,14 +111,10 @@ class SerialNetwork:
         """What a person can do while it is absent."""
         return meaning_of(self.line.error) or "plug the modem in: the daemon uses it within a second"
 
-    def note_answers(self, peer: Peer, state: PathState, now: float) -> None:
-        """Note the last round trip along the line, and echo requests without an answer. Each counts once."""
-        if state.round_trip_s is not None and state.answered_at > self._answered_at:
-            self._answered_at = state.answered_at
-            self.rate.add_round_trip(state.round_trip_s, state.answered_at)
-        requests, is_best = peer.echo_requests, state is peer.paths.best and not state.is_off
-        is_late = requests.was_late or requests.unanswered >= UNANSWERED
-        self.rate.set_late(now, is_late=is_best and is_late)  # the requests go along the best path
+    @property
+    def rate_bits_s(self) -> float:
+        """The rate at which this end sends: less while the modem says that its send buffer is full."""
+        return (BACKED_OFF if self._full_s else 1.0) * self.config.budget_bits_s
 
     @property
     def recent_reports(self) -> int:
@@ -205,12 +126,12 @@ class SerialNetwork:
         """Damaged pieces and whole datagrams of the last seconds, if the damaged ones are many."""
         if not self._seconds:
             return None
-        (noise_before, whole_before, *_), (noise, whole, *_) = self._seconds[0], self._seconds[-1]
+        (noise_before, whole_before, _), (noise, whole, _) = self._seconds[0], self._seconds[-1]
         damaged, whole = noise - noise_before, whole - whole_before
         is_much = damaged >= NOISE_PIECES and damaged > NOISE_SHARE * (damaged + whole)
         return (damaged, whole) if is_much else None
 
-    def status(self, now: float) -> dict[str, object]:
+    def status(self) -> dict[str, object]:
         """As plain values, with the keys of every network."""
         line, decoder = self.line, self.line.decoder
         report = decoder.report if self.recent_reports else None
@@ -218,18 +139,15 @@ class SerialNetwork:
             "device": line.url.device,
             "baud": line.url.baud,
             "air_bits_s": self.config.air_bits_s,
-            "rate_bits_s": round(self.rate.bits_s(now)),
-            "uses_cts": line.uses_cts,
+            "rate_bits_s": round(self.rate_bits_s),
             "line_noise": decoder.line_noise,
             "discarded": {noise.value: count for noise, count in decoder.discarded.items()},
             "discarded_bytes": {noise.value: size for noise, size in decoder.discarded_bytes.items()},
-            "cts_held_s": line.cts.total_s,
             "datagrams_received": decoder.datagrams,
             "bytes_received": line.bytes_received,
             "bytes_written": line.bytes_written,
             "failures": dict(line.failures),
             "reports": decoder.reports,
-            "reports_inside": decoder.reports_inside,
             "radio": report,
         }
         return network_status(self.config, self.presence, (), serial)
@@ -276,22 +194,14 @@ class SerialNetworks:
             for line in self.networks
         }
 
-    def follow_rates(
-        self, budgets: Mapping[int, NetworkBudget], links: Iterable[PeerLink], now: float
-    ) -> dict[int, float]:
-        """Adapt the budgets to the answers along the lines. Call it once a second.
+    def follow_rates(self, budgets: Mapping[int, NetworkBudget], now: float) -> dict[int, float]:
+        """Adapt the budgets to what the modems report. Call it once a second.
 
         Returns the rates for the core, by the number of the socket, if one of them has changed.
         """
-        if not self.networks:
-            return {}
-        for link in links:
-            for state in link.peer.paths.states:
-                if (line := self.of_number.get(state.path.socket)) is not None:
-                    line.note_answers(link.peer, state, now)
         has_changed = False
         for line in self.networks:
-            budget, bits_s = budgets[line.number], line.rate.bits_s(now)
+            budget, bits_s = budgets[line.number], line.rate_bits_s
             budget.set_rate(bits_s, now)
             has_changed |= budget.update_core(bits_s)
         return {line.number: budgets[line.number].core_bits_s for line in self.networks} if has_changed else {}

@@ -98,7 +98,7 @@ def _status(
         },
         "relays": {name: used_relay_status(relay, daemon, now) for name, relay in daemon.relays.by_name.items()},
         "fleet": None if daemon.fleet is None else fleet_status(daemon.fleet, daemon.links, now),
-        "networks": daemon.peer_sockets.network_status(now),
+        "networks": daemon.peer_sockets.network_status(),
         "endpoints": {
             endpoint.name: endpoint_status(endpoint, daemon.local.policies[endpoint.name], now)
             for endpoint in daemon.local.endpoints

@@ -163,7 +163,7 @@ def _networks(config: Config) -> Iterator[tuple[str, str]]:
             text = (
                 f"; the radio carries {network.air_bits_s:,} bits/s, this end sends up to {network.budget_bits_s:,};"
                 # With other settings the modem cuts and mixes datagrams.
-                " set a SiK modem to MAVLINK=0, RTSCTS=1 if these wires are connected, and ECC=0"
+                " set a SiK modem to MAVLINK=0, RTSCTS=0 and ECC=0"
             )
         else:
             budget = f"{network.budget_bits_s:,} bits/s" if network.budget_bits_s else "no budget"

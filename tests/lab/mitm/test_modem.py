@@ -56,7 +56,7 @@ def numbered(size: int) -> bytes:
 @pytest.mark.parametrize("air_bits_s", [4_000.0, 24_000.0, 40_000.0])
 def test_air_rate_is_held(air_bits_s: float) -> None:
     """Within 1 %, while one host writes all the time."""
-    bench = Bench(replace(SIK, air_bits_s=air_bits_s, has_flow_control=True))
+    bench = Bench(replace(SIK, air_bits_s=air_bits_s))
     bench.feed({LEFT: bytes(4096)}, until=60)
 
     carried_bits = 8 * sum(len(packet.data) for packet in bench.packets)
@@ -66,7 +66,7 @@ def test_air_rate_is_held(air_bits_s: float) -> None:
 
 def test_air_is_half_duplex() -> None:
     """Packets never overlap, a change of the sender takes the turn-around time, and both ends get their turns."""
-    bench = Bench(replace(SIK, has_flow_control=True))
+    bench = Bench()
     bench.feed({LEFT: bytes(4096), RIGHT: bytes(4096)}, until=60)
 
     assert len(bench.packets) > 500

@@ -22,7 +22,7 @@ from uavlinkd.ops.control import ask
 pytestmark = pytest.mark.usefixtures("undone_settings")
 
 LEFT, RIGHT = ModemEnd.LEFT, ModemEnd.RIGHT
-FAST = ModemSettings(air_bits_s=1e6, line_baud=1e6, turn_around_s=0.001, has_flow_control=True)
+FAST = ModemSettings(air_bits_s=1e6, line_baud=1e6, turn_around_s=0.001, queue_bytes=1 << 16)
 
 
 def settings_in(folder: Path, modem: ModemSettings = FAST, **others: Any) -> PortSettings:
@@ -114,7 +114,6 @@ async def test_requests(tmp_path: Path) -> None:
             ("set loss=1", "packet_loss"),
             ("set packet_loss=2", "share"),
             ("set packet_loss=much", "float"),
-            ("set has_flow_control=1", "bool"),
             ("attack line", "line-noise"),
             ("jump", "no request"),
         ):

@@ -3,7 +3,7 @@
 No I/O and no clock; seeded. Each *end* is a modem on a serial line with a host. The stages of a byte are: the kernel
 of the host, the line to the modem (10 bits per byte), the modem's queue, the air, the line from the other modem.
 
-- *The queue is not reported.* Without RTS/CTS, bytes that do not fit are lost, as in a SiK.
+- *The queue is not reported.* Bytes that do not fit are lost, as in a SiK.
 - *The air is half duplex.* One modem sends at a time, and a change of the sender takes ``turn_around_s``.
 - *Air packets.* A modem sends up to ``packet_bytes`` together. They arrive together, or are lost together. The
   boundaries have no relation to those of the host's datagrams.
@@ -58,8 +58,6 @@ class ModemSettings:
     """A modem waits so long for more bytes before it sends less than a whole packet."""
     queue_bytes: int = 2048
     packet_bytes: int = 240
-    has_flow_control: bool = False
-    """RTS/CTS: the host's kernel keeps the bytes for which the queue has no room."""
     host_bytes: int = 4096
     """The host's kernel holds this for the line. It accepts no more."""
     chunk_bytes: int = 62
@@ -129,7 +127,6 @@ class _Modem:
     queue: bytearray = field(default_factory=bytearray)
     oldest_at: float = 0.0
     """When the first byte of the queue came; -inf if it has waited for a packet before."""
-    is_waiting_for_room: bool = False
     is_plugged: bool = True
     hold_until: float = -math.inf
     held: bytearray = field(default_factory=bytearray)
@@ -284,12 +281,10 @@ class ModemLink:
     def _receive_from_host(self, end: ModemEnd, at: float) -> None:
         """Move the bytes that have crossed the line into the queue."""
         modem, settings = self._modems[end], self.settings
-        if not modem.host or modem.is_waiting_for_room or modem.next_at > at:
+        if not modem.host or modem.next_at > at:
             return
         arrived = min(len(modem.host), 1 + int((at - modem.next_at) / self._byte_s + _ROUNDING))
         room = settings.queue_bytes - len(modem.queue)
-        if arrived > room and settings.has_flow_control:
-            arrived, modem.is_waiting_for_room = room, True
         if not modem.queue:
             modem.oldest_at = modem.next_at
         taken = bytes(modem.host.popleft() for _ in range(arrived))
@@ -304,13 +299,12 @@ class ModemLink:
         missing = whole - len(modem.queue)
         if missing <= 0:
             return -math.inf
-        is_coming = modem.host and not modem.is_waiting_for_room
         at = math.inf
-        if is_coming and missing <= len(modem.host):
+        if missing <= len(modem.host):
             at = modem.next_at + (missing - 1) * self._byte_s
         if modem.queue:
             return min(at, modem.oldest_at + settings.gather_s)
-        return min(at, modem.next_at + settings.gather_s) if is_coming else at
+        return min(at, modem.next_at + settings.gather_s) if modem.host else at
 
     def _use_air(self, at: float) -> None:
         """The air is free, and at least one modem is ready: begin a packet, or the turn of the other modem."""
@@ -328,9 +322,6 @@ class ModemLink:
         data = bytes(modem.queue[:size])
         del modem.queue[:size]
         modem.oldest_at = -math.inf
-        if modem.is_waiting_for_room:
-            modem.is_waiting_for_room = False
-            modem.next_at = max(modem.next_at, at + self._byte_s)
         duration_s = 8 * size / settings.air_bits_s
         self._on_air = Transmission(sender, at, at + duration_s, data)
         self.packets[sender] += 1

@@ -57,8 +57,8 @@ def parse_modem(text: str, settings: ModemSettings) -> ModemSettings:
         if key not in types:
             raise ValueError(f"there is no setting {key!r} of a modem: choose one of {', '.join(types)}")
         try:
-            values[key] = {"true": True, "false": False}[value] if types[key] is bool else types[key](value)
-        except (KeyError, ValueError):
+            values[key] = types[key](value)
+        except ValueError:
             raise ValueError(f"{key} must be {types[key].__name__}, not {value!r}") from None
     return replace(settings, **values)  # type: ignore[arg-type]
 
