@@ -13,16 +13,13 @@ import warnings
 from collections.abc import Callable
 
 from cryptography.exceptions import InvalidSignature, InvalidTag, UnsupportedAlgorithm
-from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import dh, mlkem
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
-from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
 from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.hmac import HMAC
 from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand
-from cryptography.hazmat.primitives.kdf.pbkdf2 import PBKDF2HMAC
 
 from uavlinkd.core.constants import KEY_BYTES
 from uavlinkd.core.drops import Drop, DropReason
@@ -224,6 +221,9 @@ _PBES2 += "300c 06082a864886f70d0209 0500 301d 060960864801650304012a 0410{vecto
 
 def signing_key_pem(private: Secret, passphrase: Secret | None, entropy: Entropy) -> str:
     """A private key of Ed25519 in PKCS #8, as OpenSSL reads it; encrypted, unless the passphrase is None."""
+    from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes  # noqa: PLC0415  a daemon needs none
+    from cryptography.hazmat.primitives.kdf.pbkdf2 import PBKDF2HMAC  # noqa: PLC0415
+
     plain = _PKCS8 + private.reveal()
     if passphrase is None:
         return _pem("PRIVATE KEY", plain)
@@ -243,6 +243,8 @@ def _pem(label: str, data: bytes) -> str:
 
 def read_signing_key(pem: bytes, passphrase: Secret | None) -> Secret:
     """The private key of Ed25519 in a PKCS #8 file. Raises ValueError: it is not one, or the passphrase is wrong."""
+    from cryptography.hazmat.primitives import serialization  # noqa: PLC0415  10 ms, and a daemon reads no such file
+
     try:
         key = serialization.load_pem_private_key(pem, None if passphrase is None else passphrase.reveal())
     except (ValueError, TypeError, UnsupportedAlgorithm):

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import InitVar, dataclass, field
 from enum import StrEnum
-from statistics import median
 from typing import NamedTuple
 
 from uavlinkd.core import constants as c
@@ -323,8 +322,8 @@ class PathState:
             del self._waiting[token]
 
     def _lag_ms(self, now: float) -> int:
-        recent = [lag for at, lag in self._lags if at >= now - c.LAG_WINDOW_S]
-        return min(probe.LONGEST_LAG_MS, round(1000 * median(recent))) if recent else probe.UNKNOWN_LAG
+        recent = sorted(lag for at, lag in self._lags if at >= now - c.LAG_WINDOW_S)
+        return min(probe.LONGEST_LAG_MS, round(1000 * recent[len(recent) // 2])) if recent else probe.UNKNOWN_LAG
 
     # The condition.
 
