@@ -146,13 +146,13 @@ def test_policy_of_a_role_adds_to_the_usual_one(tmp_path: Path) -> None:
 
 def test_relay_needs_no_member_sections(tmp_path: Path) -> None:
     """Its limits for each member are in [relay_server]."""
-    limits = "[relay_server]\nmember_max_peers = 9\nmember_datagrams_s = 8\nmember_bits_s = 7000\n"
+    limits = "[relay_server]\nmember_bits_s = 70_000\n"
     config = load_member(tmp_path, HEAD + fleet(certificate(_RELAY, "r2")) + limits)
     assert config.relay_server is not None
     assert config.relay_server.members == ()
     assert config.fleet is not None
     made = relay_member(config.fleet, bytes(32), Certificate(bytes(4), 9, _VEHICLE, (1, 1), "v1"))
-    assert (made.name, made.most_peers, made.limits) == ("v1", 9, RelayLimits(8, 7000))
+    assert (made.name, made.most_peers, made.limits) == ("v1", 256, RelayLimits(7, 70_000))
     assert (made.peer.is_certified, made.peer.initiates, made.peer.link.features) == (True, False, _BOTH)
 
 

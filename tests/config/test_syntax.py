@@ -54,10 +54,6 @@ def test_error_is_at_its_line_and_key(tmp_path: Path, text: str, line: int, key:
             "[Interface]\nPrivateKey = {key}\n[Peer]\nPublicKey = {key}\n",
             "is a WireGuard file (wg.conf), and uavlinkd has its own format: start from configs/drone0.toml",
         ),
-        (
-            "[General]\n[UdpEndpoint uavlinkd]\nMode = Normal\n",
-            "is a file of mavlink-router, and uavlinkd has its own format: start from configs/drone0.toml",
-        ),
         ("{key}\n", "is a key file, not a configuration: give the .toml file"),
     ],
 )

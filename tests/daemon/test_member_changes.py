@@ -32,7 +32,7 @@ async def test_names_and_keys_in_the_file_win(fleet: Swarm) -> None:
     await one.until(lambda status: not is_up(status, "ground"))
     del ground.config["fleet"]["deny"]
     ground.add_peer(two, [], role="vehicle", system_ids=[2])
-    ground.config["relay_server"]["member_max_peers"] = 7
+    ground.config["relay_server"]["member_bits_s"] = 70_000_000
     assert "v2" not in (await reload(ground))["fleet"]["held"]
     await ground.until(lambda status: is_up(status, "v1", "v2") and set(status["relay"]["members"]) == {"v1"})
     ground.config["peer"] = []

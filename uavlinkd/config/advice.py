@@ -4,20 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from itertools import combinations
-from math import ceil
 
 from uavlinkd.config.model import Config, EndpointConfig, FleetConfig, PeerAddress, PeerConfig
-from uavlinkd.core import constants as c
 from uavlinkd.core.certificates import parse_bulletin, parse_certificate
-from uavlinkd.core.wire import initiation_bytes, response_bytes
 from uavlinkd.endpoints.url import EndpointKind, NetworkUrl
 from uavlinkd.mavlink.policy.settings import read_settings
-from uavlinkd.system.addresses import IPV4_UDP_BYTES, Address
+from uavlinkd.system.addresses import Address
 
-# UDP payloads that pass in one piece.
-IPV6_LEAST_PAYLOAD = 1280 - 40 - 8  # every IPv6 path carries it (RFC 8200, section 5)
-ETHERNET_PAYLOAD = 1500 - 40 - 8  # over IPv6; IPv4 has 20 bytes more
-_SHORT_TAG_BYTES = 8
 _READABLE = (
     "a link through a relay is not confidential: its owner cannot alter the frames, but can read them; write"
     " confidential = true in [link], at one end or both"
@@ -54,33 +47,9 @@ def advice(config: Config) -> Iterator[str]:
 
 
 def _of_peer(peer: PeerConfig) -> Iterator[str]:
-    link, budget = peer.settings.link, peer.egress.budget_bits_s
     yield from peer.make_policy().warnings
-    if peer.relays and not link.confidential:
+    if peer.relays and not peer.settings.link.confidential:
         yield _READABLE
-    if not link.confidential and link.tag_bytes <= _SHORT_TAG_BYTES:
-        yield (
-            "tags of 64 bits: each forged envelope is accepted with probability 2^-64; use them on slow radios only,"
-            " otherwise write tag_bits = 128"
-        )
-    if link.max_envelope > ETHERNET_PAYLOAD:
-        yield (
-            f"envelopes over {ETHERNET_PAYLOAD:,} bytes: most networks split them, and losing one part loses all;"
-            f" unless the path is known to carry them whole, write max_envelope_bytes = {c.DEFAULT_ENVELOPE_LIMIT}"
-        )
-    for suite in link.suites:
-        start = f"a handshake with {suite.name} starts with a datagram of {initiation_bytes(suite):,} bytes: "
-        if initiation_bytes(suite) > ETHERNET_PAYLOAD:
-            yield start + "it exceeds an MTU of 1,500, so every path must carry fragments; many do not"
-        elif initiation_bytes(suite) > IPV6_LEAST_PAYLOAD:
-            yield start + "Ethernet carries it, a path with IPv6's least MTU of 1,280 (some tunnels) does not"
-    size = max(initiation_bytes(link.suites[0]), response_bytes(link.suites[0])) + IPV4_UDP_BYTES
-    if budget and size * 8 / budget > link.timers.retry_max_s:
-        yield (
-            f"a handshake with {link.suites[0].name} takes {size * 8 / budget:.1f} s at {budget:,} bits/s, but the"
-            f" next attempt starts after {link.timers.retry_max_s:g} s: write retry_max_s ="
-            f" {ceil(size * 16 / budget)}"
-        )
 
 
 def _revoked(fleet: FleetConfig) -> Iterator[str]:

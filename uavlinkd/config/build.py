@@ -49,6 +49,8 @@ VERIFYING_SHARE: Final = 0.05
 TIMERS: Final = Timers(echo_after_s=0.1, handshake_after_s=0.2, lost_after_s=1.0, retry_max_s=0.5)
 """A relay is asked when a path along it fails or its peer is silent, and answers at once unless it was restarted. A
 try costs 0.3 kB: while a relay is down, 5 kbit/s. When it is lost, its name is resolved again: it may have moved."""
+_BITS_OF_DATAGRAM: Final = 10_000
+"""A relay passes one datagram for each so many bits that it may pass: almost the largest that fits Ethernet."""
 # A policy's messages repeat a group, a message, a command or a number, so that a person can search for it.
 # Any other text may be a secret, or control a terminal, or have a million digits.
 _WORD = re.compile(r"[A-Za-z0-9_:. -]{1,32}|[A-Z][A-Z0-9_]{0,55}|command:[A-Z0-9_]{1,55}")
@@ -102,8 +104,7 @@ def _fleet(file: Sections, states: Path) -> FleetConfig:
         policies=MappingProxyType(policies),
         relays=tuple(relay.valid["name"] for relay in file.used_relays),
         state_file=states / f"{file.top.valid['name']}.fleet-state",
-        member_most_peers=limits.member_max_peers,
-        member_limits=RelayLimits(limits.member_datagrams_s, limits.member_bits_s),
+        member_limits=_limits(limits.member_bits_s),
     )
 
 
@@ -292,10 +293,14 @@ def _relay_server(file: Sections) -> RelayServer | None:
     link = replace(link_of(LinkSection(file.link.valid)), features=c.FEATURE_RECORDS)
     link = fleet_link(link) if file.has_fleet else link
     every = tuple(_member(file, section, link) for section in file.members)
-    return RelayServer(every, RelayLimits(keys.datagrams_s, keys.bits_s), keys.https)
+    return RelayServer(every, _limits(keys.bits_s), keys.https)
 
 
 def _member(file: Sections, section: Values, link: Link) -> MemberSettings:
     keys = MemberSection(section.valid)
     peer = PeerSettings(keys.name, keys.public_key, file.secret(section, "psk_file"), link, initiates=False)
-    return MemberSettings(peer, keys.max_peers, RelayLimits(keys.datagrams_s, keys.bits_s))
+    return MemberSettings(peer, keys.max_peers, _limits(keys.bits_s))
+
+
+def _limits(bits_s: int) -> RelayLimits:
+    return RelayLimits(max(1, bits_s // _BITS_OF_DATAGRAM), bits_s)

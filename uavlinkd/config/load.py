@@ -173,8 +173,6 @@ def _foreign_file(text: str) -> str | None:
             " have the same form: write PrivateKey to a file of mode 0600 and name it in private_key_file; write each"
             " PublicKey as public_key of a [[peer]]"
         )
-    if re.search(r"(?mi)^[ \t]*\[(UdpEndpoint|UartEndpoint|TcpEndpoint)\b", text):
-        return "is a file of mavlink-router, and uavlinkd has its own format: start from configs/drone0.toml"
     try:
         decode_key(text)
     except ValueError:

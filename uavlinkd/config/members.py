@@ -83,4 +83,4 @@ def _systems_of(peer: PeerConfig) -> frozenset[int]:
 def relay_member(fleet: FleetConfig, key: bytes, certificate: Certificate) -> MemberSettings:
     link = replace(fleet.link, features=c.FEATURE_RECORDS | c.FEATURE_FLEET)
     peer = PeerSettings(certificate.name, key, None, link, initiates=False, is_certified=True)
-    return MemberSettings(peer, fleet.member_most_peers, fleet.member_limits)
+    return MemberSettings(peer, CERTIFIED_PEERS, fleet.member_limits)

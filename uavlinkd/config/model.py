@@ -221,7 +221,6 @@ class FleetConfig:
     policies: Mapping[MemberRole, PolicyData]
     relays: tuple[str, ...]
     state_file: Path
-    member_most_peers: int
     member_limits: RelayLimits
 
     def contact(self, key: bytes) -> ContactConfig | None:

@@ -251,6 +251,11 @@ _REMOVED = {
     **dict.fromkeys(("deny_in", "deny_out"), INSTEAD_OF_DENIAL),
     "recording": "run `uavlinkd record URL FILE` beside the daemon",
     "mac_key_bits": "delete the line: every HMAC key has 256 bits, and a longer one was no stronger",
+    **dict.fromkeys(
+        ("datagrams_s", "member_datagrams_s"),
+        "delete the line: a relay passes one datagram for each 10,000 bits of bits_s or member_bits_s",
+    ),
+    "member_max_peers": "delete the line: each member of a fleet may ask a relay for all others",
     "metrics": "delete [metrics]; `uavlinkd web` serves http://127.0.0.1:8790/metrics",
 }
 """Keys and sections that files of earlier versions may have."""

@@ -32,10 +32,9 @@ def members(file: Sections) -> Found:
             "has no effect, because the file has no [[member]]: write one with name and public_key for each daemon"
             " that may use this relay",
         )
-    for key in ("member_max_peers", "member_datagrams_s", "member_bits_s"):
-        if key in file.relay_server.valid and file.is_relay and not file.has_fleet:
-            text = "is for members by certificate, but the file has no [fleet]: write the limit in each [[member]]"
-            yield f"relay_server.{key}", text
+    if "member_bits_s" in file.relay_server.valid and file.is_relay and not file.has_fleet:
+        text = "is for members by certificate, but the file has no [fleet]: write bits_s in each [[member]]"
+        yield "relay_server.member_bits_s", text
 
 
 def _of_peer(section: Values, peer: Values) -> Found:

@@ -45,7 +45,6 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
 _INTERFACE = re.compile(r"[^\s/:]{1,15}")  # as dev_valid_name() of Linux
 # A complete or nearly complete key in base64 or hex: no message repeats it.
 _LIKE_A_KEY = re.compile(r"[A-Za-z0-9+/_-]{40,}={0,2}")
-_SMALL_GROUP = re.compile(r"(?:modp|ffdhe?|dhe?)?[-_ ]?(?:512|768|1024)")
 _HTTPS = '{ listen = "0.0.0.0:443", certificate = "tls.crt", key = "tls.key" }'
 ENROLL_AGAIN = "run `uavlinkd enroll --finish` again with the line of `uavlinkd fleet sign`"
 LEAST_BUDGET = 1000
@@ -99,11 +98,6 @@ def _suite(value: Any) -> Suite:
     text = _text(value).strip().lower()
     if (suite := SUITES_BY_NAME.get(text)) and text == value:
         return suite
-    if _SMALL_GROUP.fullmatch(text):
-        raise ValueError(
-            "is a Diffie-Hellman group of 1024 bits or less: one long computation in advance, which a state"
-            ' can afford, breaks every exchange in it (Logjam, 2015); write "x25519", or "ffdhe2048" and above'
-        )
     names = ", ".join(SUITES_BY_NAME)
     raise ValueError(f"is not a suite: write one of {names}")
 
@@ -307,16 +301,12 @@ class RelaySection(KeySection):
 
 class MemberSection(KeySection):
     max_peers: int = key(integer(1, 4000), 256)
-    datagrams_s: int = key(integer(1, 10**6), 2000)
     bits_s: int = key(integer(LEAST_BUDGET, 10**10), 20_000_000, "20_000_000")
 
 
 class RelayServerSection(Section):
     https: HttpsServer | None = key(parsed(_https), None, _HTTPS)
-    datagrams_s: int = key(integer(1, 10**6), 10**6, "100_000")
     bits_s: int = key(integer(LEAST_BUDGET, 10**10), 10**10, "100_000_000")
-    member_max_peers: int = key(integer(1, 4000), 256)
-    member_datagrams_s: int = key(integer(1, 10**6), 2000)
     member_bits_s: int = key(integer(LEAST_BUDGET, 10**10), 20_000_000, "20_000_000")
 
 
