@@ -290,7 +290,6 @@ def test_readable_links_of_members_are_warned_of(tmp_path: Path) -> None:
         (fleet(more=_ROLE + "rate_in = { PING = 0 }"), {"fleet_changed": ["policies"]}),
         (fleet(certificate(serial=9), news=bulletin(2)), {"fleet_changed": ["own", "bulletin"]}),
         (fleet() + _GS, {"peers_added": ["gs"], "fleet_changed": ["contacts"]}),
-        (fleet() + _R1, {"relays_added": ["r1"], "fleet_changed": ["contacts", "relays"]}),
     ],
 )
 def test_reload_changes_what_a_fleet_may_do(tmp_path: Path, after: str, changes: dict[str, list[str]]) -> None:
@@ -301,7 +300,9 @@ def test_reload_changes_what_a_fleet_may_do(tmp_path: Path, after: str, changes:
 
 
 def test_another_fleet_needs_a_restart(tmp_path: Path) -> None:
-    """Another authority, or one where there was none."""
+    """Another authority, or one where there was none; and another relay."""
     config = load_member(tmp_path, member_file(fleet()))
-    with pytest.raises(ConfigError, match=r"fleet\.authority: cannot change while the daemon runs"):
+    with pytest.raises(ConfigError, match=r"relay: has changed.*restart the daemon"):
+        compare(config, load_member(tmp_path, member_file(fleet() + _R1)))
+    with pytest.raises(ConfigError, match=r"fleet\.authority: has changed.*restart the daemon"):
         compare(replace(config, fleet=None), config)
