@@ -135,7 +135,7 @@ PLACES: Final[Sequence[Place]] = (
     Place("relay/service.py", "RelayService.do_housekeeping"),
     Place("relay/service.py", "RelayService.settle"),
     Place("link/findings.py", "find"),
-    Place("link/drop_summary.py", "DropSummary.check"),
+    Place("link/drop_log.py", "DropLog.check"),
     # The relay, the disk, and requests.
     Place("link/carrier.py", "FrameCarrier._unwrap"),
     Place("relay/forwarding.py", "Forwarding.take"),

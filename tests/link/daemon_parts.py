@@ -8,15 +8,14 @@ from types import SimpleNamespace
 from typing import Any
 
 from uavlinkd.core.node import Node
-from uavlinkd.link.evidence import Evidence, History
+from uavlinkd.link.evidence import Evidence
+from uavlinkd.link.journal import Journal
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.mavlink.routing import Router
 from uavlinkd.system.addresses import Address
 
 
-def parts_of(
-    node: Node, links: Mapping[str, PeerLink], evidence: Evidence, history: History, router: Router[Any] | None = None
-) -> Any:
+def parts_of(node: Node, links: Mapping[str, PeerLink], evidence: Evidence, router: Router[Any] | None = None) -> Any:
     """As :class:`uavlinkd.link.parts.DaemonParts`; every network is well."""
     sockets = SimpleNamespace(
         unresolved=lambda name: set[str](),
@@ -42,7 +41,7 @@ def parts_of(
         node=node,
         peer_sockets=sockets,
         evidence=evidence,
-        history=history,
+        journal=Journal(),
         relays=SimpleNamespace(by_name={}),
         relay=None,
         fleet=None,

@@ -28,8 +28,8 @@ from uavlinkd.link.conditions import (
     Phase,
 )
 from uavlinkd.link.event_log import ENDED_PROBLEMS, ENDPOINT_DELAY_S, FINDING_DELAY_S, EventLog
-from uavlinkd.link.evidence import History
 from uavlinkd.link.finding import Finding, Severity, Subject
+from uavlinkd.link.journal import Journal
 
 BEGAN, CONTINUED, ENDED = Phase
 
@@ -302,11 +302,11 @@ async def test_problems_of_a_refused_configuration_control_no_terminal(monkeypat
         )
 
     monkeypatch.setattr(daemon, "load_in_thread", refuse)
-    parts = SimpleNamespace(config=SimpleNamespace(path="a.toml"), local=None, history=History(0.0))
+    parts = SimpleNamespace(config=SimpleNamespace(path="a.toml"), local=None, journal=Journal())
     stub = SimpleNamespace(parts=parts, log=structlog.get_logger())
     with capture_logs() as lines, pytest.raises(ConfigError):
         await daemon.Daemon._apply_file(cast(daemon.Daemon, stub))
     ((problems, event),) = [(line["problems"], line["event"]) for line in lines]
     assert event == "configuration_refused"
-    assert parts.history.refused_file == problems
+    assert parts.journal.refused_file == problems
     assert problems == [r"a\x1b]0;owned\x07.toml:1:1: name: is missing", "b.toml: empty"]

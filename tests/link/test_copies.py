@@ -12,7 +12,7 @@ from tests.samples import attitude, battery, command, heartbeat, manual_control,
 from uavlinkd.core.outputs import Transmit
 from uavlinkd.core.path import Path
 from uavlinkd.link.copies import DEBT_S, LEAST_BITS_S, MAX_WAIT_S, MAX_WAITING_BYTES, Copies
-from uavlinkd.link.drop_summary import ShellReason
+from uavlinkd.link.journal import ShellReason
 from uavlinkd.link.networks import NetworkBudget, wire_bytes
 from uavlinkd.mavlink.frames import Frame
 

@@ -23,12 +23,10 @@ from uavlinkd.link.evidence import (
     EVIDENCE_S,
     MAX_DETAILS,
     PLACES_S,
-    REMEMBERED_S,
     REPORTED,
     Evidence,
-    History,
-    RecentGrowth,
 )
+from uavlinkd.link.history import REMEMBERED_S, History, RecentGrowth
 from uavlinkd.link.peer_link import Carriage, PeerLink
 from uavlinkd.mavlink.frames import SplitCounters, split_payload
 from uavlinkd.mavlink.policy.compilation import Policy

@@ -28,10 +28,11 @@ from uavlinkd.core.refusals import RefusalReport, Refused
 from uavlinkd.core.sessions import Twin
 from uavlinkd.core.settings import PeerSettings
 from uavlinkd.endpoints.url import parse_url
-from uavlinkd.link.evidence import EVIDENCE_S, HIDDEN_LEAST, REPORTED, History
+from uavlinkd.link.evidence import EVIDENCE_S, REPORTED
 from uavlinkd.link.facts import ICMP_S
 from uavlinkd.link.finding import Finding, Severity, Subject
 from uavlinkd.link.findings import ROWS, Exit, find, has_no_client, own_codes, stop_frames
+from uavlinkd.link.history import HIDDEN_LEAST, History
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.signs import SECURITY_S, is_contested
 from uavlinkd.link.traffic_signs import PROBLEMS
@@ -56,14 +57,14 @@ class Daemon(Scene):
         self.now = NOW
         self.history = History(0.0)
         self.router = Router[Any]()
-        self.parts = parts_of(self.node, self.links, self.evidence, self.history, self.router)
+        self.parts = parts_of(self.node, self.links, self.evidence, self.router)
         self.parts.config.public_key = OWN_KEY
         self.sockets: Any = self.parts.peer_sockets
         self.local: list[Any] = self.parts.local.endpoints
 
     def findings(self, now: float | None = None) -> dict[str, Finding]:
         """The findings, by cause."""
-        findings = find(self.parts, self.now if now is None else now)
+        findings = find(self.parts, self.history, self.now if now is None else now)
         assert findings == sorted(findings, key=lambda one: one.severity)
         return {finding.cause: finding for finding in findings}
 
@@ -284,8 +285,8 @@ def test_problems_of_the_daemon(daemon: Daemon) -> None:
     """Bare MAVLink, a pause, and a refused file."""
     daemon.set_up(role="all", system_ids="all")
     daemon.dropped(DropReason.RAW_MAVLINK, STRANGER)
-    daemon.history.paused = NOW, 4.0
-    daemon.history.refused_file = ["drone0.toml: link.tag_bits: must be 64, 96 or 128", "another"]
+    daemon.parts.journal.paused = NOW, 4.0
+    daemon.parts.journal.refused_file = ["drone0.toml: link.tag_bits: must be 64, 96 or 128", "another"]
     findings = daemon.findings()
     assert set(findings) == {"configuration_refused", "raw_mavlink", "daemon_paused"}
     assert {finding.severity for finding in findings.values()} == {Severity.WARNING}
@@ -346,7 +347,7 @@ def test_autopilot_with_anforeign_system_id(daemon: Daemon, owner: int, remedy: 
         "set MAV_SYSID (ArduPilot; before 4.7 SYSID_THISMAV) or MAV_SYS_ID (PX4)" in findings["foreign_system"].remedy
     )
     assert remedy in findings["foreign_system"].remedy
-    found = find(daemon.parts, daemon.now)
+    found = find(daemon.parts, daemon.history, daemon.now)
     assert own_codes(found, is_cut_off=False) == [1], "its peers see that it refuses its own autopilot"
     assert not own_codes([one._replace(subject=Subject.PEER) for one in found], is_cut_off=False)
 
@@ -466,7 +467,7 @@ def test_key_on_two_machines_is_named_for_ten_minutes(daemon: Daemon) -> None:
     peer.sessions.twins = {Twin.PEERS: NOW}
     member = SimpleNamespace(peer=peer, peers=[peer], is_own=True, settings=SimpleNamespace(name="member"))
     daemon.parts.relay = SimpleNamespace(members={1: member, 2: SimpleNamespace(peer=peer, is_own=False)})
-    here, of_peer = [one for one in find(daemon.parts, NOW) if one.cause == "key_on_two_machines"]
+    here, of_peer = [one for one in find(daemon.parts, daemon.history, NOW) if one.cause == "key_on_two_machines"]
     assert "the private key of a member: member, from 192.0.2.1:1, 192.0.2.1:2;" in here.text
     assert of_peer.name == "drone1"
 
@@ -487,12 +488,12 @@ def test_frames_cannot_pass_without_any_client(daemon: Daemon, url: str, cause: 
     for name in ("autopilot", "companion"):
         daemon.local.append(SimpleNamespace(name=name, ports=[]))
         daemon.parts.config.endpoints.append(SimpleNamespace(name=name, url=parse_url(url), policy={}))
-    assert not has_no_client(find(daemon.parts, 4.9), 2)
-    found = find(daemon.parts, 5.0)
+    assert not has_no_client(find(daemon.parts, daemon.history, 4.9), 2)
+    found = find(daemon.parts, daemon.history, 5.0)
     assert [one.cause for one in found if one.subject is Subject.ENDPOINT] == [cause, cause]
     assert has_no_client(found, 2)
     daemon.local[0].ports = [SimpleNamespace(name="127.0.0.1:40000")]
-    found = find(daemon.parts, 5.0)
+    found = find(daemon.parts, daemon.history, 5.0)
     assert "client_silent" in {one.cause for one in found}
     assert not has_no_client(found, 2)
     assert not has_no_client([], 0)
@@ -520,7 +521,7 @@ def test_a_daemon_reports_its_own_problems_only(daemon: Daemon) -> None:
     url = parse_url("udpin:127.0.0.1:14550")
     daemon.parts.config.endpoints.append(SimpleNamespace(name="autopilot", url=url, policy={}))
     daemon.set_up(role="all", system_ids="all").peer.problem_claim = ProblemClaim((1,), 6.0)
-    found = find(daemon.parts, 6.0)
+    found = find(daemon.parts, daemon.history, 6.0)
     assert own_codes(found, is_cut_off=has_no_client(found, 1)) == [2]
     text = (ROOT / "uavlinkd/core/README.md").read_text().partition("### Problem reports")[2].partition("\n## ")[0]
     assert {int(code): name for code, name in re.findall(r"\| (\d+) \| `(\w+)`", text)} == {

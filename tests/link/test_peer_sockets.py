@@ -18,7 +18,6 @@ import structlog
 from structlog.testing import capture_logs
 
 from tests.link.socket_states import SocketStateLog
-from tests.link.test_drop_summary import Recorder
 from tests.needs import need
 from tests.waiting import until
 from uavlinkd.config.model import NetworkConfig, PeerAddress
@@ -27,8 +26,8 @@ from uavlinkd.core.relay_records import wrap
 from uavlinkd.endpoints.reader import PAUSE_S
 from uavlinkd.endpoints.sockets import BUFFER_BYTES, Presence
 from uavlinkd.link import networks as module
-from uavlinkd.link.drop_summary import EVERYDAY_ERRORS, DropSummary
 from uavlinkd.link.evidence import Evidence
+from uavlinkd.link.journal import Journal
 from uavlinkd.link.peer_names import REFRESH_S
 from uavlinkd.link.peer_sockets import RELAY_BUFFER_BYTES, PeerSockets
 from uavlinkd.system.addresses import Address
@@ -60,7 +59,7 @@ class Refusing:
         """As a socket's."""
 
 
-def sockets_with(sock: Refusing, drops: DropSummary) -> PeerSockets:
+def sockets_with(sock: Refusing, drops: Journal) -> PeerSockets:
     """The sockets of a daemon, of which this is the only one."""
     stall = StallWatch(0.0, lambda seconds: None)
     sockets = PeerSockets(stall, drops, Evidence({}, b""), structlog.get_logger(), SocketStateLog())
@@ -71,22 +70,20 @@ def sockets_with(sock: Refusing, drops: DropSummary) -> PeerSockets:
 
 @pytest.mark.parametrize("name", ["ENOBUFS", "ENOMEM", "EPERM", "ENETUNREACH", "EAGAIN"])
 def test_what_is_not_taken_is_counted_and_the_next_is_sent(name: str) -> None:
-    """A line for a rare error, a count for each, and datagrams go on when there is room again."""
-    log, sock = Recorder(), Refusing(getattr(errno, name))
-    sockets = sockets_with(sock, DropSummary(cast(Any, log)))
+    """A count for each, and datagrams go on when there is room again."""
+    journal, sock = Journal(), Refusing(getattr(errno, name))
+    sockets = sockets_with(sock, journal)
     for _ in range(3):
         sockets.send(b"lost", Path(0, ("127.0.0.1", 9)))
     sock.is_out = False
     sockets.send(b"there", Path(0, ("127.0.0.1", 9)))
     assert sock.sent == [b"there"]
-    assert sockets.failures == {name: 3}
-    logged = [] if name in EVERYDAY_ERRORS else [("sends_failed", name)]
-    assert [(event, fields["reason"]) for event, fields in log.lines] == logged
+    assert sockets.failures == {name: 3} == journal.totals
 
 
 def test_relayed_path_goes_to_the_relay_or_nowhere() -> None:
     """Wrapped, along the same socket. Without its handle nothing is sent: its host is not a name to look up."""
-    drops = DropSummary(structlog.get_logger())
+    drops = Journal()
     sock = Refusing(errno.EPERM)
     sock.is_out = False
     sockets = sockets_with(sock, drops)
@@ -103,7 +100,7 @@ async def test_sockets_of_a_relay_have_room_for_longer_bursts(*, is_relay: bool)
     """As far as the kernel grants it."""
     log = structlog.get_logger()
     stall = StallWatch(0.0, lambda _: None)
-    sockets = PeerSockets(stall, DropSummary(log), Evidence({}, b""), log, SocketStateLog())
+    sockets = PeerSockets(stall, Journal(), Evidence({}, b""), log, SocketStateLog())
     sockets.pause_s = 0.0 if is_relay else PAUSE_S
     sockets.open([Address("127.0.0.1", 0)])
     sockets.start(lambda *_: None)
@@ -145,7 +142,7 @@ class Scene:
     def __init__(self) -> None:
         self.present = dict(HERE)
         self.core = SocketStateLog()
-        self.drops = DropSummary(structlog.get_logger())
+        self.drops = Journal()
         stall = StallWatch(0.0, lambda seconds: None)
         log = structlog.get_logger()
         self.sockets = PeerSockets(stall, self.drops, Evidence({}, b""), log, self.core)

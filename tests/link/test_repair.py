@@ -10,7 +10,7 @@ from uavlinkd.core.outputs import Transmit
 from uavlinkd.core.path import Path
 from uavlinkd.core.path_state import PathCondition, PathState
 from uavlinkd.link.copies import AVERAGE_S, HOLD_S, KNOWN_S, LEAST_BITS_S, MAX_ENVELOPES, SPACING_S, Copies, Repair
-from uavlinkd.link.drop_summary import ShellReason
+from uavlinkd.link.journal import ShellReason
 from uavlinkd.link.networks import NetworkBudget
 from uavlinkd.mavlink.frames import Frame
 

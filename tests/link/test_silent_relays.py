@@ -106,7 +106,7 @@ def test_relay_with_a_url_alone(member: Member, state: str, text: str, remedy: s
     other = member.add_relay("two", FIRST)
     texts = [one.text for one in member.findings(LATER).values()]
     assert len(texts) == 1, "relays on two hosts, of which one has no address for UDP, show nothing about UDP"
-    assert other in Moment(member.parts, LATER).silent_relays
+    assert other in Moment(member.parts, member.history, LATER).silent_relays
 
 
 def test_icmp_messages_are_answers(member: Member) -> None:
@@ -115,10 +115,12 @@ def test_icmp_messages_are_answers(member: Member) -> None:
     member.add_relay("two", SECOND)
     for error, place in (("ECONNREFUSED", FIRST), ("EHOSTUNREACH", SECOND)):
         member.evidence.add_error(f"icmp_{error}", place, LATER)
-    texts = [one.text for one in find(member.parts, LATER)]
+    texts = [one.text for one in find(member.parts, member.history, LATER)]
     assert "203.0.113.1:5790: no process listens there now (ECONNREFUSED, ICMP)" in texts[0]
     assert "203.0.113.2:5790: no machine answers at the address (EHOSTUNREACH, ICMP)" in texts[1]
-    assert all("a firewall drops UDP here or there" in one.text for one in find(member.parts, LATER + 6.0))
+    assert all(
+        "a firewall drops UDP here or there" in one.text for one in find(member.parts, member.history, LATER + 6.0)
+    )
 
 
 def test_a_relay_that_no_peer_needs_is_a_warning(member: Member) -> None:

@@ -13,7 +13,6 @@ from typing import Any, cast
 import pytest
 
 from tests.link.socket_states import SocketStateLog
-from tests.link.test_drop_summary import Recorder
 from tests.waiting import Stopwatch, until
 from uavlinkd.config.model import HttpsServer
 from uavlinkd.core.path import Path, SocketAddress
@@ -21,7 +20,7 @@ from uavlinkd.endpoints.sockets import BindError
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.link import newcomers
 from uavlinkd.link import web_listener as module
-from uavlinkd.link.drop_summary import DropSummary
+from uavlinkd.link.journal import Journal
 from uavlinkd.link.web_listener import WebListener
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic
@@ -40,10 +39,10 @@ class Port:
     def __init__(self) -> None:
         self.node = SocketStateLog()
         self.node.peers = {}
-        self.log = Recorder()
+        self.journal = Journal()
         config = HttpsServer(Address("127.0.0.1", free_port()))
         stall = StallWatch(monotonic(), lambda seconds: None)
-        self.listener = WebListener(config, NUMBER, self.node, stall, DropSummary(cast(Any, self.log)))
+        self.listener = WebListener(config, NUMBER, self.node, stall, self.journal)
         self.received: list[tuple[bytes, SocketAddress]] = []
         self._clients: list[socket.socket] = []
 
@@ -129,7 +128,7 @@ async def test_newest_stranger_displaces_the_oldest_that_is_not_proved(monkeypat
         assert await is_ended(stranger)
         assert relay.counts == (3, 2)
         assert relay.refused == {"displaced": 1}
-        assert [line[1]["reason"] for line in relay.log.lines] == ["displaced"]
+        assert [*relay.journal.totals] == ["displaced"]
 
 
 async def test_connections_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -289,7 +288,7 @@ async def test_stranger_sends_few_messages(monkeypatch: pytest.MonkeyPatch) -> N
         assert await is_ended(stranger)
         assert relay.refused == {"flood": 1}
         assert sum(at == stranger.getsockname() for _, at in relay.received) <= 3
-        assert [line[1]["reason"] for line in relay.log.lines] == ["flood"]
+        assert [*relay.journal.totals] == ["flood"]
 
 
 async def test_connection_without_its_proof_is_a_strangers(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -361,7 +360,7 @@ def test_certificate_that_vanished_is_a_problem_at_the_start(tmp_path: Any) -> N
     """It was there when the file was read."""
     config = HttpsServer(Address("127.0.0.1", free_port()), tmp_path / "tls.crt", tmp_path / "tls.key")
     with pytest.raises(BindError, match=r"relay_server\.https: certificate .* cannot be read"):
-        WebListener(config, 0, SocketStateLog(), StallWatch(0.0, lambda _: None), DropSummary(cast(Any, Recorder())))
+        WebListener(config, 0, SocketStateLog(), StallWatch(0.0, lambda _: None), Journal())
 
 
 @pytest.mark.parametrize(

@@ -32,10 +32,12 @@ from uavlinkd.core.outputs import CertificateShown, Deliver, Dropped, Output, Re
 from uavlinkd.core.settings import Class
 from uavlinkd.lab.mitm.radio import RadioSettings
 from uavlinkd.link.conditions import HOUR_S, LineLimits
-from uavlinkd.link.drop_summary import DropSummary
+from uavlinkd.link.drop_log import DropLog
 from uavlinkd.link.event_log import EventLog
-from uavlinkd.link.evidence import Evidence, History
+from uavlinkd.link.evidence import Evidence
 from uavlinkd.link.findings import find
+from uavlinkd.link.history import History
+from uavlinkd.link.journal import Journal
 from uavlinkd.link.peer_link import Carriage, PeerLink
 from uavlinkd.mavlink.headers import Header
 from uavlinkd.mavlink.policy.gate import Refusal
@@ -59,14 +61,15 @@ class LoggedDaemon:
         log = structlog.wrap_logger(
             None, processors=[self.captured], wrapper_class=structlog.make_filtering_bound_logger(logging.DEBUG)
         )
-        self.drops, self.events = DropSummary(log, limits), EventLog(log, limits)
+        self.journal = Journal()
+        self.drops, self.events = DropLog(log, self.journal, limits), EventLog(log, limits)
         carriage = Carriage(drone.node, lambda _: None)
         self.links = {
             one.name: PeerLink(PeerConfig(one.settings, (), TRUSTED), one, carriage, now)
             for one in drone.node.peers.values()
         }
         self._evidence, self._history = Evidence(self.links, drone.public_key), History(now)
-        self._parts = parts_of(drone.node, self.links, self._evidence, self._history)
+        self._parts = parts_of(drone.node, self.links, self._evidence)
 
     @property
     def lines(self) -> list[MutableMapping[str, Any]]:
@@ -76,7 +79,7 @@ class LoggedDaemon:
         now = self._drone.local_now
         for output in outputs:
             if isinstance(output, Dropped):
-                self.drops.add_dropped(output, now)
+                self.journal.add_dropped(output, now)
                 self._evidence.add_dropped(output, now)
             elif not isinstance(output, Transmit | Deliver | RecordReceived | CertificateShown):
                 self.events.write(output, now)
@@ -86,11 +89,11 @@ class LoggedDaemon:
         now = self._drone.local_now
         self._history.sample(self.links.values(), [], now)
         for link in self.links.values():
-            self.drops.add("frames_withheld", Refusal.MESSAGE_NOT_ALLOWED, link.name, 100, now, ATTITUDE)
-            self.drops.add("frames_withheld", Refusal.RATE_LIMITED, link.name, 10, now, ATTITUDE)
+            self.journal.add("frames_withheld", Refusal.MESSAGE_NOT_ALLOWED, link.name, 100, now, ATTITUDE)
+            self.journal.add("frames_withheld", Refusal.RATE_LIMITED, link.name, 10, now, ATTITUDE)
             link.measure(now)
             self.events.check_link(link, now)
-        self.events.write_findings(find(self._parts, now), now)
+        self.events.write_findings(find(self._parts, self._history, now), now)
         self.drops.check(now)
         self.events.check(now)
 
@@ -147,11 +150,11 @@ def test_healthy_fleet_writes_less_than_a_line_an_hour() -> None:
         rekeys = {name: len(log.captured.entries) - len(log.lines) for name, log in network.logs.items()}
         print(f"{HOURS} h: {start} lines at the start, then {counts}; debug (rekeys): {rekeys}")
         for name, log in network.logs.items():
-            print(name, dict(Counter(line["event"] for line in log.lines)), log.drops.totals)
+            print(name, dict(Counter(line["event"] for line in log.lines)), log.journal.totals)
             assert [line for line in log.lines if line["log_level"] != "info"] == []
             assert start[name] <= 3 * 4, "two for each session, and two for what each role withholds"
             assert counts[name] <= HOURS
-            assert log.drops.totals["message_not_allowed"] >= 3 * 100 * (HOURS * HOUR_S / STEP_S - 1)
+            assert log.journal.totals["message_not_allowed"] >= 3 * 100 * (HOURS * HOUR_S / STEP_S - 1)
 
 
 @pytest.mark.long

@@ -21,7 +21,7 @@ from uavlinkd.core.relay_records import Bind, FleetRecord
 from uavlinkd.core.timers import Schedule
 from uavlinkd.core.wire import ENVELOPE_STARTS
 from uavlinkd.endpoints.reader import Datagrams
-from uavlinkd.link.drop_summary import ShellReason
+from uavlinkd.link.journal import ShellReason
 from uavlinkd.link.parts import DaemonParts
 from uavlinkd.link.peer_link import Carriage, PeerLink
 from uavlinkd.link.peers import Peers
@@ -259,7 +259,7 @@ class FrameCarrier:
                         came, frames = len(frames), link.pick_newest(frames, order, self._read_at)
                         if count := came - len(frames):
                             reason = ShellReason.SUPERSEDED
-                            self._parts.drops.add("frames_dropped", reason, link.name, count, monotonic())
+                            self._parts.journal.add("frames_dropped", reason, link.name, count, monotonic())
                     elif link.output.repair.is_on:
                         link.note_requests(frames, self._read_at)
                     if link in self._frames:
@@ -268,7 +268,7 @@ class FrameCarrier:
                         self._frames[link] = frames
                 elif isinstance(output, o.Dropped):
                     now = monotonic()
-                    self._parts.drops.add_dropped(output, now)
+                    self._parts.journal.add_dropped(output, now)
                     self._parts.evidence.add_dropped(output, now)
                 elif isinstance(output, o.RecordReceived):
                     self._on_record(output)
@@ -295,7 +295,7 @@ class FrameCarrier:
         """Count a datagram that the core does not drop."""
         self._node.drops[reason] += 1
         fact = "" if path is None else ("", path)
-        self._parts.drops.add("datagrams_dropped", reason, name, 1, monotonic(), fact)
+        self._parts.journal.add("datagrams_dropped", reason, name, 1, monotonic(), fact)
 
     def _on_record(self, received: o.RecordReceived) -> None:
         relay, fleet = self._parts.relay, self._parts.fleet
@@ -327,7 +327,7 @@ class FrameCarrier:
         run(parts.relays.on_event, event, now)
         link = self._links.get(event.peer)
         if link is not None and not isinstance(event, o.PathSuspected):
-            run(parts.events.write, event, now)
+            run(parts.journal.write, event, now)
             if isinstance(event, o.PeerLost | o.PeerClosed):
                 link.on_down(now, is_closed=isinstance(event, o.PeerClosed))
             elif not isinstance(event, o.PeerUp):

@@ -22,7 +22,7 @@ from uavlinkd.core.constants import TRANSMISSIONS
 from uavlinkd.core.outputs import Transmit
 from uavlinkd.core.path import Path
 from uavlinkd.core.path_state import PathCondition, PathState
-from uavlinkd.link.drop_summary import ShellReason
+from uavlinkd.link.journal import ShellReason
 from uavlinkd.link.networks import LARGEST_BYTES, NetworkBudget, wire_bytes
 from uavlinkd.mavlink.dialect import Lane
 from uavlinkd.mavlink.egress.bucket import Bucket

@@ -6,7 +6,6 @@ import asyncio
 import os
 from collections import Counter
 from contextlib import suppress
-from math import inf
 from typing import TYPE_CHECKING
 
 import structlog
@@ -15,8 +14,8 @@ from uavlinkd.config.changes import compare
 from uavlinkd.config.load import load_in_thread
 from uavlinkd.config.model import Config, ConfigError
 from uavlinkd.link.carrier import FrameCarrier
-from uavlinkd.link.findings import find, has_no_client, own_codes
 from uavlinkd.link.local_endpoints import PilotNotes
+from uavlinkd.link.observer import Observer
 from uavlinkd.link.parts import DaemonParts
 from uavlinkd.link.peer_link import radio_figures
 from uavlinkd.link.relay_link import RelayLink
@@ -52,6 +51,7 @@ class Daemon:
         self.log = structlog.get_logger().bind(daemon=config.name)
         self._loop = asyncio.get_running_loop()
         self.parts = DaemonParts(config, self.log, monotonic(), self._perform)
+        self.observer = Observer(self.parts, self.log, monotonic())
         self.carrier = FrameCarrier(self.parts)
         self._notes = PilotNotes(self.parts.switch.router.addresses)
         self._housekeeping: asyncio.TimerHandle | None = None
@@ -126,14 +126,10 @@ class Daemon:
         if parts.fleet is not None:
             await parts.fleet.stop()
         now = monotonic()
-        for link in parts.links.values():
-            parts.events.check_link(link, now)
-        parts.drops.close()
-        parts.events.close()
         problems = Counter[str]()
         for link in parts.links.values():
             problems.update({problem.value: count for problem, count in link.problems(now).items()})
-        counted = {**parts.drops.plain_totals(), **+problems, **parts.peer_sockets.serial.totals}
+        counted = {**self.observer.close(now), **+problems, **parts.peer_sockets.serial.totals}
         self.log.info("daemon_stopped", uptime_s=round(now - parts.started_at, 1), counted=counted)
 
     def _close_sockets(self) -> None:
@@ -151,11 +147,11 @@ class Daemon:
         parts = self.parts
         match request.partition(" "):
             case ("status", "", ""):
-                return daemon_status(parts, monotonic()) | {"is_stuck": self._is_stuck}
+                return daemon_status(self.observer, monotonic()) | {"is_stuck": self._is_stuck}
             case ("overview", _, names):
-                return overview(parts, monotonic(), names.split())
+                return overview(self.observer, monotonic(), names.split())
             case ("problems", "", ""):
-                return {"problems": parts.events.problems(monotonic())}
+                return {"problems": self.observer.events.problems(monotonic())}
             case ("reload", "", ""):
                 try:
                     await self.reload()
@@ -207,10 +203,10 @@ class Daemon:
             config = await load_in_thread(before.path, os.environ)
             changes = compare(before, config)
         except ConfigError as error:
-            self.parts.history.refused_file = problems = [printable(line) for line in str(error).split("\n")]
+            self.parts.journal.refused_file = problems = [printable(line) for line in str(error).split("\n")]
             self.log.error("configuration_refused", problems=problems)
             raise
-        self.parts.history.refused_file = []
+        self.parts.journal.refused_file = []
         try:
             self.carrier.peers.follow(config, changes)
             for endpoint in changes.changed_endpoints:
@@ -239,9 +235,7 @@ class Daemon:
         for link in links:
             run(link.measure, now)
             run(link.report_refusals, now)
-            run(parts.events.check_link, link, now, most=inf)
-        endpoints = [(one, parts.local.policies[one.name]) for one in parts.local.endpoints]
-        run(parts.history.sample, links, endpoints, now, most=inf)
+        self.observer.sample(now)
         run(parts.local.do_housekeeping, radio_figures(links), now)
         run(parts.local.write_note, self._notes.next(links, now), now)
         self._reporting = self._loop.call_soon(self._report, now)  # datagrams must not wait for all of it
@@ -261,22 +255,14 @@ class Daemon:
             relay.introductions.renew(parts.fleet.trust.held)
         relay.do_housekeeping(now)
         for reason, name, count in relay.count_drops():
-            parts.drops.add("datagrams_dropped", reason, name, count, now)
+            parts.journal.add("datagrams_dropped", reason, name, count, now)
 
     def _report(self, now: float) -> None:
         """Report what is wrong. A fault here ends no process that carries frames."""
-        parts, links = self.parts, self.parts.links.values()
-        run(self._find, now, most=inf)
-        codes = own_codes(parts.findings, is_cut_off=has_no_client(parts.findings, len(parts.local.endpoints)))
-        for link in links:
+        codes = self.observer.report(now)
+        for link in self.parts.links.values():
             run(link.report_problems, codes, now)
-        run(parts.drops.check, now, most=inf)
-        run(parts.events.check, now, most=inf)
         self.carrier.arm()
-
-    def _find(self, now: float) -> None:
-        findings = self.parts.findings = find(self.parts, now)
-        self.parts.events.write_findings(findings, now)
 
 
 def ping(parts: DaemonParts, carrier: FrameCarrier, name: str, now: float) -> dict[str, object]:

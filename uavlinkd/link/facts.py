@@ -14,6 +14,7 @@ from uavlinkd.core.path import Path, SocketAddress
 from uavlinkd.endpoints.ports import Endpoint
 from uavlinkd.endpoints.url import EndpointKind
 from uavlinkd.link.evidence import ELSEWHERE, REPORTED, Sighting
+from uavlinkd.link.history import History
 from uavlinkd.link.parts import DaemonParts
 from uavlinkd.link.peer_link import NOT_ANSWERING_S, PeerLink
 from uavlinkd.link.relay_link import RelayLink
@@ -41,8 +42,9 @@ _KERNEL_ERRORS: Final = frozenset(errno.errorcode.values())
 class Moment:
     """A daemon. Make one for all findings of a moment."""
 
-    def __init__(self, daemon: DaemonParts, now: float) -> None:
+    def __init__(self, daemon: DaemonParts, history: History, now: float) -> None:
         self.daemon = daemon
+        self.history = history
         self.now = now
         self.fields: Fields = {"here": daemon.config.name}
         self.down = [link for link in daemon.links.values() if not link.peer.is_up]
@@ -128,7 +130,7 @@ class PartFacts:
         self.name = name
         self.owner = name if kind == "peer" else f"{kind} {name}"
         """Its name among those that have system ids."""
-        self.history = moment.daemon.history.part(kind, name)
+        self.history = moment.history.part(kind, name)
         self.rules = rules
         """Its policy, as the file has it."""
         self.is_certified = False

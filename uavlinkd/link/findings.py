@@ -15,6 +15,7 @@ from uavlinkd.core.drops import DropReason
 from uavlinkd.link import signs, traffic_signs
 from uavlinkd.link.facts import EndpointFacts, Fields, Moment, PartFacts, PeerFacts
 from uavlinkd.link.finding import Finding, Severity, Subject
+from uavlinkd.link.history import History
 from uavlinkd.link.parts import DaemonParts
 from uavlinkd.mavlink.dialect import SYSTEM_ID
 
@@ -415,9 +416,9 @@ _STOPPING: Final = frozenset((row.cause, row.severity) for row in ROWS if row.ex
 _CODES: Final = {row.cause: row.code for row in ROWS if row.code}
 
 
-def find(daemon: DaemonParts, now: float) -> list[Finding]:
+def find(daemon: DaemonParts, history: History, now: float) -> list[Finding]:
     """All present findings: security first, then faults, then warnings; by subject and name among equals."""
-    moment = Moment(daemon, now)
+    moment = Moment(daemon, history, now)
     findings = [*_present(OF_DAEMON, moment, Subject.DAEMON, "")]
     for link in daemon.links.values():
         peer = PeerFacts(moment, link)

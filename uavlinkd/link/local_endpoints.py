@@ -13,7 +13,7 @@ from uavlinkd.endpoints.ports import Endpoint, LocalPort, PortHandler
 from uavlinkd.endpoints.sockets import BindError, udp_socket
 from uavlinkd.endpoints.udp import UdpClient, UdpServer
 from uavlinkd.endpoints.url import EndpointKind, NetworkUrl, SerialUrl
-from uavlinkd.link.event_log import EventLog
+from uavlinkd.link.journal import Journal
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.switch import Switch
 from uavlinkd.mavlink.dialect import IDS, KINDS, UNKNOWN, command_name, name_of
@@ -30,7 +30,6 @@ from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.delivery import Source
 from uavlinkd.mavlink.policy.gate import REFUSALS, Refusal
 from uavlinkd.mavlink.routing import SystemComponent
-from uavlinkd.system.clock import monotonic
 from uavlinkd.system.guard import run
 from uavlinkd.system.stall import StallWatch
 
@@ -66,7 +65,7 @@ def open_endpoint(config: EndpointConfig, handler: PortHandler) -> Endpoint:
 class LocalEndpoints:
     """Opens the endpoints, adds their clients to the switch, and sends them RADIO_STATUS."""
 
-    def __init__(self, name: str, switch: Switch, events: EventLog, stall: StallWatch) -> None:
+    def __init__(self, name: str, switch: Switch, journal: Journal, stall: StallWatch) -> None:
         """``name``: the daemon, as the source of its own frames."""
         self.endpoints: list[Endpoint] = []
         self.policies: dict[str, Policy] = {}
@@ -75,7 +74,7 @@ class LocalEndpoints:
         self.on_frames: Callable[..., None] = switch.forward
         """Of :class:`uavlinkd.endpoints.ports.PortHandler`, without a call in between."""
         self._switch = switch
-        self._events = events
+        self._journal = journal
         self._sources: dict[str, tuple[RadioStatusSource | None, StatusTextSource | None]] = {}
         self._own = Source(name, Policy({}, is_local=True).incoming)
 
@@ -125,11 +124,11 @@ class LocalEndpoints:
     def on_port_opened(self, port: LocalPort) -> None:
         """A local client connected: accept frames from it, and send frames to it."""
         self._switch.add(port, self.policies[port.endpoint.name])
-        run(self._events.write_client, "client_connected", port.endpoint.name, port.name, monotonic())
+        run(self._journal.write_client, "client_connected", port.endpoint.name, port.name)
 
     def on_port_closed(self, port: LocalPort) -> None:
         """A local client disconnected."""
-        run(self._events.write_client, "client_disconnected", port.endpoint.name, port.name, monotonic())
+        run(self._journal.write_client, "client_disconnected", port.endpoint.name, port.name)
         self._switch.remove(port)
 
     def on_port_silent(self, port: LocalPort) -> None:

@@ -12,12 +12,9 @@ from uavlinkd.config.model import Config
 from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import LinkedPeer, Output
 from uavlinkd.endpoints.ports import LocalPort
-from uavlinkd.link.conditions import LineLimits
-from uavlinkd.link.drop_summary import DropSummary
-from uavlinkd.link.event_log import EventLog
-from uavlinkd.link.evidence import Evidence, History
-from uavlinkd.link.finding import Finding
+from uavlinkd.link.evidence import Evidence
 from uavlinkd.link.fleet_members import FleetMembers
+from uavlinkd.link.journal import Journal
 from uavlinkd.link.local_endpoints import LocalEndpoints
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.peer_sockets import PeerSockets
@@ -57,18 +54,14 @@ class DaemonParts:
         self.link_of: dict[LinkedPeer, PeerLink] = {}
         """By each peer of the core that carries frames."""
         relay_links: dict[str, RelayLink] = {}
-        limits = LineLimits()
-        self.drops = DropSummary(log, limits)
-        self.guard = FaultGuard(log, self.drops.on_loop_failure)
+        self.journal = journal = Journal()
+        """What those that watch the daemon read."""
+        self.guard = FaultGuard(log, journal.on_loop_failure)
         self.evidence = Evidence(self.links, config.public_key, relay_links)
-        self.history = History(now)
-        self.findings: list[Finding] = []
-        """Those of the last look, at most a second ago."""
-        self.stall = StallWatch(now, self._on_pause)
-        self.peer_sockets = sockets = PeerSockets(self.stall, self.drops, self.evidence, log, node)
-        self.events = EventLog(log, limits, sockets.network_name)
-        self.switch = Switch(Router[PeerLink | LocalPort](relays=config.relays_frames), self.stall, self.drops)
-        self.local = LocalEndpoints(config.name, self.switch, self.events, self.stall)
+        self.stall = StallWatch(now, journal.on_pause)
+        self.peer_sockets = sockets = PeerSockets(self.stall, journal, self.evidence, log, node)
+        self.switch = Switch(Router[PeerLink | LocalPort](relays=config.relays_frames), self.stall, journal)
+        self.local = LocalEndpoints(config.name, self.switch, journal, self.stall)
         self.relays = Relays(node, sockets, self.links, relay_links, log)
         """Those that this daemon uses."""
         self.relay: RelayService | None = None
@@ -79,11 +72,7 @@ class DaemonParts:
                 clock=monotonic,
                 perform=perform,
                 send=sockets.send,
-                on_event=self.events.write,
+                on_event=journal.write,
             )
             self.relay = RelayService(node, config.relay_server.limits, shell)
             sockets.pause_s = 0.0
-
-    def _on_pause(self, pause_s: float) -> None:
-        self.history.paused = monotonic(), pause_s
-        self.events.write_pause(pause_s, monotonic())

@@ -55,8 +55,7 @@ class Peers:
         del parts.links[name]
         self._map_peers()
         self._note_delays()
-        parts.events.forget(name)
-        parts.drops.forget(name)
+        parts.journal.forget(name, is_removed=True)
 
     def change_peer(self, config: PeerConfig) -> None:
         """Apply other rules or addresses to the same identity. Its session continues."""
@@ -65,7 +64,7 @@ class Peers:
         link.change(config, monotonic())
         self._map_peers()
         parts.switch.set_policy(link, link.policy)
-        parts.drops.forget(config.name)  # the new policy may withhold other frames
+        parts.journal.forget(config.name, is_removed=False)
         self._note_delays()
         parts.peer_sockets.follow(link)
 

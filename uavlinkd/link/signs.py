@@ -113,13 +113,13 @@ def fault_inside(moment: Moment) -> Signs:
 
 
 def daemon_paused(moment: Moment) -> Signs:
-    paused = moment.daemon.history.paused
+    paused = moment.daemon.journal.paused
     if paused is not None and moment.now - paused[0] <= EVIDENCE_S:
         yield {"pause_s": paused[1]}
 
 
 def configuration_refused(moment: Moment) -> Signs:
-    if problems := moment.daemon.history.refused_file:
+    if problems := moment.daemon.journal.refused_file:
         yield {"problems": listed(problems, 1), "file": moment.daemon.config.path}
 
 

@@ -20,6 +20,7 @@ from uavlinkd.endpoints.ports import Endpoint
 from uavlinkd.link.finding import Finding
 from uavlinkd.link.findings import find, has_no_client, stop_frames
 from uavlinkd.link.fleet_members import FleetMembers
+from uavlinkd.link.observer import Observer
 from uavlinkd.link.parts import DaemonParts
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.relay_link import RelayLink
@@ -38,15 +39,15 @@ WayOf = Callable[[Path], tuple[str | None, SocketAddress | None]]
 _STATM = FilePath("/proc/self/statm")
 
 
-def overview(daemon: DaemonParts, now: float, detailed: Collection[str]) -> dict[str, object]:
+def overview(observer: Observer, now: float, detailed: Collection[str]) -> dict[str, object]:
     """The status with few facts of each peer, except of those that ``detailed`` names; findings are up to 1 s old.
 
     A page that 200 peers are on asks for it every second: the whole status would cost several percent of a core.
     """
-    return _status(daemon, now, daemon.findings, detailed)
+    return _status(observer, now, observer.findings, detailed)
 
 
-def daemon_status(daemon: DaemonParts, now: float) -> dict[str, object]:
+def daemon_status(observer: Observer, now: float) -> dict[str, object]:
     """The status of the whole daemon. Times are ages in seconds. A client computes rates from two of these.
 
     ``frames_pass``: every peer is up, within the last 10 s no traffic was wholly refused (``blocked`` names it),
@@ -54,7 +55,8 @@ def daemon_status(daemon: DaemonParts, now: float) -> dict[str, object]:
     (``contested``). ``stopped_there``: peers that say so of themselves; that is a claim, and health checks act on
     ``frames_pass``.
     """
-    status = _status(daemon, now, find(daemon, now), daemon.links)
+    daemon = observer.parts
+    status = _status(observer, now, find(daemon, observer.history, now), daemon.links)
     return status | {"process": _own_process() | {"uptime_s": now - daemon.started_at}}
 
 
@@ -72,10 +74,10 @@ def _own_process() -> dict[str, object]:
 
 
 def _status(
-    daemon: DaemonParts, now: float, findings: Sequence[Finding], detailed: Collection[str]
+    observer: Observer, now: float, findings: Sequence[Finding], detailed: Collection[str]
 ) -> dict[str, object]:
-    node = daemon.node
-    blocked = daemon.history.blocked(now)
+    daemon, node = observer.parts, observer.parts.node
+    blocked = observer.history.blocked(now)
     is_cut_off = has_no_client(findings, len(daemon.local.endpoints))
     contested = [name for name, link in daemon.links.items() if is_contested(link.peer, now)]
     all_up = (bool(daemon.links) or daemon.config.is_only_relay) and all(

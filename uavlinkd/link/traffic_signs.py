@@ -11,8 +11,8 @@ from typing import Final
 from uavlinkd.core import constants as c
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.refusals import Claim
-from uavlinkd.link.evidence import GateHistory
 from uavlinkd.link.facts import EndpointFacts, PartFacts, PeerFacts, listed
+from uavlinkd.link.history import GateHistory
 from uavlinkd.link.signs import SECURITY_S, Signs
 from uavlinkd.mavlink.dialect import command_name, name_of
 from uavlinkd.mavlink.egress.lanes import EgressDrop

@@ -2,51 +2,26 @@
 
 from __future__ import annotations
 
-import asyncio
-from collections import Counter, deque
+from collections import deque
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Final
 
 from structlog.typing import FilteringBoundLogger
 
 from uavlinkd.config.keys import encode_key
 from uavlinkd.core.constants import PROTOCOL_VERSION
-from uavlinkd.core.drops import Attention, Detail, DropReason, Reason
-from uavlinkd.core.outputs import Dropped
-from uavlinkd.core.path import Path
-from uavlinkd.endpoints.ports import failure_name
+from uavlinkd.core.drops import Attention, DropReason, Reason
 from uavlinkd.link.conditions import Conditions, LineLimits, OpenCondition, Phase
+from uavlinkd.link.journal import Fact, Journal, Key
 from uavlinkd.mavlink.dialect import name_of
 from uavlinkd.mavlink.headers import Header
 from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.ops.log import shown
-from uavlinkd.system.clock import monotonic
 from uavlinkd.system.error_meanings import meaning_of
 
 PERSISTENT_S = 5
 """An everyday drop is logged if it occurs in this many different seconds within :data:`WINDOW_S`."""
 WINDOW_S = 60.0
-
-Fact = str | Header | tuple[Detail, Path]
-"""What identifies the last drop of a line. It is formatted when the line is written, not for each drop of a flood."""
-Key = tuple[str, str, str]
-"""Event, reason, name of the peer or endpoint."""
-
-
-class ShellReason(Reason):
-    """Why the daemon drops frames and datagrams outside the core and the policies."""
-
-    STALE = ("stale", "the frames waited while the daemon was stopped or suspended")
-    SUPERSEDED = ("superseded", "newer states arrived first along another path of the peer", "", Attention.EXPLAINED)
-    COPY_OVER_BUDGET = ("copy_over_budget", "copies waited too long for a budget", "", Attention.EXPLAINED)
-    COPY_REPLACED = ("copy_replaced", "newer states replaced copies that waited", "", Attention.EXPLAINED)
-    RELAY_HANDLE_GONE = (
-        "relay_handle_gone",
-        "a datagram for a relay has a handle that the relay assigns no more",
-        "",
-        Attention.EVERYDAY,
-    )
-
 
 EVERYDAY_ERRORS: Final = ("EAGAIN", "ENOBUFS", "ECONNREFUSED")
 """Of the kernel: a short queue, or a peer that restarts, causes a few of them."""
@@ -82,13 +57,12 @@ class _Kind:
         return len(self.seconds) == PERSISTENT_S and now - self.seconds[0] <= WINDOW_S
 
 
-class DropSummary:
-    """Counts drops and writes their conditions. Memory is bounded: reasons are closed lists, names are configured."""
+class DropLog:
+    """Writes the conditions of drops. Memory is bounded: reasons are closed lists, names are configured."""
 
-    def __init__(self, log: FilteringBoundLogger, limits: LineLimits | None = None) -> None:
-        self.totals: Counter[str] = Counter()
-        """All drops by reason since the start, logged or not."""
+    def __init__(self, log: FilteringBoundLogger, journal: Journal, limits: LineLimits | None = None) -> None:
         self._log = log
+        self._journal = journal
         self._limits = limits or LineLimits()
         self._kinds: dict[Key, _Kind] = {}
         self._conditions = Conditions[Key](
@@ -101,54 +75,43 @@ class DropSummary:
 
     def plain_totals(self) -> dict[str, int]:
         """The totals with plain strings: a terminal's log shows members of an enumeration as code."""
-        return {str(reason): count for reason, count in self.totals.items()}
+        return {str(reason): count for reason, count in self._journal.totals.items()}
 
-    def add(self, event: str, reason: str, name: str, count: int, now: float, last: Fact = "") -> None:
-        """Count drops of a peer or endpoint. ``name`` is empty if the sender is unknown."""
-        self.totals[reason] += count
-        key = event, reason, name
-        kind = self._kinds.get(key)
-        if kind is None:
-            kind = self._kinds[key] = _Kind(reason, attention(event, reason))
-        kind.last = last
-        if kind.attention in (Attention.SECURITY, Attention.PROBLEM) or key in self._conditions:
-            self._conditions.note(key, now, count)
-        elif kind.attention is Attention.EVERYDAY:
-            kind.unlogged += count
-            if kind.persists(now):
-                self._conditions.note(key, now, kind.unlogged)
-                kind.unlogged = 0
-        elif (
-            kind.attention is Attention.DESIGN
-            and not kind.is_said
-            and (omitted := self._limits.take("withheld", name, now)) is not None
-        ):
-            kind.is_said = True
-            self._log.info(event, **self._facts(key), **omitted)
-
-    def add_dropped(self, dropped: Dropped, now: float) -> None:
-        """Count what the core dropped: a datagram, or outgoing frames."""
-        reason, peer, path, count, detail = dropped
-        name = "" if peer is None else peer.name
-        if path is None:
-            self.add("frames_dropped", reason, name, count, now)
-        else:
-            self.add("datagrams_dropped", reason, name, count, now, (detail, path))
-
-    def add_refused(self, name: str, header: Header, refusal: Refusal, now: float, *, to_them: bool) -> None:
-        """Count a frame that a policy refused: from the port of this name, or ``to_them``."""
-        self.add("frames_withheld" if to_them else "frames_refused", refusal, name, 1, now, header)
+    def _read(self) -> None:
+        """Note the drops since the last call."""
+        for key, tally in self._journal.take().items():
+            kind = self._kinds.get(key)
+            if kind is None:
+                kind = self._kinds[key] = _Kind(tally.reason, attention(key[0], tally.reason))
+            kind.last = tally.last
+            if kind.attention in (Attention.SECURITY, Attention.PROBLEM) or key in self._conditions:
+                self._conditions.note(key, tally.at, tally.count)
+            elif kind.attention is Attention.EVERYDAY:
+                kind.unlogged += tally.count
+                if kind.persists(tally.at):
+                    self._conditions.note(key, tally.at, kind.unlogged)
+                    kind.unlogged = 0
+            elif (
+                kind.attention is Attention.DESIGN
+                and not kind.is_said
+                and (omitted := self._limits.take("withheld", key[2], tally.at)) is not None
+            ):
+                kind.is_said = True
+                self._log.info(key[0], **self._facts(key), **omitted)
 
     def check(self, now: float) -> None:
-        """Write the lines that are due. Call it about once a second."""
+        """Read the drops, and write the lines that are due. Call it about once a second."""
+        self._read()
         self._conditions.check(now)
 
     def close(self) -> None:
         """Write the ends of all conditions: the daemon stops."""
+        self._read()
         self._conditions.close()
 
     def forget(self, peer: str) -> None:
         """Forget a peer that was removed or has other rules."""
+        self._read()
         self._conditions.close(lambda key: key[2] == peer)
         self._kinds = {key: kind for key, kind in self._kinds.items() if key[2] != peer}
 
@@ -169,14 +132,6 @@ class DropSummary:
         facts = {"reason": kind.reason, "who": key[2], "meaning": meaning if with_meaning else ""}
         facts["last"] = _describe(kind.last, kind.reason)
         return {field: fact for field, fact in facts.items() if fact}
-
-    def on_loop_failure(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-        """Handle an error that asyncio reports to the loop only."""
-        error = context.get("exception")
-        if isinstance(error, OSError):  # such as: no file descriptor is left for a new connection
-            self.add("connections_failed", failure_name(error), "", 1, monotonic(), str(context["message"]))
-        else:
-            loop.default_exception_handler(context)
 
 
 def _describe(fact: Fact, reason: str) -> str:

@@ -1,0 +1,76 @@
+"""All that watches a daemon: it reads the parts once a second, and when a client asks. No frame's path calls it."""
+
+from __future__ import annotations
+
+from math import inf
+
+from structlog.typing import FilteringBoundLogger
+
+from uavlinkd.core.outputs import Event
+from uavlinkd.link.conditions import LineLimits
+from uavlinkd.link.drop_log import DropLog
+from uavlinkd.link.event_log import EventLog
+from uavlinkd.link.finding import Finding
+from uavlinkd.link.findings import find, has_no_client, own_codes
+from uavlinkd.link.history import History
+from uavlinkd.link.parts import DaemonParts
+from uavlinkd.system.guard import run
+
+
+class Observer:
+    """The log, the recent past and the findings of one daemon. Times are monotonic seconds."""
+
+    def __init__(self, parts: DaemonParts, log: FilteringBoundLogger, now: float) -> None:
+        self.parts = parts
+        self.history = History(now)
+        self.findings: list[Finding] = []
+        """The findings of the last look, at most a second ago."""
+        limits = LineLimits()
+        self.drops = DropLog(log, parts.journal, limits)
+        self.events = EventLog(log, limits, parts.peer_sockets.network_name)
+        parts.journal.watcher = self
+
+    # Rare events, as :class:`uavlinkd.link.journal.Watcher`.
+
+    def write(self, event: Event, now: float) -> None:
+        self.events.write(event, now)
+
+    def write_client(self, event: str, endpoint: str, client: str, now: float) -> None:
+        self.events.write_client(event, endpoint, client, now)
+
+    def write_pause(self, pause_s: float, now: float) -> None:
+        self.events.write_pause(pause_s, now)
+
+    def forget(self, name: str, *, is_removed: bool) -> None:
+        self.drops.forget(name)
+        if is_removed:
+            self.events.forget(name)
+
+    # Once a second.
+
+    def sample(self, now: float) -> None:
+        """Read the counters of peers and endpoints."""
+        links, local = list(self.parts.links.values()), self.parts.local
+        for link in links:
+            run(self.events.check_link, link, now, most=inf)
+        endpoints = [(one, local.policies[one.name]) for one in local.endpoints]
+        run(self.history.sample, links, endpoints, now, most=inf)
+
+    def report(self, now: float) -> list[int]:
+        """Look for findings, and write the lines that are due. Returns the codes of problems that peers get."""
+        run(self._find, now, most=inf)
+        run(self.drops.check, now, most=inf)
+        run(self.events.check, now, most=inf)
+        return own_codes(self.findings, is_cut_off=has_no_client(self.findings, len(self.parts.local.endpoints)))
+
+    def _find(self, now: float) -> None:
+        self.findings = find(self.parts, self.history, now)
+        self.events.write_findings(self.findings, now)
+
+    def close(self, now: float) -> dict[str, int]:
+        """Write the ends of all conditions: the daemon stops. Returns all drops since the start by reason."""
+        for link in self.parts.links.values():
+            self.events.check_link(link, now)
+        self.drops.close()
+        self.events.close()
+        return self.drops.plain_totals()
