@@ -26,7 +26,7 @@ from tests.faults.talk import Log, Outcome, Talk, grew, prepare, reported
 from tests.namespaces import why_not as why_no_namespaces
 from tests.needs import need
 from tests.waiting import until
-from uavlinkd.link.conditions import LINES_BURST, LINES_PER_S
+from uavlinkd.ops.line_limits import LINES_BURST, LINES_PER_S
 
 SUSPENDED_S = float(os.environ.get("UAVLINKD_SIGSTOP_S", FAULT_S))
 """How long a process is stopped; 10 in CI."""

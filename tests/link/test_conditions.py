@@ -14,22 +14,13 @@ from tests.core.harness import Named
 from uavlinkd.config.model import ConfigError, Problem
 from uavlinkd.core.outputs import PathStateChanged, PeerLost, PeerUp
 from uavlinkd.core.path import Path
-from uavlinkd.link import conditions, daemon
-from uavlinkd.link.conditions import (
-    HOUR_S,
-    LINES_BURST,
-    LINES_PER_S,
-    QUIET_S,
-    TOTAL_BURST,
-    TOTAL_LINES_PER_S,
-    Conditions,
-    LineLimits,
-    OpenCondition,
-    Phase,
-)
+from uavlinkd.link import daemon
+from uavlinkd.link.conditions import HOUR_S, QUIET_S, Conditions, OpenCondition, Phase
 from uavlinkd.link.event_log import ENDED_PROBLEMS, ENDPOINT_DELAY_S, FINDING_DELAY_S, EventLog
 from uavlinkd.link.finding import Finding, Severity, Subject
 from uavlinkd.link.journal import Journal
+from uavlinkd.ops import line_limits
+from uavlinkd.ops.line_limits import LINES_BURST, LINES_PER_S, TOTAL_BURST, TOTAL_LINES_PER_S, LineLimits
 
 BEGAN, CONTINUED, ENDED = Phase
 
@@ -141,7 +132,7 @@ def test_security_line_is_not_pushed_out_by_everyday_ones(everyday_peer: str) ->
 
 def test_first_security_line_needs_no_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     """Even if the limit of security lines is used up, each of them has its first line."""
-    monkeypatch.setattr(conditions, "LINES_BURST", 0)
+    monkeypatch.setattr(line_limits, "LINES_BURST", 0)
     written = Written()
     written.conditions.note(("malformed", "b"), 1.0)
     assert written.lines == []

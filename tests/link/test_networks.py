@@ -17,8 +17,8 @@ from uavlinkd.config.model import NetworkConfig
 from uavlinkd.endpoints.sockets import BindError, Presence, network_socket
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.link import networks as module
-from uavlinkd.link.conditions import LINES_BURST, LINES_PER_S
 from uavlinkd.link.networks import Networks
+from uavlinkd.ops.line_limits import LINES_BURST, LINES_PER_S
 from uavlinkd.system.addresses import Address
 
 LTE = NetworkConfig("lte", interface="lo", metered=True)

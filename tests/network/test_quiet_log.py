@@ -31,7 +31,7 @@ from uavlinkd.core.drops import Attention, DropReason
 from uavlinkd.core.outputs import CertificateShown, Deliver, Dropped, Output, RecordReceived, Transmit
 from uavlinkd.core.settings import Class
 from uavlinkd.lab.mitm.radio import RadioSettings
-from uavlinkd.link.conditions import HOUR_S, LineLimits
+from uavlinkd.link.conditions import HOUR_S
 from uavlinkd.link.drop_log import DropLog
 from uavlinkd.link.event_log import EventLog
 from uavlinkd.link.evidence import Evidence
@@ -41,6 +41,7 @@ from uavlinkd.link.journal import Journal
 from uavlinkd.link.peer_link import Carriage, PeerLink
 from uavlinkd.mavlink.headers import Header
 from uavlinkd.mavlink.policy.gate import Refusal
+from uavlinkd.ops.line_limits import LineLimits
 
 HEALTHY = RadioSettings(delay_s=0.02, jitter_s=0.005, loss=0.01, reordering=0.001)
 NAMES = ("station", "drone1", "drone2", "drone3")

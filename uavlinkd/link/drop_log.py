@@ -11,11 +11,12 @@ from structlog.typing import FilteringBoundLogger
 from uavlinkd.config.keys import encode_key
 from uavlinkd.core.constants import PROTOCOL_VERSION
 from uavlinkd.core.drops import Attention, DropReason, Reason
-from uavlinkd.link.conditions import Conditions, LineLimits, OpenCondition, Phase
+from uavlinkd.link.conditions import Conditions, OpenCondition, Phase
 from uavlinkd.link.journal import Fact, Journal, Key
 from uavlinkd.mavlink.dialect import name_of
 from uavlinkd.mavlink.headers import Header
 from uavlinkd.mavlink.policy.gate import Refusal
+from uavlinkd.ops.line_limits import LineLimits
 from uavlinkd.ops.log import shown
 from uavlinkd.system.error_meanings import meaning_of
 

@@ -9,9 +9,10 @@ from structlog.typing import FilteringBoundLogger
 
 from uavlinkd.core import outputs as o
 from uavlinkd.core.path import Path
-from uavlinkd.link.conditions import Conditions, LineLimits, OpenCondition, Phase
+from uavlinkd.link.conditions import Conditions, OpenCondition, Phase
 from uavlinkd.link.finding import Finding, Severity, Subject
 from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.ops.line_limits import LineLimits
 from uavlinkd.ops.log import shown
 
 FINDING_DELAY_S = 2.0

@@ -26,8 +26,8 @@ from uavlinkd.core.node import Node
 from uavlinkd.core.path import Path, SocketAddress
 from uavlinkd.endpoints.reader import Datagrams
 from uavlinkd.endpoints.sockets import LINK_LOCAL, BindError, Presence, family_of, look, network_socket
-from uavlinkd.link.conditions import LineLimits
 from uavlinkd.mavlink.egress.bucket import Bucket
+from uavlinkd.ops.line_limits import LineLimits
 from uavlinkd.system.addresses import IPV4_UDP_BYTES, IPV6_UDP_BYTES, Address
 
 COPIES_SHARE: Final = 0.5

@@ -7,13 +7,13 @@ from math import inf
 from structlog.typing import FilteringBoundLogger
 
 from uavlinkd.core.outputs import Event
-from uavlinkd.link.conditions import LineLimits
 from uavlinkd.link.drop_log import DropLog
 from uavlinkd.link.event_log import EventLog
 from uavlinkd.link.finding import Finding
 from uavlinkd.link.findings import find, has_no_client, own_codes
 from uavlinkd.link.history import History
 from uavlinkd.link.parts import DaemonParts
+from uavlinkd.ops.line_limits import LineLimits
 from uavlinkd.system.guard import run
 
 

@@ -16,11 +16,11 @@ from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import LinkedPeer, Output
 from uavlinkd.core.path import RELAY_HOST, Path
 from uavlinkd.core.relay_records import Candidates
-from uavlinkd.link.conditions import LineLimits
 from uavlinkd.link.direct_search import DirectSearch, OwnSocket, Place, own_sockets, places_of
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.peer_sockets import PeerSockets
 from uavlinkd.link.relay_link import RelayLink
+from uavlinkd.ops.line_limits import LineLimits
 from uavlinkd.system.guard import report
 
 SILENT_S: Final = 0.5

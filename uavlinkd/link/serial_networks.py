@@ -20,9 +20,9 @@ from uavlinkd.core.path import SERIAL_HOST, Path, SocketAddress
 from uavlinkd.core.path_measures import limit_at
 from uavlinkd.core.peer import Peer
 from uavlinkd.endpoints.sockets import Presence
-from uavlinkd.link.conditions import LineLimits
 from uavlinkd.link.networks import NetworkBudget, NetworkLog, Receive, network_status
 from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.ops.line_limits import LineLimits
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.error_meanings import meaning_of
 from uavlinkd.system.stall import StallWatch

@@ -22,9 +22,9 @@ from uavlinkd.core.path import Path, SocketAddress
 from uavlinkd.core.path_state import PathState
 from uavlinkd.core.peer import Peer
 from uavlinkd.endpoints.ports import failure_name
-from uavlinkd.link.conditions import LineLimits
 from uavlinkd.link.networks import NetworkBudget, Receive
 from uavlinkd.mavlink.egress.bucket import Bucket
+from uavlinkd.ops.line_limits import LineLimits
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.error_meanings import CONNECTED
 from uavlinkd.system.stall import StallWatch
