@@ -12,9 +12,11 @@ from tests.imports import circle, graph, imports, is_inside, roots, sources
 
 ORDER = (
     *("system", "core", "authority", "mavlink", "endpoints", "relay", "config", "ops", "fleet", "web", "lab"),
-    *("link", "cli", "__main__"),
+    *("link", "observe", "daemon", "cli", "__main__"),
 )
 """Each package may import those before it."""
+PUTS_TOGETHER = "uavlinkd.link.daemon"
+"""The module that puts a daemon's parts and what watches them together: a package of its own, ``daemon``."""
 ORDER_OF_LABORATORY = ("child_processes", "mitm", "hostile", "sim", "evaluation", "demo", "commands")
 """Each part of the laboratory may import those before it."""
 IMPURE = {
@@ -94,6 +96,8 @@ def violations(boundary: Boundary, *folders: str) -> dict[str, set[str]]:
 
 def package_of(module: str) -> str:
     """``uavlinkd.core.node`` is in ``core``. The name is empty for ``uavlinkd`` itself."""
+    if module == PUTS_TOGETHER:
+        return "daemon"
     return f"{module}.".split(".")[1]
 
 

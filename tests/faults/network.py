@@ -13,7 +13,7 @@ from tests.daemon.process import DaemonProcess
 from tests.daemon.two_hosts import ONLY, PORT, TwoHosts, address_of, interface_of
 from tests.faults.talk import Log, Outcome, grew, reported
 from tests.waiting import PATIENCE_S
-from uavlinkd.link.drop_log import EVERYDAY_ERRORS
+from uavlinkd.observe.drop_log import EVERYDAY_ERRORS
 
 FAULT_S = float(os.environ.get("UAVLINKD_FAULT_S", "4"))
 """How long a fault lasts: longer than a peer may be silent (3 s)."""

@@ -15,7 +15,7 @@ from tests.link.inside import most_flows
 from tests.link.test_switch import Client, policy
 from tests.mavlink.inside import gate_tables, most_addresses, remembered_frames
 from uavlinkd.link import switch as switching
-from uavlinkd.link.journal import Journal
+from uavlinkd.link.journal import DaemonJournal
 from uavlinkd.link.switch import Port, Switch
 from uavlinkd.mavlink import headers, routing, sendings
 from uavlinkd.mavlink.dialect import MESSAGES, SETUP_SIGNING
@@ -225,7 +225,7 @@ def make_switch() -> Run:
         def count(name: str, header: Header, refusal: Refusal, now: float, *, to_them: bool) -> None:
             refused[refusal] += 1
 
-        drops = cast("Journal", SimpleNamespace(add_refused=count))
+        drops = cast("DaemonJournal", SimpleNamespace(add_refused=count))
         switch = Switch(router, StallWatch(monotonic(), lambda _: None), drops)
         clients = [Client(str(number)) for number in range(len(POLICIES))]
         policies = [policy(**rules) for rules in POLICIES]

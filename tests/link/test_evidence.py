@@ -26,10 +26,10 @@ from uavlinkd.link.evidence import (
     REPORTED,
     Evidence,
 )
-from uavlinkd.link.history import REMEMBERED_S, History, RecentGrowth
 from uavlinkd.link.peer_link import Carriage, PeerLink
 from uavlinkd.mavlink.frames import SplitCounters, split_payload
 from uavlinkd.mavlink.policy.compilation import Policy
+from uavlinkd.observe.history import REMEMBERED_S, History, RecentGrowth
 from uavlinkd.system.addresses import Address
 
 HOST = "192.0.2.2"

@@ -27,7 +27,7 @@ from uavlinkd.endpoints.reader import PAUSE_S
 from uavlinkd.endpoints.sockets import BUFFER_BYTES, Presence
 from uavlinkd.link import networks as module
 from uavlinkd.link.evidence import Evidence
-from uavlinkd.link.journal import Journal
+from uavlinkd.link.journal import DaemonJournal
 from uavlinkd.link.peer_names import REFRESH_S
 from uavlinkd.link.peer_sockets import RELAY_BUFFER_BYTES, PeerSockets
 from uavlinkd.system.addresses import Address
@@ -59,7 +59,7 @@ class Refusing:
         """As a socket's."""
 
 
-def sockets_with(sock: Refusing, drops: Journal) -> PeerSockets:
+def sockets_with(sock: Refusing, drops: DaemonJournal) -> PeerSockets:
     """The sockets of a daemon, of which this is the only one."""
     stall = StallWatch(0.0, lambda seconds: None)
     sockets = PeerSockets(stall, drops, Evidence({}, b""), structlog.get_logger(), SocketStateLog())
@@ -71,7 +71,7 @@ def sockets_with(sock: Refusing, drops: Journal) -> PeerSockets:
 @pytest.mark.parametrize("name", ["ENOBUFS", "ENOMEM", "EPERM", "ENETUNREACH", "EAGAIN"])
 def test_what_is_not_taken_is_counted_and_the_next_is_sent(name: str) -> None:
     """A count for each, and datagrams go on when there is room again."""
-    journal, sock = Journal(), Refusing(getattr(errno, name))
+    journal, sock = DaemonJournal(), Refusing(getattr(errno, name))
     sockets = sockets_with(sock, journal)
     for _ in range(3):
         sockets.send(b"lost", Path(0, ("127.0.0.1", 9)))
@@ -83,7 +83,7 @@ def test_what_is_not_taken_is_counted_and_the_next_is_sent(name: str) -> None:
 
 def test_relayed_path_goes_to_the_relay_or_nowhere() -> None:
     """Wrapped, along the same socket. Without its handle nothing is sent: its host is not a name to look up."""
-    drops = Journal()
+    drops = DaemonJournal()
     sock = Refusing(errno.EPERM)
     sock.is_out = False
     sockets = sockets_with(sock, drops)
@@ -100,7 +100,7 @@ async def test_sockets_of_a_relay_have_room_for_longer_bursts(*, is_relay: bool)
     """As far as the kernel grants it."""
     log = structlog.get_logger()
     stall = StallWatch(0.0, lambda _: None)
-    sockets = PeerSockets(stall, Journal(), Evidence({}, b""), log, SocketStateLog())
+    sockets = PeerSockets(stall, DaemonJournal(), Evidence({}, b""), log, SocketStateLog())
     sockets.pause_s = 0.0 if is_relay else PAUSE_S
     sockets.open([Address("127.0.0.1", 0)])
     sockets.start(lambda *_: None)
@@ -142,7 +142,7 @@ class Scene:
     def __init__(self) -> None:
         self.present = dict(HERE)
         self.core = SocketStateLog()
-        self.drops = Journal()
+        self.drops = DaemonJournal()
         stall = StallWatch(0.0, lambda seconds: None)
         log = structlog.get_logger()
         self.sockets = PeerSockets(stall, self.drops, Evidence({}, b""), log, self.core)

@@ -16,7 +16,7 @@ from uavlinkd.config.model import NetworkConfig
 from uavlinkd.endpoints.serial_line import SerialLine
 from uavlinkd.endpoints.url import SerialUrl
 from uavlinkd.link.serial_networks import NOISE_PIECES, SerialNetworks
-from uavlinkd.link.signs import line_noise
+from uavlinkd.observe.signs import line_noise
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.stall import StallWatch
 

@@ -13,7 +13,7 @@ from tests.mavlink.inside import remembered_frames
 from tests.mavlink.policy.smuggling import SET_MODE, v1, v2
 from uavlinkd.endpoints.ports import Endpoint, LocalPort, PortHandler
 from uavlinkd.link import switch as switch_module
-from uavlinkd.link.journal import Journal, ShellReason
+from uavlinkd.link.journal import DaemonJournal, ShellReason
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.switch import Switch
 from uavlinkd.mavlink.frames import Frame, SplitCounters, split_datagram
@@ -76,7 +76,7 @@ class Stage:
         self.router = Router[switch_module.Port]()
         self.withheld: list[tuple[str, Refusal]] = []
         self.stall = StallWatch(monotonic(), lambda _: None)
-        drops = cast("Journal", SimpleNamespace(add_refused=self.refuse, add=self.drop))
+        drops = cast("DaemonJournal", SimpleNamespace(add_refused=self.refuse, add=self.drop))
         self.switch = Switch(self.router, self.stall, drops)
         self.stale = 0
         self.a, self.b, self.c = (Client(name) for name in "abc")

@@ -20,7 +20,7 @@ from uavlinkd.endpoints.sockets import BindError
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.link import newcomers
 from uavlinkd.link import web_listener as module
-from uavlinkd.link.journal import Journal
+from uavlinkd.link.journal import DaemonJournal
 from uavlinkd.link.web_listener import WebListener
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic
@@ -39,7 +39,7 @@ class Port:
     def __init__(self) -> None:
         self.node = SocketStateLog()
         self.node.peers = {}
-        self.journal = Journal()
+        self.journal = DaemonJournal()
         config = HttpsServer(Address("127.0.0.1", free_port()))
         stall = StallWatch(monotonic(), lambda seconds: None)
         self.listener = WebListener(config, NUMBER, self.node, stall, self.journal)
@@ -360,7 +360,7 @@ def test_certificate_that_vanished_is_a_problem_at_the_start(tmp_path: Any) -> N
     """It was there when the file was read."""
     config = HttpsServer(Address("127.0.0.1", free_port()), tmp_path / "tls.crt", tmp_path / "tls.key")
     with pytest.raises(BindError, match=r"relay_server\.https: certificate .* cannot be read"):
-        WebListener(config, 0, SocketStateLog(), StallWatch(0.0, lambda _: None), Journal())
+        WebListener(config, 0, SocketStateLog(), StallWatch(0.0, lambda _: None), DaemonJournal())
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from typing import Any, cast
 import pytest
 
 from tests.link.socket_states import SocketStateLog
-from tests.link.test_drop_log import Recorder
+from tests.observe.test_drop_log import Recorder
 from tests.waiting import until
 from uavlinkd.config.model import PeerAddress
 from uavlinkd.core.path import Path

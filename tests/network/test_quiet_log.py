@@ -22,25 +22,25 @@ import pytest
 import structlog
 from structlog.testing import LogCapture
 
-from tests.link.daemon_parts import parts_of
 from tests.network.network import Drone, Network
 from tests.network.vehicle import add_vehicle, hop
+from tests.observe.daemon_parts import parts_of
 from tests.policies import TRUSTED
 from uavlinkd.config.model import PeerConfig
 from uavlinkd.core.drops import Attention, DropReason
 from uavlinkd.core.outputs import CertificateShown, Deliver, Dropped, Output, RecordReceived, Transmit
 from uavlinkd.core.settings import Class
 from uavlinkd.lab.mitm.radio import RadioSettings
-from uavlinkd.link.conditions import HOUR_S
-from uavlinkd.link.drop_log import DropLog
-from uavlinkd.link.event_log import EventLog
 from uavlinkd.link.evidence import Evidence
-from uavlinkd.link.findings import find
-from uavlinkd.link.history import History
-from uavlinkd.link.journal import Journal
+from uavlinkd.link.journal import DaemonJournal
 from uavlinkd.link.peer_link import Carriage, PeerLink
 from uavlinkd.mavlink.headers import Header
 from uavlinkd.mavlink.policy.gate import Refusal
+from uavlinkd.observe.conditions import HOUR_S
+from uavlinkd.observe.drop_log import DropLog
+from uavlinkd.observe.event_log import EventLog
+from uavlinkd.observe.findings import find
+from uavlinkd.observe.history import History
 from uavlinkd.ops.line_limits import LineLimits
 
 HEALTHY = RadioSettings(delay_s=0.02, jitter_s=0.005, loss=0.01, reordering=0.001)
@@ -62,7 +62,7 @@ class LoggedDaemon:
         log = structlog.wrap_logger(
             None, processors=[self.captured], wrapper_class=structlog.make_filtering_bound_logger(logging.DEBUG)
         )
-        self.journal = Journal()
+        self.journal = DaemonJournal()
         self.drops, self.events = DropLog(log, self.journal, limits), EventLog(log, limits)
         carriage = Carriage(drone.node, lambda _: None)
         self.links = {

@@ -15,7 +15,7 @@ from tests.test_readmes import ROOT, names_in_table
 from uavlinkd.core.certificates import MemberRole
 from uavlinkd.endpoints.line_framing import RADIO_FIGURES
 from uavlinkd.lab.sim.loopback_ports import free_port
-from uavlinkd.link.finding import Finding, Severity, Subject
+from uavlinkd.observe.finding import Finding, Severity, Subject
 from uavlinkd.ops import STATUS_SCHEMA
 
 MAPS = (

@@ -10,7 +10,7 @@ from rich.console import Console, RenderableType
 
 from uavlinkd.core.drops import LinkProblem
 from uavlinkd.core.path_state import PathCondition
-from uavlinkd.link.finding import Finding, Severity, Subject
+from uavlinkd.observe.finding import Finding, Severity, Subject
 from uavlinkd.ops.status_screen import render_status
 
 PATH: dict[str, Any] = {

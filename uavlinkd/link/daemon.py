@@ -15,12 +15,12 @@ from uavlinkd.config.load import load_in_thread
 from uavlinkd.config.model import Config, ConfigError
 from uavlinkd.link.carrier import FrameCarrier
 from uavlinkd.link.local_endpoints import PilotNotes
-from uavlinkd.link.observer import Observer
 from uavlinkd.link.parts import DaemonParts
 from uavlinkd.link.peer_link import radio_figures
 from uavlinkd.link.relay_link import RelayLink
-from uavlinkd.link.status import daemon_status, overview, paths_status, state_of
 from uavlinkd.mavlink.own_frames import INTERVAL_S
+from uavlinkd.observe.observer import Observer
+from uavlinkd.observe.status import daemon_status, overview, paths_status, state_of
 from uavlinkd.ops import LOG_SCHEMA
 from uavlinkd.ops.control import ControlServer
 from uavlinkd.ops.log import shown

@@ -51,7 +51,7 @@ class Tally:
     last: Fact = ""
 
 
-class Watcher(Protocol):
+class JournalReader(Protocol):
     """What is called about rare events."""
 
     def write(self, event: Event, now: float) -> None:
@@ -67,11 +67,11 @@ class Watcher(Protocol):
         """A peer was removed, or has other rules."""
 
 
-class Journal:
+class DaemonJournal:
     """Memory is bounded: reasons are closed lists, names are configured."""
 
     def __init__(self) -> None:
-        self.watcher: Watcher | None = None
+        self.watcher: JournalReader | None = None
         self.totals: Counter[str] = Counter()
         """All drops by reason since the start."""
         self.paused: tuple[float, float] | None = None

@@ -13,7 +13,7 @@ from uavlinkd.endpoints.ports import Endpoint, LocalPort, PortHandler
 from uavlinkd.endpoints.sockets import BindError, udp_socket
 from uavlinkd.endpoints.udp import UdpClient, UdpServer
 from uavlinkd.endpoints.url import EndpointKind, NetworkUrl, SerialUrl
-from uavlinkd.link.journal import Journal
+from uavlinkd.link.journal import DaemonJournal
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.switch import Switch
 from uavlinkd.mavlink.dialect import IDS, KINDS, UNKNOWN, command_name, name_of
@@ -65,7 +65,7 @@ def open_endpoint(config: EndpointConfig, handler: PortHandler) -> Endpoint:
 class LocalEndpoints:
     """Opens the endpoints, adds their clients to the switch, and sends them RADIO_STATUS."""
 
-    def __init__(self, name: str, switch: Switch, journal: Journal, stall: StallWatch) -> None:
+    def __init__(self, name: str, switch: Switch, journal: DaemonJournal, stall: StallWatch) -> None:
         """``name``: the daemon, as the source of its own frames."""
         self.endpoints: list[Endpoint] = []
         self.policies: dict[str, Policy] = {}

@@ -14,7 +14,7 @@ from uavlinkd.core.outputs import LinkedPeer, Output
 from uavlinkd.endpoints.ports import LocalPort
 from uavlinkd.link.evidence import Evidence
 from uavlinkd.link.fleet_members import FleetMembers
-from uavlinkd.link.journal import Journal
+from uavlinkd.link.journal import DaemonJournal
 from uavlinkd.link.local_endpoints import LocalEndpoints
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.peer_sockets import PeerSockets
@@ -54,7 +54,7 @@ class DaemonParts:
         self.link_of: dict[LinkedPeer, PeerLink] = {}
         """By each peer of the core that carries frames."""
         relay_links: dict[str, RelayLink] = {}
-        self.journal = journal = Journal()
+        self.journal = journal = DaemonJournal()
         """What those that watch the daemon read."""
         self.guard = FaultGuard(log, journal.on_loop_failure)
         self.evidence = Evidence(self.links, config.public_key, relay_links)

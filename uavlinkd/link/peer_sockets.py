@@ -29,7 +29,7 @@ from uavlinkd.endpoints.sockets import (
     udp_socket,
 )
 from uavlinkd.link.evidence import REPORTED, Evidence
-from uavlinkd.link.journal import Journal, ShellReason
+from uavlinkd.link.journal import DaemonJournal, ShellReason
 from uavlinkd.link.networks import Network, NetworkBudget, Networks, Receive
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.peer_names import PeerNames
@@ -86,7 +86,7 @@ class PeerSockets:
     """Reads and sends the peers' datagrams. A path's first number is the number of its socket here."""
 
     def __init__(
-        self, stall: StallWatch, drops: Journal, evidence: Evidence, log: FilteringBoundLogger, node: Node
+        self, stall: StallWatch, drops: DaemonJournal, evidence: Evidence, log: FilteringBoundLogger, node: Node
     ) -> None:
         self.failures: Counter[str] = Counter()
         """Datagrams to peers that the kernel did not accept, by the name of the error."""

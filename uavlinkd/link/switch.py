@@ -14,7 +14,7 @@ from itertools import count
 from typing import NamedTuple
 
 from uavlinkd.endpoints.ports import LocalPort
-from uavlinkd.link.journal import Journal, ShellReason
+from uavlinkd.link.journal import DaemonJournal, ShellReason
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.mavlink.headers import Header
@@ -55,7 +55,7 @@ class _Known:
 class Switch:
     """Knows every port and its policy. It drops frames from before a pause. All times are monotonic seconds."""
 
-    def __init__(self, router: Router[Port], stall: StallWatch, drops: Journal) -> None:
+    def __init__(self, router: Router[Port], stall: StallWatch, drops: DaemonJournal) -> None:
         self.router = router
         self.stall = stall
         self._drops = drops

@@ -30,7 +30,7 @@ from uavlinkd.endpoints.sockets import BindError, set_options
 from uavlinkd.endpoints.tcp import tcp_listener
 from uavlinkd.endpoints.tls_channel import TlsFactory, server_tls
 from uavlinkd.endpoints.web_stream import WebStream, server_protocol
-from uavlinkd.link.journal import Journal
+from uavlinkd.link.journal import DaemonJournal
 from uavlinkd.link.networks import Receive
 from uavlinkd.link.newcomers import NEWCOMERS, Newcomer, Newcomers
 from uavlinkd.system.addresses import Address, numeric_host
@@ -109,7 +109,7 @@ class _Connection:
 class WebListener:
     """``number``: that of the socket, for the core."""
 
-    def __init__(self, config: HttpsServer, number: int, node: Node, stall: StallWatch, drops: Journal) -> None:
+    def __init__(self, config: HttpsServer, number: int, node: Node, stall: StallWatch, drops: DaemonJournal) -> None:
         """Listen. Raises BindError if the address or the certificate cannot be used."""
         self.number = number
         self.refused = Counter[str]()

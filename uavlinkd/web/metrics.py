@@ -46,7 +46,7 @@ _RELAY_REASONS = (
 
 
 def exposition(status: Status) -> bytes:
-    """Write a status (:func:`uavlinkd.link.status.daemon_status`) as the text that Prometheus reads."""
+    """Write a status (:func:`uavlinkd.observe.status.daemon_status`) as the text that Prometheus reads."""
     # Not the global registry of the library, which measures the process its own way.
     return generate_latest(_StatusCollector(status))
 

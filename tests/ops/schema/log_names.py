@@ -15,7 +15,7 @@ from tests.imports import sources
 from tests.ops.schema import golden
 
 _METHODS = frozenset({"debug", "info", "warning", "error", "critical", "exception"})
-_PACKAGES = ("system", "core", "mavlink", "endpoints", "config", "ops", "link")
+_PACKAGES = ("system", "core", "mavlink", "endpoints", "config", "ops", "link", "observe")
 _EVENT = re.compile(r"[a-z]+(_[a-z]+)+")
 _TYPES = {
     bool: "boolean",

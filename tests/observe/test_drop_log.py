@@ -14,12 +14,12 @@ from tests.core.harness import Named
 from uavlinkd.core.drops import DropReason
 from uavlinkd.core.outputs import Dropped
 from uavlinkd.core.path import Path
-from uavlinkd.link import drop_log
-from uavlinkd.link.conditions import HOUR_S
-from uavlinkd.link.drop_log import PERSISTENT_S, DropLog
-from uavlinkd.link.journal import Fact, Journal, ShellReason
+from uavlinkd.link.journal import DaemonJournal, Fact, ShellReason
 from uavlinkd.mavlink.headers import Header
 from uavlinkd.mavlink.policy.gate import Refusal
+from uavlinkd.observe import drop_log
+from uavlinkd.observe.conditions import HOUR_S
+from uavlinkd.observe.drop_log import PERSISTENT_S, DropLog
 
 
 class Recorder:
@@ -51,7 +51,7 @@ class Summary:
     """A journal, and the log that reads it when a test asks for it."""
 
     def __init__(self, recorder: Recorder) -> None:
-        self.journal = Journal()
+        self.journal = DaemonJournal()
         self.log = DropLog(cast(Any, recorder), self.journal)
 
     def add(self, event: str, reason: str, name: str, count: int, now: float, last: Fact = "") -> None:

@@ -17,18 +17,18 @@ from uavlinkd.core.path import Path, SocketAddress, relay_name
 from uavlinkd.core.path_state import PathState
 from uavlinkd.core.peer import Peer
 from uavlinkd.endpoints.ports import Endpoint
-from uavlinkd.link.finding import Finding
-from uavlinkd.link.findings import find, has_no_client, stop_frames
 from uavlinkd.link.fleet_members import FleetMembers
-from uavlinkd.link.observer import Observer
 from uavlinkd.link.parts import DaemonParts
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.relay_link import RelayLink
-from uavlinkd.link.signs import is_contested
-from uavlinkd.link.traffic_signs import codes_there, name_of_problem, stops_frames
 from uavlinkd.mavlink.dialect import command_name, name_of
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import ANY_OTHER, REFUSALS, Refusal
+from uavlinkd.observe.finding import Finding
+from uavlinkd.observe.findings import find, has_no_client, stop_frames
+from uavlinkd.observe.observer import Observer
+from uavlinkd.observe.signs import is_contested
+from uavlinkd.observe.traffic_signs import codes_there, name_of_problem, stops_frames
 from uavlinkd.ops import LOG_SCHEMA, STATUS_SCHEMA
 from uavlinkd.ops.log import shown
 from uavlinkd.relay.service import RelayMember, RelayService

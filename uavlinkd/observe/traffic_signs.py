@@ -11,12 +11,12 @@ from typing import Final
 from uavlinkd.core import constants as c
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.refusals import Claim
-from uavlinkd.link.facts import EndpointFacts, PartFacts, PeerFacts, listed
-from uavlinkd.link.history import GateHistory
-from uavlinkd.link.signs import SECURITY_S, Signs
 from uavlinkd.mavlink.dialect import command_name, name_of
 from uavlinkd.mavlink.egress.lanes import EgressDrop
 from uavlinkd.mavlink.policy.gate import ANY_OTHER, REFUSALS, Refusal
+from uavlinkd.observe.facts import EndpointFacts, PartFacts, PeerFacts, listed
+from uavlinkd.observe.history import GateHistory
+from uavlinkd.observe.signs import SECURITY_S, Signs
 
 COMMANDS_S: Final = 300.0
 """A refused command stays in the findings for this time: a person looks some time after the press of a button."""

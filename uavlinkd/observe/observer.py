@@ -7,12 +7,12 @@ from math import inf
 from structlog.typing import FilteringBoundLogger
 
 from uavlinkd.core.outputs import Event
-from uavlinkd.link.drop_log import DropLog
-from uavlinkd.link.event_log import EventLog
-from uavlinkd.link.finding import Finding
-from uavlinkd.link.findings import find, has_no_client, own_codes
-from uavlinkd.link.history import History
 from uavlinkd.link.parts import DaemonParts
+from uavlinkd.observe.drop_log import DropLog
+from uavlinkd.observe.event_log import EventLog
+from uavlinkd.observe.finding import Finding
+from uavlinkd.observe.findings import find, has_no_client, own_codes
+from uavlinkd.observe.history import History
 from uavlinkd.ops.line_limits import LineLimits
 from uavlinkd.system.guard import run
 
@@ -30,7 +30,7 @@ class Observer:
         self.events = EventLog(log, limits, parts.peer_sockets.network_name)
         parts.journal.watcher = self
 
-    # Rare events, as :class:`uavlinkd.link.journal.Watcher`.
+    # Rare events, as :class:`uavlinkd.link.journal.JournalReader`.
 
     def write(self, event: Event, now: float) -> None:
         self.events.write(event, now)

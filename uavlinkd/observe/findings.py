@@ -12,12 +12,12 @@ from enum import Enum
 from typing import Any, Final, NamedTuple
 
 from uavlinkd.core.drops import DropReason
-from uavlinkd.link import signs, traffic_signs
-from uavlinkd.link.facts import EndpointFacts, Fields, Moment, PartFacts, PeerFacts
-from uavlinkd.link.finding import Finding, Severity, Subject
-from uavlinkd.link.history import History
 from uavlinkd.link.parts import DaemonParts
 from uavlinkd.mavlink.dialect import SYSTEM_ID
+from uavlinkd.observe import signs, traffic_signs
+from uavlinkd.observe.facts import EndpointFacts, Fields, Moment, PartFacts, PeerFacts
+from uavlinkd.observe.finding import Finding, Severity, Subject
+from uavlinkd.observe.history import History
 
 SECURITY, FAULT, WARNING = Severity
 

@@ -13,8 +13,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from tests.core.harness import PLAIN
 from tests.daemon.frames import command_long, ground_heartbeat, heartbeat
-from tests.link.daemon_parts import parts_of
 from tests.link.test_evidence import HOST, OWN_KEY, THERE, Scene
+from tests.observe.daemon_parts import parts_of
 from tests.samples import blank
 from tests.test_readmes import ROOT
 from uavlinkd.config.keys import encode_key
@@ -29,19 +29,19 @@ from uavlinkd.core.sessions import Twin
 from uavlinkd.core.settings import PeerSettings
 from uavlinkd.endpoints.url import parse_url
 from uavlinkd.link.evidence import EVIDENCE_S, REPORTED
-from uavlinkd.link.facts import ICMP_S
-from uavlinkd.link.finding import Finding, Severity, Subject
-from uavlinkd.link.findings import ROWS, Exit, find, has_no_client, own_codes, stop_frames
-from uavlinkd.link.history import HIDDEN_LEAST, History
 from uavlinkd.link.peer_link import PeerLink
-from uavlinkd.link.signs import SECURITY_S, is_contested
-from uavlinkd.link.traffic_signs import PROBLEMS
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.mavlink.egress.lanes import EgressDrop
 from uavlinkd.mavlink.egress.peer_egress import PeerEgress
 from uavlinkd.mavlink.frames import SplitCounters, split_payload
 from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.mavlink.routing import Router
+from uavlinkd.observe.facts import ICMP_S
+from uavlinkd.observe.finding import Finding, Severity, Subject
+from uavlinkd.observe.findings import ROWS, Exit, find, has_no_client, own_codes, stop_frames
+from uavlinkd.observe.history import HIDDEN_LEAST, History
+from uavlinkd.observe.signs import SECURITY_S, is_contested
+from uavlinkd.observe.traffic_signs import PROBLEMS
 from uavlinkd.system.addresses import Address
 
 NOW = 1.0

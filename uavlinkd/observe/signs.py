@@ -20,10 +20,10 @@ from uavlinkd.core.path import RELAY_HOST, SocketAddress
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.sessions import Twin
 from uavlinkd.link.evidence import ELSEWHERE, EVIDENCE_S, REPORTED, Sighting
-from uavlinkd.link.facts import UNROUTED, Fields, Moment, PeerFacts, at, details_at, hosts_of, listed
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.relay_link import RelayLink
 from uavlinkd.link.switch import Port
+from uavlinkd.observe.facts import UNROUTED, Fields, Moment, PeerFacts, at, details_at, hosts_of, listed
 from uavlinkd.ops.log import shown, titled
 from uavlinkd.system.error_meanings import CONNECTED, meaning_of, web_problem
 

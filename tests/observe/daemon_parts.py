@@ -9,7 +9,7 @@ from typing import Any
 
 from uavlinkd.core.node import Node
 from uavlinkd.link.evidence import Evidence
-from uavlinkd.link.journal import Journal
+from uavlinkd.link.journal import DaemonJournal
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.mavlink.routing import Router
 from uavlinkd.system.addresses import Address
@@ -41,7 +41,7 @@ def parts_of(node: Node, links: Mapping[str, PeerLink], evidence: Evidence, rout
         node=node,
         peer_sockets=sockets,
         evidence=evidence,
-        journal=Journal(),
+        journal=DaemonJournal(),
         relays=SimpleNamespace(by_name={}),
         relay=None,
         fleet=None,

@@ -9,9 +9,9 @@ from structlog.typing import FilteringBoundLogger
 
 from uavlinkd.core import outputs as o
 from uavlinkd.core.path import Path
-from uavlinkd.link.conditions import Conditions, OpenCondition, Phase
-from uavlinkd.link.finding import Finding, Severity, Subject
 from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.observe.conditions import Conditions, OpenCondition, Phase
+from uavlinkd.observe.finding import Finding, Severity, Subject
 from uavlinkd.ops.line_limits import LineLimits
 from uavlinkd.ops.log import shown
 
@@ -23,7 +23,7 @@ ENDPOINT_DELAY_S = 15.0
 ENDED_PROBLEMS = 100
 """So many findings that ended are kept for a page that shows them."""
 FINDING_QUIET_S = 10.0
-"""A finding has ended when it was absent for so long, see :data:`uavlinkd.link.conditions.QUIET_S`."""
+"""A finding has ended when it was absent for so long, see :data:`uavlinkd.observe.conditions.QUIET_S`."""
 
 _OTHER_EVENTS = frozenset({"daemon_paused", "network_absent", "configuration_refused", "fault_inside"})
 """Findings that are logged by events of their own."""

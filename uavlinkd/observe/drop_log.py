@@ -11,11 +11,11 @@ from structlog.typing import FilteringBoundLogger
 from uavlinkd.config.keys import encode_key
 from uavlinkd.core.constants import PROTOCOL_VERSION
 from uavlinkd.core.drops import Attention, DropReason, Reason
-from uavlinkd.link.conditions import Conditions, OpenCondition, Phase
-from uavlinkd.link.journal import Fact, Journal, Key
+from uavlinkd.link.journal import DaemonJournal, Fact, Key
 from uavlinkd.mavlink.dialect import name_of
 from uavlinkd.mavlink.headers import Header
 from uavlinkd.mavlink.policy.gate import Refusal
+from uavlinkd.observe.conditions import Conditions, OpenCondition, Phase
 from uavlinkd.ops.line_limits import LineLimits
 from uavlinkd.ops.log import shown
 from uavlinkd.system.error_meanings import meaning_of
@@ -61,7 +61,7 @@ class _Kind:
 class DropLog:
     """Writes the conditions of drops. Memory is bounded: reasons are closed lists, names are configured."""
 
-    def __init__(self, log: FilteringBoundLogger, journal: Journal, limits: LineLimits | None = None) -> None:
+    def __init__(self, log: FilteringBoundLogger, journal: DaemonJournal, limits: LineLimits | None = None) -> None:
         self._log = log
         self._journal = journal
         self._limits = limits or LineLimits()

@@ -14,10 +14,10 @@ from uavlinkd.core.path import Path, SocketAddress
 from uavlinkd.endpoints.ports import Endpoint
 from uavlinkd.endpoints.url import EndpointKind
 from uavlinkd.link.evidence import ELSEWHERE, REPORTED, Sighting
-from uavlinkd.link.history import History
 from uavlinkd.link.parts import DaemonParts
 from uavlinkd.link.peer_link import NOT_ANSWERING_S, PeerLink
 from uavlinkd.link.relay_link import RelayLink
+from uavlinkd.observe.history import History
 from uavlinkd.ops.log import shown
 from uavlinkd.system.error_meanings import meaning_of
 

@@ -15,10 +15,10 @@ from uavlinkd.config.model import ConfigError, Problem
 from uavlinkd.core.outputs import PathStateChanged, PeerLost, PeerUp
 from uavlinkd.core.path import Path
 from uavlinkd.link import daemon
-from uavlinkd.link.conditions import HOUR_S, QUIET_S, Conditions, OpenCondition, Phase
-from uavlinkd.link.event_log import ENDED_PROBLEMS, ENDPOINT_DELAY_S, FINDING_DELAY_S, EventLog
-from uavlinkd.link.finding import Finding, Severity, Subject
-from uavlinkd.link.journal import Journal
+from uavlinkd.link.journal import DaemonJournal
+from uavlinkd.observe.conditions import HOUR_S, QUIET_S, Conditions, OpenCondition, Phase
+from uavlinkd.observe.event_log import ENDED_PROBLEMS, ENDPOINT_DELAY_S, FINDING_DELAY_S, EventLog
+from uavlinkd.observe.finding import Finding, Severity, Subject
 from uavlinkd.ops import line_limits
 from uavlinkd.ops.line_limits import LINES_BURST, LINES_PER_S, TOTAL_BURST, TOTAL_LINES_PER_S, LineLimits
 
@@ -293,7 +293,7 @@ async def test_problems_of_a_refused_configuration_control_no_terminal(monkeypat
         )
 
     monkeypatch.setattr(daemon, "load_in_thread", refuse)
-    parts = SimpleNamespace(config=SimpleNamespace(path="a.toml"), local=None, journal=Journal())
+    parts = SimpleNamespace(config=SimpleNamespace(path="a.toml"), local=None, journal=DaemonJournal())
     stub = SimpleNamespace(parts=parts, log=structlog.get_logger())
     with capture_logs() as lines, pytest.raises(ConfigError):
         await daemon.Daemon._apply_file(cast(daemon.Daemon, stub))
