@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import base64
 import re
-import secrets
 from pathlib import Path
 
 import pytest
@@ -15,39 +13,14 @@ from uavlinkd.config.key_rules import EXAMPLE_KEYS
 
 ROOT = Path(__file__).parents[2]
 _SHOWN = re.compile(r"(?<![A-Za-z0-9+/])[A-Za-z0-9+/]{43}=")
-_WITH_PSK = 'psk_file = "pair.psk"\n'
 
 
-def _problem(folder: Path, secret: str, more: str = "") -> str:
+def _problem(folder: Path, secret: str) -> str:
     """The problem of a file with a secret key in place of the peer's public key."""
-    ((place, message),) = refused(folder, GOOD.replace(KEY["drone1"], secret) + more).items()
+    ((place, message),) = refused(folder, GOOD.replace(KEY["drone1"], secret)).items()
     assert place == "peer[0].public_key (drone1)"
     assert secret[:8] not in message
     return message
-
-
-def _odd_key() -> str:
-    """A secret without the form of a private key, which is a valid public key too."""
-    return base64.b64encode(bytes([1]) + secrets.token_bytes(30) + bytes([0])).decode()
-
-
-@pytest.mark.parametrize(
-    ("secret", "name"),
-    [(keys.generate_private_key(), "other.txt"), (_odd_key(), "other.psk")],
-    ids=["form", "no-form"],
-)
-def test_private_key_beside_the_file(tmp_path: Path, secret: str, name: str) -> None:
-    """The file that holds the key is named, also if the key has no form of its own. The key is exposed by that."""
-    (tmp_path / name).write_text(secret + "\n")
-    message = _problem(tmp_path, secret)
-    assert message.startswith(f"is the secret key in {name}")
-    assert "make a new one there with `uavlinkd keygen`" in message
-
-
-def test_public_key_beside_the_file(tmp_path: Path) -> None:
-    """People keep what `keygen` printed, under any name: no secret is exposed."""
-    (tmp_path / "drone1.txt").write_text(KEY["drone1"] + "\n")
-    load(tmp_path, GOOD)
 
 
 def test_own_private_key(tmp_path: Path) -> None:
@@ -56,13 +29,6 @@ def test_own_private_key(tmp_path: Path) -> None:
     message = _problem(tmp_path, (tmp_path / "drone0.key").read_text().strip())
     assert message.startswith("is this daemon's private key")
     assert "make a new one with `uavlinkd keygen`" in message
-
-
-def test_psk_as_public_key(tmp_path: Path) -> None:
-    """The PSK of its file."""
-    load(tmp_path, GOOD)
-    (tmp_path / "pair.psk").write_text(psk := _odd_key())
-    assert "is a PSK, which must stay secret: make a new PSK" in _problem(tmp_path, psk, _WITH_PSK)
 
 
 def test_public_key_in_the_private_key_file(tmp_path: Path) -> None:
@@ -96,10 +62,3 @@ def test_suspicious_key_is_warned_of(tmp_path: Path, what: str) -> None:
         (warning,) = (warning for warning in warnings if "public_key" in warning)
         assert re.match(rf'{what} "\w+": public_key {words}.*on the {what}', warning)
         assert private[:8] not in warning
-
-
-def test_private_key_of_another_peer(tmp_path: Path) -> None:
-    """Its public half is the key of another peer."""
-    private = keys.generate_private_key()
-    other = OTHER_PEER.replace(KEY["b"], keys.public_key_text(private))
-    assert "is the private key of peer[1] (drone2)" in _problem(tmp_path, private, other)

@@ -12,7 +12,6 @@ import pytest
 from tests.config.files import ADDRESSES, ENDPOINT, PEER, TOP, URL, load
 from tests.needs import need
 from uavlinkd.cli import main
-from uavlinkd.endpoints.sockets import Presence
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.ops import surroundings
 
@@ -29,7 +28,7 @@ def lacks(tmp_path: Path) -> Lacks:
         text = f'{TOP}control_socket = "{control}"\nlisten = ["{listen or f"127.0.0.1:{free_port()}"}"]\n'
         text += ENDPOINT.replace(URL, url or f"udpin:127.0.0.1:{free_port()}")
         config = load(tmp_path, text + PEER.replace(ADDRESSES, f'["{address}"]'))
-        return surroundings.look_around(config).lacks
+        return surroundings.look_around(config)
 
     return loading
 
@@ -38,17 +37,6 @@ def test_complete_machine_has_no_line(lacks: Lacks) -> None:
     """Free ports, existing folders, numeric addresses."""
     assert lacks() == []
     assert lacks(listen=f"0.0.0.0:{free_port()}", url=f"tcpin:0.0.0.0:{free_port()}") == []
-
-
-def test_an_address_of_this_daemon_is_no_peers(lacks: Lacks, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It listens on every address. Another port is another software."""
-    port = free_port()
-    assert lacks(f"0.0.0.0:{port}", address=f"192.0.2.7:{port}") == []
-    monkeypatch.setattr(surroundings, "look", lambda _, host: Presence(hosts=(host,)))
-    assert lacks(f"0.0.0.0:{port}", address=f"192.0.2.7:{port}") == [
-        f'peer "drone1": 192.0.2.7:{port} is an address of this daemon itself: write that of the other machine'
-    ]
-    assert lacks(f"0.0.0.0:{port}", address="192.0.2.7:9") == []
 
 
 def test_control_socket(lacks: Lacks, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -70,23 +58,11 @@ def test_check_prints_it_unless_the_file_is_for_another_machine(
         assert ("/dev/no-such-tty is not there" in " ".join(capsys.readouterr().out.split())) == is_shown
 
 
-def test_check_refuses_broadcast_addresses_of_this_machine(
-    lacks: Lacks, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """A peer and a client are one machine each."""
-    need(sys.platform == "linux", "Linux")
-    lacks(url="udpout:127.255.255.255:14550", address="127.255.255.255:5790")
-    assert main(["check", "--config", str(tmp_path / "drone0.toml")]) == 1
-    says = " ".join(capsys.readouterr().out.split())
-    for place in ('endpoint "autopilot": 127.255.255.255:14550', 'peer "drone1": 127.255.255.255:5790'):
-        assert f"error: {place} is a broadcast address: write the address of one machine" in says
-
-
 def test_a_network_that_is_absent(tmp_path: Path) -> None:
     """Its interface may be plugged in later."""
     need(sys.platform == "linux", "Linux")
     networks = "".join(f'[[network]]\nname = "{name}"\ninterface = "{name}"\n' for name in ("lo", "absent0"))
     config = load(tmp_path, TOP + networks + PEER.replace(ADDRESSES, '["203.0.113.7:5790"]'))
-    assert [lack for lack in surroundings.look_around(config).lacks if "network" in lack] == [
+    assert [lack for lack in surroundings.look_around(config) if "network" in lack] == [
         'network "absent0": there is no interface absent0 now: the daemon uses it as soon as it is there'
     ]

@@ -1,4 +1,4 @@
-"""Rules about keys: each is in its place and belongs to one daemon. People paste private keys, and keys of examples.
+"""Rules about keys: each belongs to one daemon. People paste private keys, and keys of examples.
 
 No message repeats a key. A private key in a configuration is exposed, because that file is shown, copied and sent:
 the remedy is always a new key.
@@ -6,12 +6,9 @@ the remedy is always a new key.
 
 from __future__ import annotations
 
-import stat
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import suppress
-from pathlib import Path
+from collections.abc import Iterable, Iterator
 
-from uavlinkd.config.keys import KEY_TEXT_LENGTH, decode_key, encode_key, looks_private
+from uavlinkd.config.keys import encode_key, looks_private
 from uavlinkd.config.problems import Found, Sections, Values, unique
 from uavlinkd.core.crypto import x25519_public_key
 
@@ -24,8 +21,6 @@ EXAMPLE_KEYS = frozenset(
     }
 )
 """The public keys in README.md and configs/. Their private keys do not exist. A test compares this list with them."""
-_MAX_FILES = 512
-_SECRET_FILES = (".key", ".psk")
 _THERE = "write what `uavlinkd pubkey` prints on the {}"
 _EXPOSED = "it is exposed: make a new one there with `uavlinkd keygen`, and write here the public key that it prints"
 
@@ -38,47 +33,23 @@ def check(file: Sections) -> Found:
 
 def _public_keys(file: Sections) -> Found:
     """No secret key is written as a public one, and no key of this daemon as another's."""
-    private, own, files = file.secret(file.top, "private_key_file"), file.own_key, _key_files(file.folder)
-    owners = {section.get("public_key"): section.at() for section in file.others}
-    psks = {psk.reveal() for section in file.others if (psk := file.secret(section, "psk_file"))}
+    private, own = file.secret(file.top, "private_key_file"), file.own_key
     for section in file.others:
         if private is not None and file.secret(section, "psk_file") == private:
             text = "holds this daemon's private key, which must stay secret: make a PSK with `uavlinkd psk`"
             yield section.at("psk_file"), text
         if (key := section.get("public_key")) is None:
             continue
-        half, there = x25519_public_key(key), _THERE.format(section.kind)
+        there = _THERE.format(section.kind)
         if private is not None and key == private.reveal() and not looks_private(key):
             text = f"holds the public key of {section.at()}, not a private key: make this daemon's own with"
             yield "private_key_file", f"{text} `uavlinkd keygen`"
         elif key == own:
             or_else = f"; or private_key_file is that of the {section.kind}: carry each key file to its own machine"
             yield section.at("public_key"), f"is this daemon's own key: {there}{or_else}"
-        elif half == own:
+        elif x25519_public_key(key) == own:
             remedy = f"move its file away, make a new one with `uavlinkd keygen`, and {there}"
             yield section.at("public_key"), f"is this daemon's private key, which must stay secret: {remedy}"
-        elif key in psks:
-            text = f"is a PSK, which must stay secret: make a new PSK with `uavlinkd psk`, and {there}"
-            yield section.at("public_key"), text
-        elif half in owners or key in files:
-            what = f"private key of {owners[half]}" if half in owners else f"secret key in {files[key]}"
-            yield section.at("public_key"), f"is the {what}, which must stay secret; {_EXPOSED}"
-
-
-def _key_files(folder: Path) -> Mapping[bytes, str]:
-    """The secret keys in the small files of a folder, with the names of the files. People keep public keys too."""
-    keys: dict[bytes, str] = {}
-    with suppress(OSError):
-        for number, path in enumerate(folder.iterdir()):
-            if number == _MAX_FILES:
-                break
-            with suppress(OSError, ValueError):
-                status = path.lstat()
-                if stat.S_ISREG(status.st_mode) and KEY_TEXT_LENGTH <= status.st_size <= KEY_TEXT_LENGTH + 4:
-                    key = decode_key(path.read_text(encoding="ascii"))
-                    if path.suffix in _SECRET_FILES or looks_private(key):
-                        keys[key] = path.name
-    return keys
 
 
 def advice(private: bytes, owners: Iterable[Values]) -> Iterator[str]:

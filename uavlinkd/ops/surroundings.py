@@ -6,39 +6,22 @@ resolves no name and sends nothing.
 
 from __future__ import annotations
 
-import errno
 import os
-import socket
 import stat
 from collections.abc import Iterator
-from contextlib import suppress
-from itertools import chain
 from pathlib import Path
-from typing import NamedTuple
 
 from uavlinkd.config.model import Config
-from uavlinkd.endpoints.sockets import family_of, look
+from uavlinkd.endpoints.sockets import look
 from uavlinkd.endpoints.url import NetworkUrl, SerialUrl
-from uavlinkd.system.addresses import Address
 
 _MAX_SOCKET_PATH = 107
 _SERIAL_DEVICES = ("serial/by-id/*", "ttyACM*", "ttyUSB*", "serial0")
 
 
-class Surroundings(NamedTuple):
-    """Sentences for a person. The daemon may run in spite of ``lacks``, now or later. ``errors`` are about addresses
-    that are not those of one machine.
-    """
-
-    lacks: list[str]
-    errors: list[str]
-
-
-def look_around(config: Config) -> Surroundings:
-    lacks = chain(
-        _serial(config), _listening(config), _own_addresses(config), _control_socket(config), _networks(config)
-    )
-    return Surroundings(list(lacks), list(_broadcasts(config)))
+def look_around(config: Config) -> list[str]:
+    """Sentences for a person. The daemon may run in spite of them, now or later."""
+    return [*_serial(config), *_listening(config), *_control_socket(config), *_networks(config)]
 
 
 def _listening(config: Config) -> Iterator[str]:
@@ -55,33 +38,6 @@ def _listening(config: Config) -> Iterator[str]:
                 f"{key}: {address.host} is not an address of this machine now (`ip -brief address` lists them): the"
                 f' daemon uses it as soon as it is; for every address, write "{wildcard}:{address.port}"'
             )
-
-
-def _numeric(config: Config) -> Iterator[tuple[str, Address]]:
-    """The numeric addresses that the daemon sends to, each with its section."""
-    sections = [(f'peer "{peer.name}"', peer.addresses) for peer in config.peers]
-    sections += [(f'relay "{relay.name}"', relay.addresses) for relay in config.relays if relay.peer is None]
-    named = [(section, written.address) for section, addresses in sections for written in addresses]
-    for endpoint in config.endpoints:
-        if isinstance(endpoint.url, NetworkUrl):
-            named.append((f'endpoint "{endpoint.name}"', endpoint.url.address))
-    return ((section, address) for section, address in named if address.ip is not None)
-
-
-def _own_addresses(config: Config) -> Iterator[str]:
-    """Peers, relays and clients whose address is this daemon's."""
-    ports = {address.port for address in config.listen}
-    for section, address in _numeric(config):
-        if address.port in ports and look(None, address.host).hosts:
-            yield f"{section}: {address} is an address of this daemon itself: write that of the other machine"
-
-
-def _broadcasts(config: Config) -> Iterator[str]:
-    """Broadcast addresses, of which the kernel knows those of the interfaces that are up. It refuses to connect."""
-    for section, address in _numeric(config):
-        with socket.socket(family_of(address.host), socket.SOCK_DGRAM) as probe, suppress(OSError):
-            if probe.connect_ex((address.host, address.port)) == errno.EACCES:
-                yield f"{section}: {address} is a broadcast address: write the address of one machine"
 
 
 def _serial(config: Config) -> Iterator[str]:

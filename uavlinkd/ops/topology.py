@@ -21,22 +21,22 @@ from uavlinkd.core.certificates import parse_bulletin
 from uavlinkd.mavlink import dialect
 from uavlinkd.mavlink.policy.compilation import Policy, PolicyRow
 from uavlinkd.mavlink.policy.roles import ROLES
-from uavlinkd.ops.surroundings import Surroundings
 from uavlinkd.relay.forwarding import MemberSettings
 
 _MOST_COLUMNS: Final = 100_000  # more than any line has
 _NEVER_BROKEN: Final = frozenset({"name", "public key", "address", "URL"})
 
 
-def print_topology(config: Config, here: Surroundings | None = None, console: Console | None = None) -> None:
-    """Print the topology: with colours on a terminal, as plain text elsewhere. ``here``: what this machine has.
+def print_topology(config: Config, lacks: Sequence[str] = (), console: Console | None = None) -> None:
+    """Print the topology: with colours on a terminal, as plain text elsewhere. ``lacks``: what this machine
+    does not have now.
 
     Users compare and copy keys and URLs, so none is broken: a table may be wider than the terminal. In a pipe, each
-    row, error and warning is one line, for ``grep``; only policies are folded. What is wrong comes first.
+    row and warning is one line, for ``grep``; only policies are folded. What is wrong comes first.
     """
     if console is None:
         console = Console()
-    facts, policies, verdict = _facts(config), _policies(config), _verdict(config.warnings, here)
+    facts, policies, verdict = _facts(config), _policies(config), _verdict(config.warnings, lacks)
     columns, is_plain = console.width, not console.is_terminal
     printer = Console(no_color=True, force_terminal=False) if is_plain else console
     wide = printer.options.update(width=_MOST_COLUMNS)
@@ -211,18 +211,17 @@ def _endpoint(endpoint: EndpointConfig) -> tuple[str | Text, ...]:
     )
 
 
-def _verdict(warnings: Sequence[str], here: Surroundings | None) -> RenderableType:
-    """All errors and warnings, or a line that says that there is no warning."""
-    lines = [("error:", error) for error in (here.errors if here else ())]
-    lines += [("warning:", warning) for warning in warnings]
-    lines += [("this machine:", lack) for lack in (here.lacks if here else ())]
+def _verdict(warnings: Sequence[str], lacks: Sequence[str]) -> RenderableType:
+    """All warnings, or a line that says that there is none."""
+    lines = [("warning:", warning) for warning in warnings]
+    lines += [("this machine:", lack) for lack in lacks]
     if not lines:
         return Text("No warnings.\n", style="green")
     table = Table.grid(padding=(0, 1))
     table.add_column(no_wrap=True)
     table.add_column(overflow="fold")
     for label, line in lines:
-        table.add_row(Text(label, style="bold red" if label == "error:" else "bold yellow"), Text(line))
+        table.add_row(Text(label, style="bold yellow"), Text(line))
     return Padding(table, (0, 0, 1, 0), expand=False)
 
 
