@@ -93,7 +93,6 @@ class LoggedDaemon:
             self.journal.add("frames_withheld", Refusal.MESSAGE_NOT_ALLOWED, link.name, 100, now, ATTITUDE)
             self.journal.add("frames_withheld", Refusal.RATE_LIMITED, link.name, 10, now, ATTITUDE)
             link.measure(now)
-            self.events.check_link(link, now)
         self.events.write_findings(find(self._parts, self._history, now), now)
         self.drops.check(now)
         self.events.check(now)

@@ -129,7 +129,7 @@ class Daemon:
         problems = Counter[str]()
         for link in parts.links.values():
             problems.update({problem.value: count for problem, count in link.problems(now).items()})
-        counted = {**self.observer.close(now), **+problems, **parts.peer_sockets.serial.totals}
+        counted = {**self.observer.close(), **+problems, **parts.peer_sockets.serial.totals}
         self.log.info("daemon_stopped", uptime_s=round(now - parts.started_at, 1), counted=counted)
 
     def _close_sockets(self) -> None:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections import defaultdict, deque
+from collections import deque
 from collections.abc import Callable, Iterable
 
 from structlog.typing import FilteringBoundLogger
 
 from uavlinkd.core import outputs as o
 from uavlinkd.core.path import Path
-from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.observe.conditions import Conditions, OpenCondition, Phase
 from uavlinkd.observe.finding import Finding, Severity, Subject
 from uavlinkd.ops.line_limits import LineLimits
@@ -43,7 +42,7 @@ class EventLog:
         self._log = log
         self._limits = limits or LineLimits()
         self._network_of = network_of
-        self._watches = defaultdict[str, LinkWatch](LinkWatch)  # by name in the core
+        self._omitted_states: dict[str, _State] = {}  # the latest that a limit omitted, by name in the core
         self._findings: dict[_FindingKey, Finding] = {}
         self._present: dict[_FindingKey, float] = {}  # since when
         self._ended = deque[tuple[Finding, float, float]](maxlen=ENDED_PROBLEMS)  # when they began and ended
@@ -57,7 +56,7 @@ class EventLog:
 
     def check(self, now: float) -> None:
         """Write the lines that are due. Call it about once a second."""
-        for state in [watch.omitted_state for watch in self._watches.values() if watch.omitted_state is not None]:
+        for state in list(self._omitted_states.values()):
             if self._limits.are_used_up("peer", now):
                 break
             self._write_event(state, now)
@@ -70,7 +69,7 @@ class EventLog:
     def forget(self, peer: str) -> None:
         """Forget a peer that was removed."""
         self._finding_conditions.close(lambda key: key[1] is Subject.PEER and key[2] == peer)
-        self._watches.pop(peer, None)
+        self._omitted_states.pop(peer, None)
         self._limits.forget(peer)
 
     # Events of the core.
@@ -86,13 +85,13 @@ class EventLog:
 
     def _write_event(self, event: o.Event, now: float) -> None:
         name = event.peer.name
-        watch, omitted = self._watches[name], self._limits.take("peer", name, now)
-        earlier, watch.omitted_state = watch.omitted_state, None
+        omitted, earlier = self._limits.take("peer", name, now), self._omitted_states.pop(name, None)
         if omitted is None:
             if earlier is not event and (earlier is not None or not isinstance(event, _State)):
                 self._limits.omit("peer", name)
             # A state is written later, so that the log ends with the state of the link.
-            watch.omitted_state = event if isinstance(event, _State) else earlier
+            if (state := event if isinstance(event, _State) else earlier) is not None:
+                self._omitted_states[name] = state
             return
         if earlier is not None and earlier is not event:
             omitted["omitted_before"] = omitted.get("omitted_before", 0) + 1
@@ -130,16 +129,6 @@ class EventLog:
             self._log.info(event, endpoint=endpoint, client=client, **omitted)
 
     # Conditions.
-
-    def check_link(self, link: PeerLink, now: float) -> None:
-        """Note the repair of a link. Call it about once a second."""
-        repair, size, watch = link.output.repair, link.output.copies.repeat_bytes, self._watches[link.name]
-        if repair.is_on and watch.repair is None:
-            watch.repair = now, size
-            self._log.info("repair_began", peer=link.name, transmissions=repair.transmissions)
-        elif not repair.is_on and watch.repair is not None:
-            (began_at, before), watch.repair = watch.repair, None
-            self._log.info("repair_ended", peer=link.name, duration_s=round(now - began_at, 3), bytes=size - before)
 
     def write_pause(self, pause_s: float, now: float) -> None:
         """Write that the process was paused."""
@@ -200,13 +189,3 @@ def _session_facts(session: o.SessionEstablished) -> dict[str, object]:
         "initiated_by": "us" if session.initiator else "peer",
         "rekey": session.rekey,
     }
-
-
-class LinkWatch:
-    """What the log knows of one link."""
-
-    def __init__(self) -> None:
-        self.omitted_state: _State | None = None
-        """The latest that a limit omitted."""
-        self.repair: tuple[float, int] | None = None
-        """When it began, and the bytes of repeats then; None while there is none."""

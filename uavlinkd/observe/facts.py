@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from functools import cached_property
 from typing import Any, Final
 
@@ -95,32 +95,6 @@ class Moment:
         has_address = bool(relay.peer.paths.configured)  # by UDP or TLS
         return is_over and has_address and self.refused_by(relay) is None and not any(certain)
 
-    # System ids.
-
-    def owner(self, system: int, other_than: str) -> str | None:
-        """A peer, or an endpoint here, that has a MAVLink system id, except the one of this name."""
-        return next((name for name in self._owners.get(system, ()) if name != other_than), None)
-
-    @cached_property
-    def _owners(self) -> Mapping[int, list[str]]:
-        """By the file, or because frames of the system were received. Looked up once for all peers."""
-        owners: dict[int, list[str]] = {}
-        for system, name in self._systems():
-            owners.setdefault(system, []).append(name)
-        return owners
-
-    def _systems(self) -> Iterator[tuple[int, str]]:
-        links, router = self.daemon.links.values(), self.daemon.switch.router
-        for link in links:
-            for system in link.policy.incoming.systems or ():
-                yield system, link.name
-        for endpoint in self.daemon.local.endpoints:
-            for system in {system for port in endpoint.ports for system, _ in router.addresses(port)}:
-                yield system, f"endpoint {endpoint.name}"
-        for link in links:
-            for system in {system for system, _ in router.addresses(link)}:
-                yield system, link.name
-
 
 class PartFacts:
     """A peer or an endpoint."""
@@ -128,8 +102,6 @@ class PartFacts:
     def __init__(self, moment: Moment, kind: str, name: str, rules: Mapping[str, object]) -> None:
         self.moment, self.daemon, self.now = moment, moment.daemon, moment.now
         self.name = name
-        self.owner = name if kind == "peer" else f"{kind} {name}"
-        """Its name among those that have system ids."""
         self.history = moment.history.part(kind, name)
         self.rules = rules
         """Its policy, as the file has it."""

@@ -51,8 +51,6 @@ class Observer:
     def sample(self, now: float) -> None:
         """Read the counters of peers and endpoints."""
         links, local = list(self.parts.links.values()), self.parts.local
-        for link in links:
-            run(self.events.check_link, link, now, most=inf)
         endpoints = [(one, local.policies[one.name]) for one in local.endpoints]
         run(self.history.sample, links, endpoints, now, most=inf)
 
@@ -67,10 +65,8 @@ class Observer:
         self.findings = find(self.parts, self.history, now)
         self.events.write_findings(self.findings, now)
 
-    def close(self, now: float) -> dict[str, int]:
+    def close(self) -> dict[str, int]:
         """Write the ends of all conditions: the daemon stops. Returns all drops since the start by reason."""
-        for link in self.parts.links.values():
-            self.events.check_link(link, now)
         self.drops.close()
         self.events.close()
         return self.drops.plain_totals()

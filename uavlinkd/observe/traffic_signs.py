@@ -74,28 +74,17 @@ def foreign_system(part: PartFacts) -> Signs:
     is_all = _is_only_foreign(part)
     systems = part.history.incoming.systems.within(REFUSED_S, part.now)
     if systems and (is_all or "in" not in part.blocked):
-        allowed = part.rules.get("system_ids")
-        owners = {system: part.moment.owner(system, part.owner) for system in sorted(systems)}
+        allowed, how = part.rules.get("system_ids"), "write it into its system_ids"
+        if part.is_certified:
+            how = f"`uavlinkd fleet sign --replace {part.name} --id {min(systems)}` signs it again"
         yield {
             "which": "all" if is_all else "some",
             "systems": listed(map(str, sorted(systems)), 8),
             "ids": listed(map(str, allowed)) if isinstance(allowed, list | tuple) else str(allowed),
             "where": "in its certificate" if part.is_certified else "here",
-            "advice": _advice(part, {system: owner for system, owner in owners.items() if owner}, min(systems)),
+            "how": how,
             **({} if is_all else {"severity": "warning"}),
         }
-
-
-def _advice(part: PartFacts, owners: dict[int, str], first: int) -> str:
-    """What else to do about frames of these systems, of which ``owners`` names some of others."""
-    if owners:  # never advise to trust one peer as another
-        whose = listed(f"{system} is {owner}'s" for system, owner in owners.items())
-        is_captured = f"; if no client there forwards such frames, treat {part.name} as captured"
-        return f": {whose}{is_captured if isinstance(part, PeerFacts) else ''}"
-    remedy = "write it into its system_ids"
-    if part.is_certified:
-        remedy = f"`uavlinkd fleet sign --replace {part.name} --id {first}` signs it again"
-    return f"; or, only if you know that {part.owner} has this id, {remedy}"
 
 
 def _is_only_foreign(part: PartFacts) -> bool:
