@@ -26,6 +26,7 @@ from uavlinkd.lab.evaluation.tampering_plan import FLEET
 from uavlinkd.system.base64_text import to_base64
 
 _GONE_ID, _CAPTURED_ID = 98, 99
+_REVOKED_EARLIER: Final = 900
 _NUMBER: Final = GENERATION + 2
 
 
@@ -62,7 +63,7 @@ class FleetStage(DaemonStage):
             for number, name in enumerate(self.names, 1)
         }
         self.certificate_of_gone = self.authority.certify(self.gone.public, "gone", _GONE_ID)
-        self.revoked = [len(self.names) + 1, len(self.names) + 2]  # a later bulletin may not shrink
+        self.revoked = [len(self.names) + 1, _REVOKED_EARLIER]  # a later bulletin may not shrink
         self.bulletin = self.authority.publish(_NUMBER, *self.revoked)
         await super().open()
 
