@@ -163,12 +163,9 @@ async def test_quick_run(tmp_path: Path) -> None:
     findings = FLIGHT.read(tmp_path)
     assert facts == summary(findings)
     assert [phase for phase, _, _ in findings.spans] == [phase for phase, _ in FlightSettings(quick=True).phases()]
-    for link in LinkKind:
-        assert findings.of("sample", link=link, aircraft="drone0")
-        assert findings.of("sample", link=link, aircraft="drone1")
+    assert all(findings.believed("errors_m", link) for link in LinkKind)
     assert "late_copy" in findings.noticed(LinkKind.OURS, AttackPhase.REPLAY)
     assert "bad_tag" in findings.noticed(LinkKind.OURS, AttackPhase.ALTER)
-    assert "(flight.svg)" in (tmp_path / "flight.md").read_text()
     interventions = [json.loads(line) for line in (tmp_path / "mitm-flight-uavlinkd.jsonl").read_text().splitlines()]
     attacks = {line["attack"] for line in interventions if line["event"] == "intervention"}
     assert attacks >= {"duplicate", "displace-positions", "hold", "drop"}

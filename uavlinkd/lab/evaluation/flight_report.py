@@ -50,17 +50,11 @@ class FlightFindings(RunRecords):
         """Whether a daemon reports at this time that its link is not well."""
         return any(begin_s <= at < end_s for _, begin_s, end_s in self.states())
 
-    def unnoticed_errors_m(self, link: LinkKind) -> list[float]:
-        """The errors of believed positions, without those after which an end reported a problem."""
-        states = self.states() if link is LinkKind.OURS else []
-        return [
-            sample.number("error_m")
-            for sample in self.of("sample", link=link)
-            if not any(
-                begin_s <= sample.number("at_s") and sample.number("accepted_at_s") < end_s
-                for _, begin_s, end_s in states
-            )
-        ]
+    def believed(self, name: str, link: LinkKind, *phases: AttackPhase) -> list[float]:
+        """The ``errors_m`` or ``ages_s`` of the positions believed over a link, in these phases or in all."""
+        wanted = phases or tuple(AttackPhase)
+        chosen = [record for record in self.of("believed", link=link) if record.point["phase"] in wanted]
+        return [value for record in chosen for value in record.values[name]]
 
     def states(self) -> list[tuple[str, float, float]]:
         """What the daemons reported of a link that was not well, with begin and end in seconds."""
@@ -73,10 +67,8 @@ def summary(findings: FlightFindings) -> dict[str, Value]:
     facts: dict[str, Value] = {"quick": findings.run.get("quick"), "duration_s": findings.duration_s}
     for link, name in ((LinkKind.PAPER, "paper"), (LinkKind.OURS, "ours")):
         facts |= {f"{name}_{kind.value}_accepted": findings.count(kind.value, link=link) for kind in _FALSE}
-        facts[f"{name}_max_error_m"] = max(findings.numbers("sample", "error_m", link=link), default=None)
-        facts[f"{name}_max_unnoticed_error_m"] = max(findings.unnoticed_errors_m(link), default=None)
         for phase in AttackPhase:
-            errors = findings.numbers("sample", "error_m", link=link, phase=phase)
+            errors = findings.believed("errors_m", link, phase)
             facts[f"{name}_max_error_m_{phase.name.lower()}"] = max(errors, default=None)
     return facts
 
@@ -113,40 +105,38 @@ def sections(findings: FlightFindings) -> list[ReportSection]:
     is_short = settings.attack_s <= REPORTED_WITHIN_S
     short = f"This run does not check that daemons report within {REPORTED_WITHIN_S:g} s: its attacks are shorter."
     return [
-        ReportSection("Positions believed and positions flown", [_overview(findings)], "flight"),
+        ReportSection("Positions believed and positions flown", [_overview(findings)]),
         ReportSection("Each attack on each link", [_by_phase(findings)]),
         ReportSection("What uavlinkd reported", [_noticed(findings), _states(findings)], text=[short] * is_short),
     ]
 
 
 def _overview(findings: FlightFindings) -> Table:
-    rows = []
-    for link in LinkKind:
-        errors = findings.numbers("sample", "error_m", link=link)
-        counts = [f"{findings.count(name, link=link):,}" for name in ("sent", *Provenance)]
-        rows.append([LINK_NAMES[link], *counts, *_extent(errors), _metres(findings.unnoticed_errors_m(link))])
+    rows = [
+        [LINK_NAMES[link], *_counts(findings, link=link), *_extent(findings.believed("errors_m", link))]
+        for link in LinkKind
+    ]
     head = ["link", "positions sent", "accepted: genuine", "replayed", "altered", "median error", "largest error"]
-    return Table([*head, "largest error that no end reported"], rows)
+    return Table(head, rows)
+
+
+def _counts(findings: FlightFindings, **point: Value) -> list[str]:
+    return [f"{findings.count(name, **point):,}" for name in ("sent", *Provenance)]
 
 
 def _extent(errors: Sequence[float]) -> list[str]:
-    return [f"{median(errors):.1f} m", _metres(errors)] if errors else [NOTHING] * 2
-
-
-def _metres(errors: Sequence[float]) -> str:
-    return f"{max(errors):.1f} m" if errors else NOTHING
+    return [f"{median(errors):.1f} m", f"{max(errors):.1f} m"] if errors else [NOTHING] * 2
 
 
 def _by_phase(findings: FlightFindings) -> Table:
     rows = []
     for phase in AttackPhase:
         for link in LinkKind:
-            errors = findings.numbers("sample", "error_m", link=link, phase=phase)
-            ages = findings.numbers("sample", "age_s", link=link, phase=phase)
-            counts = [f"{findings.count(name, link=link, phase=phase):,}" for name in ("sent", *Provenance)]
-            if errors:
+            ages = findings.believed("ages_s", link, phase)
+            if ages:
+                error = " / ".join(_extent(findings.believed("errors_m", link, phase)))
                 age = f"{duration(median(ages))} / {duration(max(ages))}"
-                rows.append([phase, LINK_NAMES[link], *counts, " / ".join(_extent(errors)), age])
+                rows.append([phase, LINK_NAMES[link], *_counts(findings, link=link, phase=phase), error, age])
     head = ["attack", "link", "sent", *Provenance, "error: median / largest", "age: median / largest"]
     return Table(head, rows)
 

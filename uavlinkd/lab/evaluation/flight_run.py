@@ -40,7 +40,7 @@ from uavlinkd.lab.evaluation.flight_report import FlightFindings, flight_problem
 from uavlinkd.lab.evaluation.frame import Evaluation, Work
 from uavlinkd.lab.evaluation.middle import MiddleHere
 from uavlinkd.lab.evaluation.paper_attacks import PaperRelay
-from uavlinkd.lab.evaluation.records import Record, Value
+from uavlinkd.lab.evaluation.records import Record
 from uavlinkd.lab.evaluation.stage import DaemonStage, PaperStage, Stage, until
 from uavlinkd.lab.mitm.anatomy import mavlink_frame
 from uavlinkd.lab.mitm.attack import AttackObject
@@ -157,7 +157,7 @@ class _Run:
                 attack = AttackPhase.REPLAY if number == 0 else phase
                 await self._run_phase(phase, None if phase is AttackPhase.REPLAY else attack, duration_s)
             duration_s = self._now()
-        self._add_samples()
+        self._add_errors()
         return {"duration_s": round(duration_s, 1)}
 
     def _now(self) -> float:
@@ -245,28 +245,25 @@ class _Run:
                 self._work.add(Record("state", {}, {"at_s": round(self._now(), 3), "state": state}))
             await asyncio.sleep(_NOTICE_S)
 
-    def _add_samples(self) -> None:
+    def _add_errors(self) -> None:
+        """The errors and ages of the positions that the receivers believed in each phase, ten samples a second."""
         for kind, receivers in self._receivers.items():
+            errors: dict[AttackPhase, list[PositionSample]] = {}
             for name, receiver in receivers.items():
-                sender, before = _other(name), AttackPhase.QUIET
+                before = AttackPhase.QUIET
                 for phase, begin_s, end_s in self._phases:
-                    for sample in samples(self._flown[sender], receiver.beliefs, begin_s, end_s, SAMPLE_S):
+                    for sample in samples(self._flown[_other(name)], receiver.beliefs, begin_s, end_s, SAMPLE_S):
                         # An attack has an effect until a position is accepted after its end.
                         is_over = sample.belief.accepted_at >= begin_s
                         cause = before if phase is AttackPhase.QUIET and not is_over else phase
-                        point: dict[str, Value] = {"link": kind.value, "aircraft": sender, "phase": cause.value}
-                        self._work.add(Record("sample", point, _values(sample)))
+                        errors.setdefault(cause, []).append(sample)
                     before = phase
-
-
-def _values(sample: PositionSample) -> dict[str, Value]:
-    return {
-        "at_s": round(sample.at, 3),
-        "error_m": round(sample.error_m, 2),
-        "age_s": round(sample.age_s, 3),
-        "accepted_at_s": round(sample.belief.accepted_at, 3),
-        "provenance": sample.belief.provenance.value,
-    }
+            for phase, chosen in errors.items():
+                values = {
+                    "errors_m": [round(one.error_m, 2) for one in chosen],
+                    "ages_s": [round(one.age_s, 3) for one in chosen],
+                }
+                self._work.add(Record("believed", {"link": kind.value, "phase": phase.value}, values))
 
 
 def _other(name: str) -> str:
@@ -283,5 +280,4 @@ FLIGHT = Evaluation(
     sections=sections,
     problems=flight_problems,
     summary=summary,
-    draw="draw_flight",
 )
