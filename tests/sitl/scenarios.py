@@ -54,7 +54,7 @@ def _alone(scene: Callable[[World, Pilot], Awaitable[Figures]]) -> Scene:
 
 SCENARIOS = (
     Scenario("parameters-mission", _alone(parameters_and_mission), ALL_KINDS, ALL_CONDITIONS),
-    Scenario("flight", _alone(flight), ALL_KINDS, ("clean", "loss10", "loss30", "slow", "delay")),
+    Scenario("flight", _alone(flight), ("ardupilot", "px4", "rover"), ("clean", "loss10", "loss30", "slow", "delay")),
     Scenario("log-file", _alone(log_and_file)),
     Scenario("signing", _alone(signing), ("ardupilot",), has_maintenance_port=True),
     Scenario("two-vehicles", two_vehicles, ("ardupilot", "px4", "own"), vehicles=2),
@@ -64,10 +64,10 @@ SCENARIOS = (
     Scenario("outages", _alone(outages), radios=({},)),
     Scenario("restarts", _alone(restarts)),
     Scenario("two-radios", _alone(two_radios), radios=({}, {})),
-    Scenario("relay", _alone(relayed), ("ardupilot", "px4", "own"), relays=1),
+    Scenario("relay", _alone(relayed), ("ardupilot", "px4"), relays=1),
     Scenario("roles", _alone(roles), ("ardupilot", "px4", "own"), is_direct=True),
-    Scenario("two-relays", _alone(relayed), ("ardupilot", "px4", "own"), relays=2),
-    Scenario("relay-tls", _alone(relayed), ("ardupilot", "own"), relays=1, by_tls=True),
+    Scenario("two-relays", _alone(relayed), ("ardupilot", "px4"), relays=2),
+    Scenario("relay-tls", _alone(relayed), ("ardupilot",), relays=1, by_tls=True),
     Scenario("outages-tls", _alone(outages), ("ardupilot",), relays=1, by_tls=True),
     Scenario("downloads", _alone(downloads), ("ardupilot",), has_maintenance_port=True),
     Scenario("downloads-relay", _alone(downloads), ("ardupilot",), has_maintenance_port=True, relays=1),

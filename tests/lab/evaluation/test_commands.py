@@ -27,11 +27,10 @@ def test_defaults_are_those_of_the_settings(name: str) -> None:
     assert settings_of(evaluation, parse(name, "--out", "x")) == evaluation.settings()
 
 
-@pytest.mark.parametrize("arguments", [("report", "{}"), ("flight", "--quick", "--out", "{}/file")])
-def test_failure_is_one_line(arguments: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A folder without records, and results that cannot be written."""
+def test_failure_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Here results that cannot be written."""
     (tmp_path / "file").write_text("")
-    assert main(["evaluate", *(text.format(tmp_path) for text in arguments)]) == 1
+    assert main(["evaluate", "flight", "--quick", "--out", f"{tmp_path}/file"]) == 1
     assert len(capsys.readouterr().err.splitlines()) == 1
 
 
@@ -47,14 +46,13 @@ def test_the_parsers_and_the_measurements_import_nothing_of_the_figures() -> Non
     subprocess.run([sys.executable, "-c", script], check=True)
 
 
-def test_report_of_an_interrupted_run_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_report_of_an_interrupted_run_says_so(tmp_path: Path) -> None:
+    evaluation = evaluation_of("tampering")
     with RecordWriter(tmp_path, "tampering", {"command": "uavlinkd evaluate", "cores": 2}) as writer:
-        assert main(["evaluate", "report", str(tmp_path)]) == 0
-        assert "Not as expected: the run was interrupted." in (tmp_path / "tampering.md").read_text()
+        page = evaluation.write(tmp_path)
+        assert "Not as expected: the run was interrupted." in page.read_text()
         writer.add(Record("end", {}, {"load_after": 2.5}))
-    page = tmp_path / "tampering.md"
-    assert main(["evaluate", "report", str(tmp_path)]) == 0
-    assert capsys.readouterr().out.splitlines() == [str(page)] * 2
+    evaluation.write(tmp_path)
     assert "Not as expected" not in page.read_text()
     assert "Made by `uavlinkd evaluate`." in page.read_text()
     assert "| load after | 2.5 |" in page.read_text()

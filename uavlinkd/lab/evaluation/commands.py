@@ -32,7 +32,7 @@ _Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 
 def add_evaluations(commands: _Commands) -> None:
-    """Add the evaluations, and ``report``."""
+    """Add the evaluations."""
     _, tampering, _ = (_add(commands, name) for name in EVALUATIONS)
     tampering.add_argument(
         "--only",
@@ -41,9 +41,6 @@ def add_evaluations(commands: _Commands) -> None:
         action="append",
         help=f"run this stage alone; may be repeated: {', '.join(STAGES)} (default: all)",
     )
-    report = commands.add_parser("report", help="write the figures and the report again, from the records")
-    report.add_argument("folder", metavar="DIR", type=Path, help="folder with the records")
-    report.set_defaults(command=_report)
 
 
 def _add(commands: _Commands, name: str) -> argparse.ArgumentParser:
@@ -89,20 +86,6 @@ def _evaluate(options: argparse.Namespace) -> int:
         print(line, file=sys.stderr)
     print(json.dumps(evaluation.summary(findings)))
     return FAILED if problems else OK
-
-
-def _report(options: argparse.Namespace) -> int:
-    if find_spec("matplotlib") is None:
-        return _fail(NEEDS_EXTRA)
-    for name in EVALUATIONS:
-        evaluation = evaluation_of(name)
-        if (options.folder / f"{name}.jsonl").exists():
-            try:
-                print(evaluation.write(options.folder))
-            except _errors() as error:
-                return _fail(error)
-            return OK
-    return _fail(f"{options.folder}: has no records of an evaluation")
 
 
 def _errors() -> tuple[type[Exception], ...]:

@@ -194,7 +194,7 @@ class Drift:
         return displace(frame, metres, metres)
 
 
-class DisplacePositions(Alteration, name="displace-positions", catalogue=("D6",)):
+class DisplacePositions(Alteration, name="displace-positions"):
     """Moves the position in MAVLink frames, bare or in an envelope, and repairs the checksum but not the tag."""
 
     def prepare(self) -> None:

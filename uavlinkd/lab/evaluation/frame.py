@@ -134,9 +134,9 @@ def command(name: str, settings: EvaluationSettings) -> str:
 def _run_section(findings: RunRecords) -> ReportSection:
     facts = {**findings.run, **(findings.of("end")[0].values if findings.of("end") else {})}
     text = (
-        f"Made by `{facts.pop('command', '')}`. `uavlinkd evaluate report DIR` writes this report again from the "
-        "records. The seed determines the choices of the run, but no key. Times contain other load on the machine. "
-        "`uavlinkd/lab/evaluation/RESULTS*.md` of this project explain the tables, with the results of full runs."
+        f"Made by `{facts.pop('command', '')}`. The seed determines the choices of the run, but no key. Times contain"
+        " other load on the machine. `uavlinkd/lab/evaluation/RESULTS*.md` of this project explain the tables, with"
+        " the results of full runs."
     )
     rows = [
         [name.replace("_", " "), str(value)]

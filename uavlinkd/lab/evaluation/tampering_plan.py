@@ -337,11 +337,10 @@ relay lies about addresses | relay-lie,rate_per_s=100 | is_silent
 relay invents handles | relay-invent | least_s=3 needs=relay_unknown_handle,relay_malformed
 relay sends frames of its own | relay-frames,rate_per_s=100 | needs=frames_not_allowed
 relay binds the wrong members | relay-bind-wrong,rate_per_s=100 | least_s=5 needs=unknown_index
-relay restarts, then replays | relay-restart | least_s=6
 """,
     takes_away=True,
 )
-"""On three daemons that reach each other only along a hostile relay. The last two leave gaps in the counters, which
+"""On three daemons that reach each other only along a hostile relay. The last one leaves gaps in the counters, which
 the daemons report later."""
 
 _UNANSWERED: Final = "drop-message,message=response"

@@ -147,9 +147,7 @@ class HostileRelay(ChannelService):
         await super()._close()
 
     def _serve(self, now: float) -> None:
-        """A relay without sessions, bindings and handles."""
-        self._directions.clear()
-        self._targets.clear()
+        """Make a relay without sessions, bindings and handles."""
         self._node = _LyingNode(self.settings.private_key, os.urandom, now)
         self._node.relay = self
         shell = RelayShell(
@@ -191,9 +189,6 @@ class HostileRelay(ChannelService):
         host, port = self._victim.getsockname()
         return host, port
 
-    def is_connected(self, direction: Direction) -> bool:
-        return direction in self._targets
-
     def record(self, done: Intervention) -> None:
         self.journal.add(done)
 
@@ -214,11 +209,6 @@ class HostileRelay(ChannelService):
 
     def send_frames(self, member: str, frame: bytes) -> None:
         self._perform(self._node.send(self._peer(member), [frame], monotonic()))
-
-    def restart(self) -> None:
-        now = monotonic()
-        self.event("restarted")
-        self._serve(now)
 
     def _peer(self, name: str) -> Peer:
         return self._service.members[self.keys[name]].peer

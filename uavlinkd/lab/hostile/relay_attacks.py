@@ -1,4 +1,4 @@
-"""Attacks on what only a relay does: assigning handles, reporting addresses, sessions with all members, restarting.
+"""Attacks on what only a relay does: assigning handles, reporting addresses, sessions with all members.
 
 They are attacks as those of the man in the middle, which a relay can run too. ``direction=A>B`` limits them to what
 the relay sends to B.
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 from abc import abstractmethod
-from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -18,23 +17,16 @@ from uavlinkd.core import constants as c
 from uavlinkd.core.relay_records import Bound, wrap
 from uavlinkd.lab.mitm.anatomy import DatagramKind
 from uavlinkd.lab.mitm.attack import (
-    NEVER,
     Action,
     Attack,
     AttackContext,
     Direction,
     Intervention,
     Operation,
-    Send,
     Timed,
 )
 from uavlinkd.lab.mitm.attacks import ATTACKS
 from uavlinkd.lab.mitm.attacks.forgery import COMMAND_FRAMES
-
-RECORDED: Final = 512
-"""Datagrams that a relay keeps, to send them again after its restart."""
-REPLAYS_AT_ONCE: Final = 10
-REPLAY_EVERY_S: Final = 0.01
 
 
 class AttackedRelay(Protocol):
@@ -45,9 +37,6 @@ class AttackedRelay(Protocol):
     @property
     def victim(self) -> tuple[str, int]:
         """An address that is not a member's."""
-
-    def is_connected(self, direction: Direction) -> bool:
-        """Whether members have handles for this direction now."""
 
     def record(self, done: Intervention) -> None:
         """Count an attempt."""
@@ -60,9 +49,6 @@ class AttackedRelay(Protocol):
 
     def send_frames(self, member: str, frame: bytes) -> None:
         """Send a frame in the relay's session with a member."""
-
-    def restart(self) -> None:
-        """Forget all sessions, bindings and handles."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,50 +151,7 @@ class SendOwnFrames(RelayAttack, name="relay-frames", rate_per_s=20.0):
         return []
 
 
-class RestartAndReplay(RelayAttack, name="relay-restart", rate_per_s=0.4):
-    """Forgets everything, and sends what it recorded before along the handles that it assigns afterwards.
-
-    The first restart is after one interval.
-    """
-
-    def prepare(self) -> None:
-        super().prepare()
-        self._next_at += 1 / self.options.rate_per_s
-        self._recorded: deque[tuple[bytes, Direction]] = deque(maxlen=RECORDED)
-        self._replays: deque[tuple[bytes, Direction]] = deque()
-        self._replay_at = NEVER
-
-    def observe(self, datagram: bytes, direction: Direction, now: float) -> None:
-        del now
-        self._recorded.append((datagram, direction))
-
-    def send_next(self, now: float) -> list[Action]:
-        if self.should_attack():
-            self._replays, self._replay_at = self._recorded.copy(), now + REPLAY_EVERY_S
-            self.relay.restart()
-        return []
-
-    def due(self, now: float) -> list[Action]:
-        actions = super().due(now)
-        if now < self._replay_at:
-            return actions
-        for _ in range(min(REPLAYS_AT_ONCE, len(self._replays))):
-            datagram, direction = self._replays.popleft()
-            if self.relay.is_connected(direction):
-                note = self.own(Operation.REPLAYED, datagram, direction, now, "after a restart of the relay")
-                actions += [Send(datagram, direction), note]
-            else:  # the members are not bound to each other again
-                self._replays.append((datagram, direction))
-        self._replay_at = now + REPLAY_EVERY_S if self._replays else NEVER
-        return actions
-
-    def next_deadline(self) -> float:
-        return min(super().next_deadline(), self._replay_at)
-
-
-_ALL: tuple[type[RelayAttack], ...] = (
-    *(LieAboutAddresses, BindWrongMembers, InventHandles, SendOwnFrames, RestartAndReplay),
-)
+_ALL: tuple[type[RelayAttack], ...] = (*(LieAboutAddresses, BindWrongMembers, InventHandles, SendOwnFrames),)
 RELAY_ATTACKS: Final[Mapping[str, type[RelayAttack]]] = MappingProxyType({one.name: one for one in _ALL})
 ALL_ATTACKS: Final[Mapping[str, type[Attack]]] = MappingProxyType({**RELAY_ATTACKS, **ATTACKS})
 """All that a relay can do: its own attacks, and those of the man in the middle on what it forwards."""

@@ -183,20 +183,16 @@ class PassiveAttack:
 class Attack(PassiveAttack, ABC):
     """The base class of all attacks: when they are active, in which direction, and how often.
 
-    A class is a row of the catalogue if it has a name: ``class Truncate(Forgery, name="truncate", catalogue=("H18",
-    "D7"), kinds="envelope")``. The further arguments are parameters that it takes, with their defaults.
-    ``uavlink-mitm --list`` shows the first line of its docstring.
+    A class can be chosen if it has a name: ``class Truncate(Forgery, name="truncate", kinds="envelope")``. Further
+    arguments are its parameters with their defaults. ``uavlink-mitm --list`` shows the first line of its docstring.
     """
 
     name: ClassVar[str] = ""
-    catalogue: ClassVar[tuple[str, ...]] = ()
-    """IDs of the threat catalogue: H for the handshake, D for data."""
     takes: ClassVar[Mapping[str, object]] = {}
     options_model: ClassVar[type[Options]] = options_with({})
 
-    def __init_subclass__(cls, name: str = "", catalogue: tuple[str, ...] = (), **takes: object) -> None:
+    def __init_subclass__(cls, name: str = "", **takes: object) -> None:
         cls.name = name or cls.name
-        cls.catalogue = catalogue or cls.catalogue
         cls.takes = {**cls.takes, **takes}
         cls.options_model = options_with(cls.takes)
 

@@ -9,7 +9,7 @@ All ground stations receive each frame: they share one link and one sequence of 
 from __future__ import annotations
 
 import math
-from collections import Counter, OrderedDict, deque
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
@@ -17,10 +17,10 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from uavlinkd.lab.sim.mav_commands import Command, Commands
-from uavlinkd.lab.sim.mission import MissionPilot, Missions
+from uavlinkd.lab.sim.mission import Missions
 from uavlinkd.lab.sim.parameters import ParameterTable
 from uavlinkd.lab.sim.telemetry import MAX_RATE_HZ, Streams, Telemetry, default_rates
-from uavlinkd.lab.sim.vehicle import GeoPoint, Landed, Mode, Vehicle
+from uavlinkd.lab.sim.vehicle import GeoPoint, Landed, Vehicle
 from uavlinkd.mavlink.frames import SplitCounters, split_datagram
 
 MOVE_EVERY_S: Final = 0.05
@@ -71,10 +71,9 @@ class Autopilot:
         self.vehicle = Vehicle(self.settings.home)
         self.parameters = ParameterTable(self.settings.system_id)
         self.missions = Missions(self.send, self._plan_changed)
-        self.pilot = MissionPilot(self.vehicle, self.missions)
         self.streams = Streams(default_rates(self.settings.attitude_rate_hz), started_at)
         self.commands = Commands(self)
-        self._telemetry = Telemetry(self.vehicle, self.missions, seed=self.settings.seed, unix_epoch_us=unix_epoch_us)
+        self._telemetry = Telemetry(self.vehicle, seed=self.settings.seed, unix_epoch_us=unix_epoch_us)
         self._codec = mavlink.MAVLink(None, self.settings.system_id, COMPONENT_ID)
         self._on_event = on_event
         self._started_at = started_at
@@ -82,9 +81,7 @@ class Autopilot:
         self._out: list[bytes] = []
         self._parameters_to_send: deque[int] = deque()
         self._parameter_due_at = started_at
-        # The last heartbeat of each ground station, by (system, component), the latest last.
-        self._stations: OrderedDict[tuple[int, int], float] = OrderedDict()
-        self._gcs_lost = False
+        self._stations: set[tuple[int, int]] = set()
         self._handlers: dict[str, Callable[[Message, float], None]] = {
             "HEARTBEAT": self._on_heartbeat,
             "PARAM_REQUEST_LIST": self._on_param_request_list,
@@ -93,8 +90,6 @@ class Autopilot:
             "COMMAND_LONG": self._on_command_long,
             "COMMAND_INT": self._on_command_int,
             "SET_MODE": self._on_set_mode,
-            "REQUEST_DATA_STREAM": self._on_request_data_stream,
-            "MISSION_SET_CURRENT": self._on_mission_set_current,
             "FILE_TRANSFER_PROTOCOL": self._on_file_transfer,
             "TIMESYNC": self._on_timesync,
             **dict.fromkeys(
@@ -127,13 +122,6 @@ class Autopilot:
             self.emit("landed")
         if was_armed and not self.vehicle.armed:
             self.emit("disarmed")
-        mode = self.vehicle.mode
-        for sequence in self.pilot.advance():
-            self.emit("mission_item_reached", sequence=sequence)
-            self.send(mavlink.MAVLink_mission_item_reached_message(sequence))
-        if self.vehicle.mode is not mode:
-            self.emit("mode_changed", mode=self.vehicle.mode.name)
-        self._watch_stations(now)
         self.missions.advance(now)
         while self._parameters_to_send and self._parameter_due_at <= now:
             self._send_parameter(self._parameters_to_send.popleft())
@@ -184,32 +172,15 @@ class Autopilot:
         if handle is not None:
             handle(message, now)
 
-    def _watch_stations(self, now: float) -> None:
-        """ArduPilot's ground station failsafe: silence for FS_GCS_TIMEOUT brings the copter home."""
-        if not self._stations or self._gcs_lost:
-            return
-        last_seen_at = next(reversed(self._stations.values()))
-        if now - last_seen_at < self.parameters["FS_GCS_TIMEOUT"]:
-            return
-        self._gcs_lost = True
-        self.emit("gcs_lost", after_s=round(now - last_seen_at, 3))
-        flying = self.vehicle.armed and self.vehicle.landed is not Landed.ON_GROUND
-        if flying and self.parameters["FS_GCS_ENABLE"] and self.vehicle.mode not in (Mode.RTL, Mode.LAND):
-            self.emit("gcs_failsafe")
-            self.send(mavlink.MAVLink_statustext_message(mavlink.MAV_SEVERITY_WARNING, b"GCS Failsafe"))
-            self.commands.set_mode(Mode.RTL)
-
-    def _on_heartbeat(self, message: Message, now: float) -> None:
-        if message.type != mavlink.MAV_TYPE_GCS:
-            return
+    def _on_heartbeat(self, message: Message, _now: float) -> None:
         station = (message.get_srcSystem(), message.get_srcComponent())
-        if station not in self._stations or self._gcs_lost:
-            self._gcs_lost = False
+        if (
+            message.type == mavlink.MAV_TYPE_GCS
+            and station not in self._stations
+            and len(self._stations) < MAX_STATIONS
+        ):
+            self._stations.add(station)
             self.emit("gcs_connected", system_id=station[0], component_id=station[1])
-        self._stations[station] = now
-        self._stations.move_to_end(station)
-        if len(self._stations) > MAX_STATIONS:
-            self._stations.popitem(last=False)
 
     def _on_param_request_list(self, _message: Message, now: float) -> None:
         if not self._parameters_to_send:
@@ -273,15 +244,6 @@ class Autopilot:
         result = self.commands.set_mode(message.custom_mode)
         self._acknowledge(message, mavlink.MAVLINK_MSG_ID_SET_MODE, result)  # as ArduPilot does
 
-    def _on_request_data_stream(self, message: Message, now: float) -> None:
-        rate = message.req_message_rate if message.start_stop else 0
-        self.streams.set_group(message.req_stream_id, rate, now)
-
-    def _on_mission_set_current(self, message: Message, now: float) -> None:
-        if self.missions.set_current(message.seq):
-            self.pilot.restart()
-        self.send_by_number(mavlink.MAVLINK_MSG_ID_MISSION_CURRENT, now)
-
     def _on_file_transfer(self, message: Message, _now: float) -> None:
         """Refuse, because there are no files: a ground station then uses the parameter protocol immediately."""
         request = bytes(message.payload)
@@ -298,7 +260,6 @@ class Autopilot:
     def _plan_changed(self, partner: tuple[int, int]) -> None:
         items = len(self.missions.plan)
         self.parameters.preset("MIS_TOTAL", items)
-        self.pilot.restart()
         self.emit("mission_received", items=items, system_id=partner[0])
 
 

@@ -29,7 +29,7 @@ class Flight:
     """One simulated autopilot at a MAVLink URL, as an asynchronous context.
 
     ``on_event`` is called with a name and fields: armed, disarmed, takeoff_started, landed, mode_changed,
-    parameter_set, mission_received, mission_item_reached, gcs_connected, gcs_lost, gcs_failsafe.
+    parameter_set, mission_received, gcs_connected.
     """
 
     def __init__(self, url: str, settings: AutopilotSettings | None = None, *, on_event: Event | None = None) -> None:

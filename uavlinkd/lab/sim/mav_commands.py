@@ -9,7 +9,7 @@ from typing import Final, Protocol
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from uavlinkd.lab.sim.mission import MissionPilot, Missions, point_of
+from uavlinkd.lab.sim.mission import point_of
 from uavlinkd.lab.sim.telemetry import Streams
 from uavlinkd.lab.sim.vehicle import Landed, Mode, Vehicle
 
@@ -39,8 +39,6 @@ class Commanded(Protocol):
     """The parts of an autopilot that commands use."""
 
     vehicle: Vehicle
-    missions: Missions
-    pilot: MissionPilot
     streams: Streams
 
     def send(self, message: mavlink.MAVLink_message) -> None:
@@ -65,7 +63,6 @@ class Commands:
             mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda _command, _now: self.set_mode(Mode.RTL),
             mavlink.MAV_CMD_DO_SET_MODE: lambda command, _now: self.set_mode(int(command.parameters[1])),
             mavlink.MAV_CMD_DO_REPOSITION: self._reposition,
-            mavlink.MAV_CMD_MISSION_START: self._start_mission,
             mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_interval,
             mavlink.MAV_CMD_REQUEST_MESSAGE: self._send_message,
             mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: self._send_version,
@@ -88,11 +85,8 @@ class Commands:
         except ValueError:
             return DENIED
         autopilot = self._autopilot
-        if mode is Mode.AUTO and not autopilot.missions.plan:
-            return FAILED  # nothing to fly
         if autopilot.vehicle.mode is not mode:
             autopilot.vehicle.set_mode(mode)
-            autopilot.pilot.restart()
             autopilot.emit("mode_changed", mode=mode.name)
         return ACCEPTED
 
@@ -102,7 +96,6 @@ class Commands:
         if wanted == 1:
             if not vehicle.armed:
                 vehicle.arm()
-                self._autopilot.pilot.restart()
                 self._autopilot.emit("armed")
             return ACCEPTED
         if wanted != 0:
@@ -135,11 +128,6 @@ class Commands:
         self.set_mode(Mode.GUIDED)
         vehicle.go_to(point_of(vehicle, command.frame, command.x, command.y, command.z))
         return ACCEPTED
-
-    def _start_mission(self, _command: Command, _now: float) -> int:
-        if not self._autopilot.vehicle.armed:
-            return FAILED
-        return self.set_mode(Mode.AUTO)
 
     def _set_interval(self, command: Command, now: float) -> int:
         message, interval_us = int(command.parameters[0]), command.parameters[1]

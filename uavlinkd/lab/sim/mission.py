@@ -1,4 +1,4 @@
-"""Missions: their transfer (one upload at a time, any number of downloads), and the flight along them in AUTO.
+"""The transfer of missions: one upload at a time, any number of downloads.
 
 Source of the exchange: https://mavlink.io/en/services/mission.html
 """
@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from uavlinkd.lab.sim.vehicle import Axes, GeoPoint, Landed, Mode, Vehicle
+from uavlinkd.lab.sim.vehicle import Axes, GeoPoint, Vehicle
 
 # A bound on memory.
 MAX_ITEMS: Final = 1000
@@ -60,7 +60,6 @@ class Missions:
         self._changed = changed
         self.plan: list[Item] = []
         self._upload: _Upload | None = None
-        self.current = 0
 
     @property
     def next_due_at(self) -> float:
@@ -108,20 +107,12 @@ class Missions:
                 if self._upload and self._upload.partner == partner and message.type:
                     self._upload = None
 
-    def set_current(self, sequence: int) -> bool:
-        """Change the current item; False if it does not exist."""
-        if not 0 <= sequence < max(len(self.plan), 1):
-            return False
-        self.current = sequence
-        return True
-
     def _send_item(self, partner: Partner, sequence: int) -> None:
         if sequence >= len(self.plan):
             self._acknowledge(partner, mavlink.MAV_MISSION_INVALID_SEQUENCE)
             return
         item = self.plan[sequence]
-        current = int(sequence == self.current)
-        head = (*partner, sequence, item.frame, item.command, current, item.autocontinue, *item.parameters)
+        head = (*partner, sequence, item.frame, item.command, int(sequence == 0), item.autocontinue, *item.parameters)
         # Also for the older MISSION_REQUEST, as in PX4.
         self._send(mavlink.MAVLink_mission_item_int_message(*head, item.x, item.y, item.z))
 
@@ -163,7 +154,6 @@ class Missions:
 
     def _store(self, items: list[Item], partner: Partner) -> None:
         self.plan = items
-        self.current = 0
         self._changed(partner)
 
     def _ask(self, upload: _Upload, now: float) -> None:
@@ -184,13 +174,6 @@ LOCAL_FRAMES: Final = (mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_LOCAL_ENU,
 
 
 ABSOLUTE_FRAMES: Final = (mavlink.MAV_FRAME_GLOBAL, mavlink.MAV_FRAME_GLOBAL_INT)
-# A copter flies to each of these.
-WAYPOINTS: Final = (
-    mavlink.MAV_CMD_NAV_WAYPOINT,
-    mavlink.MAV_CMD_NAV_SPLINE_WAYPOINT,
-    mavlink.MAV_CMD_NAV_LOITER_TIME,
-    mavlink.MAV_CMD_NAV_LOITER_UNLIM,
-)
 
 
 def point_of(vehicle: Vehicle, frame: int, x: int, y: int, z: float) -> Axes:
@@ -202,59 +185,3 @@ def point_of(vehicle: Vehicle, frame: int, x: int, y: int, z: float) -> Axes:
     if x == 0 and y == 0:
         return Axes(vehicle.position.north, vehicle.position.east, altitude - vehicle.home.altitude_m)
     return vehicle.point_of(GeoPoint(x / 1e7, y / 1e7, altitude))
-
-
-class MissionPilot:
-    """Follows the plan while the mode is AUTO. As in ArduPilot, item 0 is home and not a waypoint."""
-
-    def __init__(self, vehicle: Vehicle, missions: Missions) -> None:
-        self._vehicle = vehicle
-        self._missions = missions
-        self._begun: int | None = None
-
-    def restart(self) -> None:
-        """Start the current item again, after a change of the mode, the plan or the current item."""
-        self._begun = None
-
-    def advance(self) -> list[int]:
-        """Continue the mission, and return the reached items."""
-        vehicle, missions = self._vehicle, self._missions
-        reached: list[int] = []
-        # If all items are skipped, the loop ends at the last one.
-        while vehicle.armed and vehicle.mode is Mode.AUTO and missions.plan:
-            sequence = missions.current
-            if self._begun != sequence:
-                self._begun = sequence
-                self._begin(sequence, missions.plan[sequence])
-            if not self._is_done(sequence, missions.plan[sequence]):
-                break
-            if sequence > 0:
-                reached.append(sequence)
-            if not missions.set_current(sequence + 1) and vehicle.mode is Mode.AUTO:
-                # The end of the plan: hold the position, unless the last item was to return or land.
-                vehicle.set_mode(Mode.LOITER)
-        return reached
-
-    def _begin(self, sequence: int, item: Item) -> None:
-        vehicle = self._vehicle
-        if sequence == 0:
-            return
-        point = point_of(vehicle, item.frame, item.x, item.y, item.z)
-        if item.command == mavlink.MAV_CMD_NAV_TAKEOFF:
-            vehicle.take_off(max(point.up, 0.5))
-        elif vehicle.landed is Landed.ON_GROUND:
-            return
-        elif item.command in WAYPOINTS:
-            vehicle.go_to(point)
-        elif item.command == mavlink.MAV_CMD_NAV_LAND:
-            vehicle.land()
-        elif item.command == mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH:
-            vehicle.set_mode(Mode.RTL)
-
-    def _is_done(self, sequence: int, item: Item) -> bool:
-        if sequence == 0 or item.command not in (*WAYPOINTS, mavlink.MAV_CMD_NAV_TAKEOFF, mavlink.MAV_CMD_NAV_LAND):
-            return True
-        # As in ArduCopter, a waypoint without a take-off before it never starts.
-        if item.command == mavlink.MAV_CMD_NAV_LAND:
-            return self._vehicle.landed is Landed.ON_GROUND
-        return self._vehicle.landed is not Landed.ON_GROUND and self._vehicle.has_arrived()

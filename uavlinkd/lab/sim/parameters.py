@@ -51,8 +51,6 @@ def _defaults(system_id: int) -> list[Parameter]:
         Parameter("COMPASS_USE", i8, 1),
         Parameter("FENCE_ENABLE", i8, 0),
         Parameter("FENCE_RADIUS", real, 300.0),
-        Parameter("FS_GCS_ENABLE", i8, 1),
-        Parameter("FS_GCS_TIMEOUT", real, 5.0),
         Parameter("LAND_SPEED", i16, 100),
         Parameter("LOG_BITMASK", i32, 176_126),
         Parameter("MIS_TOTAL", i16, 0, read_only=True),

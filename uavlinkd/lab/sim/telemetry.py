@@ -9,28 +9,11 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from uavlinkd.lab.sim.mission import Missions
 from uavlinkd.lab.sim.vehicle import Landed, Vehicle
 
 MAX_RATE_HZ: Final = 1000.0
 # Messages later than this are skipped, so that a pause is not followed by a burst of outdated messages.
 MAX_LATE_S: Final = 0.25
-
-# The groups of REQUEST_DATA_STREAM, as in ArduCopter (only simulated messages).
-GROUPS: Final[dict[int, tuple[int, ...]]] = {
-    mavlink.MAV_DATA_STREAM_EXTENDED_STATUS: (
-        mavlink.MAVLINK_MSG_ID_SYS_STATUS,
-        mavlink.MAVLINK_MSG_ID_GPS_RAW_INT,
-        mavlink.MAVLINK_MSG_ID_MISSION_CURRENT,
-    ),
-    mavlink.MAV_DATA_STREAM_POSITION: (
-        mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
-        mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
-    ),
-    mavlink.MAV_DATA_STREAM_EXTRA1: (mavlink.MAVLINK_MSG_ID_ATTITUDE,),
-    mavlink.MAV_DATA_STREAM_EXTRA2: (mavlink.MAVLINK_MSG_ID_VFR_HUD,),
-    mavlink.MAV_DATA_STREAM_EXTRA3: (mavlink.MAVLINK_MSG_ID_SYSTEM_TIME,),
-}
 
 
 def default_rates(attitude_rate_hz: float) -> dict[int, float]:
@@ -46,7 +29,6 @@ def default_rates(attitude_rate_hz: float) -> dict[int, float]:
         mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: 1.0,
         mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 1.0,
         mavlink.MAVLINK_MSG_ID_HOME_POSITION: 0.5,
-        mavlink.MAVLINK_MSG_ID_MISSION_CURRENT: 1.0,
     }
 
 
@@ -73,15 +55,6 @@ class Streams:
         else:
             self._due_at[message] = min(self._due_at.get(message, now), now + 1 / rate)
         self.next_due_at = min(self._due_at.values())
-        return True
-
-    def set_group(self, group: int, rate_hz: float, now: float) -> bool:
-        """Change the rates of a MAV_DATA_STREAM, or of all of them. False if it is unknown."""
-        groups = list(GROUPS) if group == mavlink.MAV_DATA_STREAM_ALL else [group]
-        if not GROUPS.keys() >= set(groups):
-            return False
-        for message in (message for number in groups for message in GROUPS[number]):
-            self.set_rate(message, rate_hz, now)
         return True
 
     def take_due(self, now: float) -> list[int]:
@@ -129,9 +102,8 @@ FLIGHT_VERSION: Final = 4 << 24 | 6 << 16 | 0 << 8 | mavlink.FIRMWARE_VERSION_TY
 class Telemetry:
     """Creates messages from the vehicle's state. The seed determines the sensor noise."""
 
-    def __init__(self, vehicle: Vehicle, missions: Missions, *, seed: int, unix_epoch_us: int) -> None:
+    def __init__(self, vehicle: Vehicle, *, seed: int, unix_epoch_us: int) -> None:
         self._vehicle = vehicle
-        self._missions = missions
         self._random = Random(seed)  # noqa: S311  seeded noise of a simulated sensor
         self._unix_epoch_us = unix_epoch_us
         self._messages: dict[int, Callable[[float], Message]] = {
@@ -142,7 +114,6 @@ class Telemetry:
             mavlink.MAVLINK_MSG_ID_ATTITUDE: self._attitude,
             mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: self._local_position_ned,
             mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: self._global_position_int,
-            mavlink.MAVLINK_MSG_ID_MISSION_CURRENT: self._mission_current,
             mavlink.MAVLINK_MSG_ID_VFR_HUD: self._vfr_hud,
             mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: self._autopilot_version,
             mavlink.MAVLINK_MSG_ID_HOME_POSITION: self._home_position,
@@ -160,7 +131,7 @@ class Telemetry:
     def _heartbeat(self, _up_s: float) -> Message:
         vehicle = self._vehicle
         base_mode = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | mavlink.MAV_MODE_FLAG_STABILIZE_ENABLED
-        if vehicle.mode.name in {"AUTO", "GUIDED", "LOITER", "RTL", "LAND"}:
+        if vehicle.mode.name in {"GUIDED", "LOITER", "RTL", "LAND"}:
             base_mode |= mavlink.MAV_MODE_FLAG_GUIDED_ENABLED
         if vehicle.armed:
             base_mode |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED
@@ -240,9 +211,6 @@ class Telemetry:
             round(-100 * vehicle.velocity.up),
             round(100 * math.degrees(vehicle.yaw_rad)) % 36000,
         )
-
-    def _mission_current(self, _up_s: float) -> Message:
-        return mavlink.MAVLink_mission_current_message(self._missions.current, total=len(self._missions.plan))
 
     def _vfr_hud(self, _up_s: float) -> Message:
         vehicle = self._vehicle

@@ -21,7 +21,6 @@ class Mode(IntEnum):
 
     STABILIZE = 0
     ALT_HOLD = 2
-    AUTO = 3
     GUIDED = 4
     LOITER = 5
     RTL = 6

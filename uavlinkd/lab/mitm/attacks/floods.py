@@ -35,7 +35,7 @@ class Flood(Timed, rate_per_s=500.0, sources=64):
         raise NotImplementedError
 
 
-class FloodInitiations(Flood, name="flood-initiations", catalogue=("H12",), mac1="valid", certificate=False):
+class FloodInitiations(Flood, name="flood-initiations", mac1="valid", certificate=False):
     """Floods with random initiations, with a valid or bad mac1, from many addresses."""
 
     def prepare(self) -> None:
@@ -50,7 +50,7 @@ class FloodInitiations(Flood, name="flood-initiations", catalogue=("H12",), mac1
         return random_initiation(self.rng, X25519, key, more), f"{self.options.mac1} mac1"
 
 
-class FloodReplays(Flood, name="flood-replays", catalogue=("H3", "H12"), kinds="initiation"):
+class FloodReplays(Flood, name="flood-replays", kinds="initiation"):
     """Floods with recorded initiations, from many addresses."""
 
     def prepare(self) -> None:
@@ -73,7 +73,7 @@ _HOSTILE_TEXT = (
 """Text that a log reader or a terminal might interpret."""
 
 
-class FloodGarbage(Flood, name="flood-garbage", catalogue=("H21", "D15", "D21")):
+class FloodGarbage(Flood, name="flood-garbage"):
     """Floods with random bytes, empty datagrams, and text that would forge log lines."""
 
     def make(self, direction: Direction) -> tuple[bytes, str]:
@@ -89,7 +89,7 @@ class FloodGarbage(Flood, name="flood-garbage", catalogue=("H21", "D15", "D21"))
                 return self.rng.randbytes(self.rng.randrange(1, 1400)), "garbage"
 
 
-class StrangerScan(Flood, name="stranger-scan", catalogue=("H21",), rate_per_s=200.0, sources=4):
+class StrangerScan(Flood, name="stranger-scan", rate_per_s=200.0, sources=4):
     """Looks for an answer like a port scanner: every first byte, in datagrams of valid lengths."""
 
     def make(self, direction: Direction) -> tuple[bytes, str]:
@@ -100,7 +100,7 @@ class StrangerScan(Flood, name="stranger-scan", catalogue=("H21",), rate_per_s=2
         return (bytes((kind, 0)) + self.rng.randbytes(length))[:length], f"type {kind:#04x}"
 
 
-class AmplificationProbe(Flood, name="amplification-probe", catalogue=("H13", "H21"), rate_per_s=300.0, sources=4):
+class AmplificationProbe(Flood, name="amplification-probe", rate_per_s=300.0, sources=4):
     """Sends short datagrams that a peer might answer. The statistics have the bytes of longer answers.
 
     The rate makes the peer require cookies.
@@ -126,7 +126,7 @@ class AmplificationProbe(Flood, name="amplification-probe", catalogue=("H13", "H
         return random_initiation(self.rng, X25519, key), "initiation"
 
 
-class ForgeHints(Flood, name="forge-hints", catalogue=("H16",), rate_per_s=100.0, sources=0):
+class ForgeHints(Flood, name="forge-hints", rate_per_s=100.0, sources=0):
     """Sends envelopes for unknown sessions, so that a peer believes that the other lost its session."""
 
     def make(self, direction: Direction) -> tuple[bytes, str]:
@@ -135,7 +135,7 @@ class ForgeHints(Flood, name="forge-hints", catalogue=("H16",), rate_per_s=100.0
         return header + self.rng.randbytes(32), f"index {index}"
 
 
-class ForgeCookie(Attack, name="forge-cookie", catalogue=("H19",), copies=1):
+class ForgeCookie(Attack, name="forge-cookie", copies=1):
     """Answers handshake messages with forged cookie replies that have the right index, before the peer answers.
 
     The cookies cannot be decrypted: that needs ChaCha20-Poly1305, and this package computes only ``mac1``.

@@ -37,7 +37,7 @@ class Forgery(Alteration, kinds="envelope", beside=False):
         return self._turns[kind] - 1
 
 
-class BitFlip(Forgery, name="bit-flip", catalogue=("H18", "D6"), repair_mac1=False):
+class BitFlip(Forgery, name="bit-flip", repair_mac1=False):
     """Flips one bit, at all positions in turn."""
 
     def alter(self, datagram: bytes, direction: Direction) -> tuple[bytes, str]:
@@ -53,7 +53,7 @@ class BitFlip(Forgery, name="bit-flip", catalogue=("H18", "D6"), repair_mac1=Fal
         return changed, f"bit {bit} of byte {at}"
 
 
-class Truncate(Forgery, name="truncate", catalogue=("H18", "D7", "D15")):
+class Truncate(Forgery, name="truncate"):
     """Truncates datagrams by one byte, two bytes, and so on, until they are empty."""
 
     def alter(self, datagram: bytes, direction: Direction) -> tuple[bytes, str]:
@@ -61,7 +61,7 @@ class Truncate(Forgery, name="truncate", catalogue=("H18", "D7", "D15")):
         return datagram[:-cut], f"{cut} bytes cut off"
 
 
-class Extend(Forgery, name="extend", catalogue=("H18", "D8", "D15")):
+class Extend(Forgery, name="extend"):
     """Appends bytes to datagrams: one, two, and so on."""
 
     def alter(self, datagram: bytes, direction: Direction) -> tuple[bytes, str]:
@@ -76,7 +76,7 @@ class OfEnvelopes(Forgery):
         return envelope_of(datagram) is not None
 
 
-class Splice(OfEnvelopes, name="splice", catalogue=("D6", "D8")):
+class Splice(OfEnvelopes, name="splice"):
     """Joins parts of two envelopes: header and body of different ones, swapped tags, two in one datagram."""
 
     def prepare(self) -> None:
@@ -108,7 +108,7 @@ class Splice(OfEnvelopes, name="splice", catalogue=("D6", "D8")):
         return spliced[join], f"{join} of envelope {other.counter} in envelope {this.counter}"
 
 
-class CounterJump(OfEnvelopes, name="counter-jump", catalogue=("D5", "D17"), beside=True, to="random"):
+class CounterJump(OfEnvelopes, name="counter-jump", beside=True, to="random"):
     """Alters the counter of envelopes: to the last valid one, far ahead, a little ahead, or back.
 
     The genuine envelope passes too: a moved replay window would show.
@@ -134,7 +134,7 @@ class CounterJump(OfEnvelopes, name="counter-jump", catalogue=("D5", "D17"), bes
         return header + datagram[envelope.header_bytes :], f"counter {old} to {new}"
 
 
-class AlterFrame(Forgery, name="alter-frame", catalogue=("D6",)):
+class AlterFrame(Forgery, name="alter-frame"):
     """Alters the payload of envelopes, but not the header and the tag, whatever its length."""
 
     def is_target(self, datagram: bytes) -> bool:
@@ -148,7 +148,7 @@ class AlterFrame(Forgery, name="alter-frame", catalogue=("D6",)):
         return with_changed_byte(datagram, at, self.rng), f"byte {at} of envelope {envelope.counter}"
 
 
-class TamperTag(Forgery, name="tamper-tag", catalogue=("D6", "D7")):
+class TamperTag(Forgery, name="tamper-tag"):
     """Alters the tag of envelopes: zeros, random bytes, another length, or no tag."""
 
     def is_target(self, datagram: bytes) -> bool:
@@ -196,7 +196,7 @@ class FromAnywhere(Timed, origin="both", sources=16):
         return self.rng.randrange(max(1, self.options.sources)) if is_stranger else None
 
 
-class ForgeData(FromAnywhere, name="forge-data", catalogue=("D5", "D6", "D16")):
+class ForgeData(FromAnywhere, name="forge-data"):
     """Injects forged envelopes: valid session index, a coming counter, a command, a random tag."""
 
     def prepare(self) -> None:
@@ -220,11 +220,11 @@ class ForgeData(FromAnywhere, name="forge-data", catalogue=("D5", "D6", "D16")):
         return self.inject(datagram, direction, now, f"{name} as envelope {counter}", self.stranger())
 
 
-class FloodEnvelopes(ForgeData, name="flood-envelopes", catalogue=("D16",), rate_per_s=1000.0, sources=64):
+class FloodEnvelopes(ForgeData, name="flood-envelopes", rate_per_s=1000.0, sources=64):
     """Floods with envelopes that are valid except for the tag."""
 
 
-class RawMavlink(FromAnywhere, name="raw-mavlink", catalogue=("D12",)):
+class RawMavlink(FromAnywhere, name="raw-mavlink"):
     """Sends bare MAVLink frames to the peers' ports: disarm, flight termination, mode changes, heartbeats."""
 
     def send_next(self, now: float) -> list[Action]:

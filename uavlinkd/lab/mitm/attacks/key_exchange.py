@@ -67,7 +67,7 @@ class FieldAlteration(MessageAlteration, repair_mac1=True):
         return parts._replace(ephemeral=key), f"public key replaced by {key[:4].hex()}…"
 
 
-class TamperKey(FieldAlteration, name="tamper-key", catalogue=("H1", "H18")):
+class TamperKey(FieldAlteration, name="tamper-key"):
     """Alters some bytes of the ephemeral public key in handshake messages."""
 
     def change(self, parts: Parts) -> tuple[Parts, str]:
@@ -78,21 +78,21 @@ class TamperKey(FieldAlteration, name="tamper-key", catalogue=("H1", "H18")):
         return parts._replace(ephemeral=key), f"bytes {at} to {at + TAMPERED_BYTES - 1} of the public key altered"
 
 
-class ReplaceKey(FieldAlteration, name="replace-key", catalogue=("H1",)):
+class ReplaceKey(FieldAlteration, name="replace-key"):
     """Replaces the ephemeral public key in handshake messages."""
 
     def change(self, parts: Parts) -> tuple[Parts, str]:
         return self.replaced(parts)
 
 
-class RandomKey(TamperKey, name="random", catalogue=("H1", "H18")):
+class RandomKey(TamperKey, name="random"):
     """Alters or replaces the public key at random, independently in each direction."""
 
     def change(self, parts: Parts) -> tuple[Parts, str]:
         return super().change(parts) if self.rng.random() < 0.5 else self.replaced(parts)
 
 
-class SuiteDowngrade(FieldAlteration, name="suite-downgrade", catalogue=("H10", "H11")):
+class SuiteDowngrade(FieldAlteration, name="suite-downgrade"):
     """Changes the suite of a handshake message to x25519, or that to ffdhe2048, and its length accordingly."""
 
     def change(self, parts: Parts) -> tuple[Parts, str]:
@@ -104,7 +104,7 @@ class SuiteDowngrade(FieldAlteration, name="suite-downgrade", catalogue=("H10", 
         return changed._replace(share=share), f"suite {parts.suite.name} to {suite.name}"
 
 
-class CertificateLength(FieldAlteration, name="certificate-length", catalogue=("H10", "H18"), message="initiation"):
+class CertificateLength(FieldAlteration, name="certificate-length", message="initiation"):
     """Cuts the bytes of a certificate off initiations that have one, and adds as many to those without.
 
     The length says whether an initiation carries a certificate.
@@ -117,7 +117,7 @@ class CertificateLength(FieldAlteration, name="certificate-length", catalogue=("
         return parts._replace(rest=parts.rest + self.rng.randbytes(size)), "certificate added"
 
 
-class InvalidElement(FieldAlteration, name="invalid-element", catalogue=("H8", "H9")):
+class InvalidElement(FieldAlteration, name="invalid-element"):
     """Replaces the ephemeral X25519 key by 0, 1, p-1, p, p+1 or a point of low order, in turn.
 
     The shares of FFDHE and ML-KEM are encrypted, so only ``corrupt-share`` applies to them.
@@ -128,7 +128,7 @@ class InvalidElement(FieldAlteration, name="invalid-element", catalogue=("H8", "
         return parts._replace(ephemeral=ELEMENTS[name]), f"public key is {name}"
 
 
-class CorruptShare(FieldAlteration, name="corrupt-share", catalogue=("H8",)):
+class CorruptShare(FieldAlteration, name="corrupt-share"):
     """Alters the encrypted FFDHE or ML-KEM share or ciphertext, in suites that have one."""
 
     def is_target(self, datagram: bytes) -> bool:
@@ -140,7 +140,7 @@ class CorruptShare(FieldAlteration, name="corrupt-share", catalogue=("H8",)):
         return parts._replace(share=with_changed_byte(parts.share, at, self.rng)), f"byte {at} of the share altered"
 
 
-class AlterIndices(FieldAlteration, name="alter-indices", catalogue=("H5", "H18"), field="both"):
+class AlterIndices(FieldAlteration, name="alter-indices", field="both"):
     """Alters the session indices in the header of handshake messages."""
 
     def is_target(self, datagram: bytes) -> bool:
@@ -159,7 +159,7 @@ class AlterIndices(FieldAlteration, name="alter-indices", catalogue=("H5", "H18"
         return parts._replace(header=bytes(header)), ", ".join(changed)
 
 
-class AlterMacs(MessageAlteration, name="alter-macs", catalogue=("H12", "H18", "H19"), mac="mac1"):
+class AlterMacs(MessageAlteration, name="alter-macs", mac="mac1"):
     """Alters mac1 or mac2 of handshake messages."""
 
     def alter(self, datagram: bytes, direction: Direction) -> tuple[bytes, str]:
@@ -168,7 +168,7 @@ class AlterMacs(MessageAlteration, name="alter-macs", catalogue=("H12", "H18", "
         return with_changed_byte(datagram, at, self.rng), f"{self.options.mac} altered"
 
 
-class SpliceHandshake(FieldAlteration, name="splice-handshake", catalogue=("H5", "H18")):
+class SpliceHandshake(FieldAlteration, name="splice-handshake"):
     """Joins the header of one handshake message and the body of the one before it in that direction."""
 
     def prepare(self) -> None:

@@ -103,34 +103,34 @@ class Replay(Attack, kinds="any", when="now", delay_s=10.0, rate_per_s=200.0, co
             self._schedule(now + SETTLE_S + number / self.options.rate_per_s, *item)
 
 
-class ReplayInitiation(Replay, name="replay-initiation", catalogue=("H3",), kinds="initiation"):
+class ReplayInitiation(Replay, name="replay-initiation", kinds="initiation"):
     """Replays initiations."""
 
 
-class ReplayResponse(Replay, name="replay-response", catalogue=("H3",), kinds="response"):
+class ReplayResponse(Replay, name="replay-response", kinds="response"):
     """Replays responses."""
 
 
-class ReplayCookie(Replay, name="replay-cookie", catalogue=("H19",), kinds="cookie"):
+class ReplayCookie(Replay, name="replay-cookie", kinds="cookie"):
     """Replays cookie replies."""
 
 
-class StolenCookie(Replay, name="stolen-cookie", catalogue=("H12", "H19"), origin="stranger"):
+class StolenCookie(Replay, name="stolen-cookie", origin="stranger"):
     """Replays handshake messages with a mac2 from another address, to use the cookie of their sender."""
 
     def is_target(self, datagram: bytes) -> bool:
         return has_cookie(datagram)
 
 
-class ReplayData(Replay, name="replay-data", catalogue=("D1", "D2"), kinds="envelope"):
+class ReplayData(Replay, name="replay-data", kinds="envelope"):
     """Replays envelopes."""
 
 
-class Duplicate(Replay, name="duplicate", catalogue=("H3", "D1")):
+class Duplicate(Replay, name="duplicate"):
     """Sends everything twice."""
 
 
-class Reflect(Replay, name="reflect", catalogue=("H4", "D3")):
+class Reflect(Replay, name="reflect"):
     """Sends datagrams back to their sender, with the other peer's address."""
 
     operation = Operation.REFLECTED
@@ -139,7 +139,7 @@ class Reflect(Replay, name="reflect", catalogue=("H4", "D3")):
         return direction.reverse
 
 
-class Misroute(Replay, name="misroute", catalogue=("H5", "D2")):
+class Misroute(Replay, name="misroute"):
     """Sends datagrams to a peer that is not their receiver; needs three peers."""
 
     operation = Operation.MISROUTED
@@ -158,7 +158,7 @@ class Misroute(Replay, name="misroute", catalogue=("H5", "D2")):
         return self.rng.choice(self._others[direction])
 
 
-class Roam(Attack, name="roam", catalogue=("H20", "D2"), kinds="envelope", mode="race"):
+class Roam(Attack, name="roam", kinds="envelope", mode="race"):
     """Forwards datagrams from a stranger's address, so that the peer moves the traffic there."""
 
     def intercept(self, datagram: bytes, direction: Direction, now: float) -> list[Action]:
@@ -191,7 +191,7 @@ class Roam(Attack, name="roam", catalogue=("H20", "D2"), kinds="envelope", mode=
         return self.context.directions.index(direction) % STRANGERS
 
 
-class Wander(Roam, name="wander", catalogue=("H20",), kinds="any", mode="relay", sources=64):
+class Wander(Roam, name="wander", kinds="any", mode="relay", sources=64):
     """Forwards each datagram from another stranger, like a broken NAT. Relays the answers, unless it races."""
 
     def prepare(self) -> None:

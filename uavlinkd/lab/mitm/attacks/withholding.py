@@ -21,7 +21,7 @@ HELD_LIMIT = 65536
 _AWAITED_LIMIT = 64
 
 
-class DropAny(Attack, name="drop", catalogue=("D10", "H14"), kinds="any"):
+class DropAny(Attack, name="drop", kinds="any"):
     """Drops datagrams of a kind; direction=A>B makes it one-sided, share=0.3 a loss of 30 %."""
 
     def drops(self, datagram: bytes, direction: Direction) -> str | None:
@@ -36,15 +36,15 @@ class DropAny(Attack, name="drop", catalogue=("D10", "H14"), kinds="any"):
         return [self.note(Operation.DROPPED, datagram, direction, now, why)]
 
 
-class BlockRekey(DropAny, name="block-rekey", catalogue=("D17", "H14"), kinds="handshake"):
+class BlockRekey(DropAny, name="block-rekey", kinds="handshake"):
     """Drops handshake messages and passes envelopes, so that keys expire."""
 
 
-class Blackout(DropAny, name="blackout", catalogue=("D11",), seconds=3.0):
+class Blackout(DropAny, name="blackout", seconds=3.0):
     """Drops all datagrams for some seconds."""
 
 
-class DropMessage(DropAny, name="drop-message", catalogue=("H14",), message="initiation"):
+class DropMessage(DropAny, name="drop-message", message="initiation"):
     """Drops exactly one message of each handshake: initiation, response, confirmation or cookie."""
 
     def prepare(self) -> None:
@@ -66,7 +66,7 @@ class DropMessage(DropAny, name="drop-message", catalogue=("H14",), message="ini
         return None
 
 
-class DropHeartbeats(DropAny, name="drop-heartbeats", catalogue=("D10", "D18"), message_id=0, size=42):
+class DropHeartbeats(DropAny, name="drop-heartbeats", message_id=0, size=42):
     """Drops the envelopes that carry heartbeats (or another message), recognised by message ID or by size."""
 
     def drops(self, datagram: bytes, direction: Direction) -> str | None:
@@ -79,7 +79,7 @@ class DropHeartbeats(DropAny, name="drop-heartbeats", catalogue=("D10", "D18"), 
         return "by its size" if len(datagram) - self.options.size in (0, 2) else None
 
 
-class Hold(Attack, name="hold", catalogue=("D9", "H15"), kinds="envelope", hold_s=30.0, at_once=False):
+class Hold(Attack, name="hold", kinds="envelope", hold_s=30.0, at_once=False):
     """Holds datagrams and releases them later, unaltered."""
 
     def prepare(self) -> None:
@@ -106,7 +106,7 @@ class Hold(Attack, name="hold", catalogue=("D9", "H15"), kinds="envelope", hold_
         return self._held[0][0] if self._held else NEVER
 
 
-class Move(Attack, name="move", catalogue=("D2", "D10"), kinds="envelope", onto=2, beside=False):
+class Move(Attack, name="move", kinds="envelope", onto=2, beside=False):
     """Sends datagrams of one path along another, before or instead of along their own."""
 
     def prepare(self) -> None:
@@ -120,7 +120,7 @@ class Move(Attack, name="move", catalogue=("D2", "D10"), kinds="envelope", onto=
         return [Send(datagram, onto), note, *([Send(datagram, direction)] if self.options.beside else [])]
 
 
-class Cross(Attack, name="cross-initiations", catalogue=("H15",)):
+class Cross(Attack, name="cross-initiations"):
     """Holds initiations until both peers have sent one, so that they cross.
 
     An initiation without a counterpart passes after :attr:`patience_s`.
@@ -153,7 +153,7 @@ class Cross(Attack, name="cross-initiations", catalogue=("H15",)):
         return min((until for _, until in self._held.values()), default=NEVER)
 
 
-class Reorder(Attack, name="reorder", catalogue=("D4",), kinds="envelope"):
+class Reorder(Attack, name="reorder", kinds="envelope"):
     """Collects datagrams in batches and sends each batch in another order."""
 
     depth = 8
@@ -195,7 +195,7 @@ class Reorder(Attack, name="reorder", catalogue=("D4",), kinds="envelope"):
         return actions
 
 
-class Stretch(Attack, name="stretch", catalogue=("D9",), interval_s=1.8, block_handshakes=True):
+class Stretch(Attack, name="stretch", interval_s=1.8, block_handshakes=True):
     """Delays envelopes in order: one passes every 1.8 s, so the delay grows with each. Drops handshake messages."""
 
     def prepare(self) -> None:
@@ -243,7 +243,7 @@ class Stretch(Attack, name="stretch", catalogue=("D9",), interval_s=1.8, block_h
         return min(self._next_at.values(), default=NEVER)
 
 
-class StretchOneWay(Stretch, name="stretch-one-way", catalogue=("D9", "D10"), back="echoes"):
+class StretchOneWay(Stretch, name="stretch-one-way", back="echoes"):
     """Delays the envelopes of one direction in order, and drops the echo records of the other one, or all of it."""
 
     def stretched(self) -> tuple[Direction, ...]:
