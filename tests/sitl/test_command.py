@@ -53,7 +53,7 @@ def test_empty_selection_is_refused(
 
 def test_run_that_passed_before_is_not_repeated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A selection of such runs only is not an error: the tables are written again."""
-    arguments = ("--out", str(tmp_path), "--kind", "own", "--scenario", "flight", "--condition", "loss10")
+    arguments = ("--out", str(tmp_path), "--kind", "own", "--scenario", "parameters-mission", "--condition", "loss10")
     assert command.main(arguments) == command.OK
     assert len(capsys.readouterr().out.splitlines()) == 2
     (tmp_path / command.RESULTS).unlink()
