@@ -49,7 +49,6 @@ local PROBLEM_REPORT, MOST_CODES = 8, 8
 local PROBE, ANSWER_BYTES, QUESTION_BYTES = 3, 20, 22
 local ALONE, FRAMES_FOLLOW, PADDING_FOLLOWS = 0, 1, 2
 local PROBE_FLAGS = { [ALONE] = "alone", [FRAMES_FOLLOW] = "frames follow", [PADDING_FOLLOWS] = "padding follows" }
-local UNKNOWN_LAG = 0xFFFF
 local REASONS = {
     [1] = "foreign_system",
     [2] = "message_not_allowed",
@@ -98,7 +97,6 @@ local f = {
     probe_answer = ProtoField.uint32("uavlink.probe.answer", "Answer to question (0: none)", base.HEX),
     probe_sent = ProtoField.uint32("uavlink.probe.sent", "Datagrams sent along this path", base.DEC),
     probe_received = ProtoField.uint32("uavlink.probe.received", "Datagrams received along this path", base.DEC),
-    probe_lag = ProtoField.uint16("uavlink.probe.lag", "Lag of copies along this path in ms", base.DEC),
     probe_padding = ProtoField.bytes("uavlink.probe.padding", "Padding"),
     refused_msgid = ProtoField.uint24("uavlink.refused.msgid", "Refused message id", base.DEC),
     refused_command = ProtoField.uint16("uavlink.refused.command", "Refused command (0: none)", base.DEC),
@@ -346,10 +344,6 @@ local function add_probe(tvb, pinfo, tree, offset, stop)
     tree:add(f.probe_answer, tvb(offset + 6, 4))
     tree:add(f.probe_sent, tvb(offset + 10, 4))
     tree:add(f.probe_received, tvb(offset + 14, 4))
-    local lag = tree:add(f.probe_lag, tvb(offset + 18, 2))
-    if tvb(offset + 18, 2):uint() == UNKNOWN_LAG then
-        lag:append_text(" (unknown)")
-    end
     local text = length == ANSWER_BYTES and "Probe, answer"
         or tvb(offset + 6, 4):uint() ~= 0 and "Probe, answer and question"
         or "Probe, question"

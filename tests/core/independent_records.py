@@ -25,7 +25,7 @@ class Probe(NamedTuple):
     answer: int = 0
     sent: int = 0
     received: int = 0
-    lag_ms: int = 65535
+    unused: int = 65535
     frames: bytes = b""
     padding: bytes = b""
 
@@ -37,7 +37,7 @@ class Probe(NamedTuple):
 
 def read_probe(payload: bytes) -> Probe:
     """Section 15: a probe, and what follows it."""
-    kind, flags, question, answer, sent, received, lag_ms = struct.unpack(">BBIIIIH", payload[:20])
+    kind, flags, question, answer, sent, received, unused = struct.unpack(">BBIIIIH", payload[:20])
     assert kind == 3
     assert question or answer
     rest = payload[20:]
@@ -46,7 +46,7 @@ def read_probe(payload: bytes) -> Probe:
         rest = rest[2:]
     assert bool(rest) == (flags in (1, 2))
     frames, padding = (rest, b"") if flags == 1 else (b"", rest)
-    return Probe(question, answer, sent, received, lag_ms, frames, padding)
+    return Probe(question, answer, sent, received, unused, frames, padding)
 
 
 def refusal_report(*entries: tuple[int, int, int, int]) -> bytes:

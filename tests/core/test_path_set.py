@@ -14,7 +14,6 @@ from uavlinkd.core.outputs import PathChanged, PathEvent, PathStateChanged
 from uavlinkd.core.path import SERIAL_HOST, Path, SocketAddress, SocketFacts, relayed
 from uavlinkd.core.path_state import PathCondition, PathState
 from uavlinkd.core.paths import PathSet
-from uavlinkd.core.probe import Probe
 from uavlinkd.core.settings import Class, Redundancy
 
 LTE, MESH, SIK = (Path(number, (f"192.0.2.{number + 1}", 5790)) for number in range(3))
@@ -269,17 +268,6 @@ def test_loss_counts_as_delay() -> None:
     assert state.loss_out == pytest.approx(0.3, abs=0.02)
     paths.update(PEER, 2.6)
     assert paths.update(PEER, 2.6 + c.BETTER_FOR_S) == [PathChanged(PEER, MESH, LTE, "loss")]
-
-
-@pytest.mark.parametrize("lags", [{LTE: 80, MESH: 0}, {LTE: 80}])
-def test_lag_of_copies_counts_instead_of_the_round_trip_if_all_are_known(lags: dict[Path, int]) -> None:
-    """It compares one-way delays on real traffic. A lag and a round trip cannot be compared."""
-    paths = linked(LTE, MESH)
-    for now in (2.0, 4.0):
-        for path, lag_ms in lags.items():
-            of(paths, path).receive_report(Probe(1, 0, 1, 1, lag_ms), now)
-        changes = paths.update(PEER, now)
-    assert changes == ([PathChanged(PEER, MESH, LTE, "faster")] if len(lags) == 2 else [])
 
 
 # Metered paths.

@@ -10,7 +10,7 @@ from tests.core.harness import AT_A
 from uavlinkd.core import constants as c
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.path_state import PathCondition, PathState
-from uavlinkd.core.probe import LONGEST_LAG_MS, UNKNOWN_LAG, Probe
+from uavlinkd.core.probe import Probe
 
 UNPROVEN, USABLE, SUSPECT, DOWN = PathCondition
 _tokens = itertools.count(1)
@@ -240,30 +240,6 @@ def test_counts_begin_again_with_a_session() -> None:
     assert (state.sent, state.received, state.loss_out) == (0, 0, 0.0)
     assert state.receive_answer(question, 1, 2.1) is not None
     assert state.loss_out == 0.0
-
-
-# Lag.
-
-
-def test_reported_lag_is_the_median_of_the_last_second() -> None:
-    """Copies that came earlier are forgotten. The longest that the field holds is not the value for unknown."""
-    state = usable()
-    state.note_copy(70.0, 1.0)
-    assert state.make_probe(1, 0, 1.0).lag_ms == LONGEST_LAG_MS
-    for lag_s in (0.030, 0.500, 0.020):
-        state.note_copy(lag_s, 3.0)
-    assert state.make_probe(1, 0, 3.0 + c.LAG_WINDOW_S).lag_ms == 30
-    assert state.make_probe(1, 0, 3.001 + c.LAG_WINDOW_S).lag_ms == UNKNOWN_LAG
-
-
-def test_lag_that_the_peer_reported_counts_for_three_seconds() -> None:
-    """A report without a lag leaves the last one."""
-    state = usable()
-    assert state.lag_s(1.0) is None
-    state.receive_report(Probe(1, 0, 1, 1, 40), 1.0)
-    state.receive_report(Probe(2, 0, 2, 2, UNKNOWN_LAG), 2.0)
-    assert state.lag_s(1.0 + c.LAG_VALID_S) == 0.04
-    assert state.lag_s(1.001 + c.LAG_VALID_S) is None
 
 
 # Bytes before the first answer, and the network.

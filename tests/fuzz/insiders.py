@@ -138,7 +138,7 @@ class Insider:
         """A probe with any report; alone, or before frames or padding."""
         how = script.byte()
         question = script.long() if how & 1 else 0
-        record = Probe(question, answer, script.word(), script.word(), script.word())
+        record = Probe(question, answer, script.word(), script.word())
         behind = script.byte() >> 2
         return record.encode(bytes((0xFD,)) * behind if how & 2 else b"", behind if how & 4 else 0)
 

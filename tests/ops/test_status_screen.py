@@ -30,7 +30,6 @@ PATH: dict[str, Any] = {
     "jitter_s": 0.5678,
     "loss_in": 0.12,
     "loss_out": 1.0,
-    "lag_s": 0.4,
     "bytes_in_s": 123456.0,
     "bytes_out_s": 1234.0,
     "bytes_received": 123_456_789,

@@ -31,12 +31,12 @@ PATH: dict[str, Any] = {
     "state": "usable",
     "role": "best",
     "carries": ["critical", "stream", "bulk"],
-    **numbered("round_trip_s", "jitter_s", "lag_s", "loss_in", "loss_out", "bytes_received", "bytes_sent"),
+    **numbered("round_trip_s", "jitter_s", "loss_in", "loss_out", "bytes_received", "bytes_sent"),
     **numbered("datagrams_received", "datagrams_sent", "duplicates"),
 }
 LEARNED_PATH = {
     **PATH,
-    **dict.fromkeys(("network", "round_trip_s", "jitter_s", "lag_s")),
+    **dict.fromkeys(("network", "round_trip_s", "jitter_s")),
     "number": 2,
     "address": "198.51.100.66:4000",
     "is_configured": False,

@@ -269,12 +269,6 @@ TRANSMISSIONS = 7
 """How often a critical envelope is sent along a path, repeats included, at most."""
 REPAIR_WINDOW_S = 10.0
 """Whether to repeat depends on the loss of this time."""
-LAG_WINDOW_S = 1.0
-"""A report contains the median lag of the copies of this time."""
-LAG_SAMPLES = 64
-"""Copies whose lag is kept for a path."""
-LAG_VALID_S = 3.0
-"""How long a reported lag counts."""
 CRITICAL_ENVELOPE_LIMIT = 320
 """The longest critical envelope while it goes along several paths; one frame may be longer. Each path carries it."""
 SMALLER_LIMITS = (1452, 1232, 1024, 768, 548)

@@ -5,13 +5,11 @@ Only an answered question makes a path usable. What the peer reports can only ma
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import InitVar, dataclass, field
 from enum import StrEnum
 from typing import NamedTuple
 
 from uavlinkd.core import constants as c
-from uavlinkd.core import probe
 from uavlinkd.core.path import Path
 from uavlinkd.core.path_measures import NO_REPEATS, EnvelopeLimit, PathLoss, Repeats
 from uavlinkd.core.probe import Probe
@@ -107,8 +105,8 @@ class PathState:
     _recovering_answers: int = 0
     _loss_in: PathLoss = field(default_factory=PathLoss)
     _loss_out: PathLoss = field(default_factory=PathLoss)
-    _lags: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=c.LAG_SAMPLES))
-    _reported_lag: tuple[float, float] | None = None  # when, seconds
+    copy_lag_s: float | None = None
+    """How much later than along the first path the last copy arrived; 0 for the first path itself."""
     _reported_lost: int = 0  # of the peer's datagrams of the current session
 
     def __post_init__(self, now: float) -> None:
@@ -167,12 +165,6 @@ class PathState:
         by_echo, by_probe = self.loss_by_echo, self._loss_out
         return by_echo if by_echo.reported_at > by_probe.reported_at else by_probe
 
-    def lag_s(self, now: float) -> float | None:
-        """By how much our copies arrive later along this path than along the first, if the peer said so recently."""
-        if self._reported_lag is None or now > self._reported_lag[0] + c.LAG_VALID_S:
-            return None
-        return self._reported_lag[1]
-
     @property
     def wait_s(self) -> float:
         """An answer that takes longer makes the path suspect (RFC 6298, section 2, with a lower least value)."""
@@ -211,19 +203,15 @@ class PathState:
         at = number - 2
         self.repeats = (*self.repeats[:at], self.repeats[at] + 1, *self.repeats[at + 1 :])
 
-    def note_copy(self, lag_s: float, now: float) -> None:
-        """A copy arrived along this path, so much later than the first; 0 for the first itself."""
-        self._lags.append((now, lag_s))
-
     def head_start_s(self, slower: PathState) -> float:
         """How much earlier than along a slower path the peer's envelopes arrive here, at most, as far as is known.
 
         Negative if the other path is known to be the faster one.
         """
         by_answers_s = ((slower.srtt_s or 0.0) - (self.srtt_s or 0.0)) / 2
-        if not (slower._lags and self._lags):
+        if slower.copy_lag_s is None or self.copy_lag_s is None:
             return by_answers_s
-        return max(slower._lags[-1][1] - self._lags[-1][1], by_answers_s)
+        return max(slower.copy_lag_s - self.copy_lag_s, by_answers_s)
 
     # Probes.
 
@@ -233,7 +221,7 @@ class PathState:
         It may well get no answer. So it makes no path suspect, and a padded one is left out of what was sent.
         """
         self._wait_for(question, Question(now, 0, size=size), now)
-        return Probe(question, 0, self.sent + (not size), self.received, self._lag_ms(now))
+        return Probe(question, 0, self.sent + (not size), self.received)
 
     def take_questions(self, candidate: PathState) -> None:
         """The path was asked as a candidate, before it had a slot: the answers to those questions count."""
@@ -247,7 +235,7 @@ class PathState:
             if not self._unanswered:
                 self._unanswered_since = now
             self._unanswered += 1
-        return Probe(question, answer, self.sent + 1, self.received, self._lag_ms(now))
+        return Probe(question, answer, self.sent + 1, self.received)
 
     def _wait_for(self, token: int, question: Question, now: float) -> None:
         self._expire_questions(now)
@@ -264,8 +252,6 @@ class PathState:
         lost = report.sent - self.received
         more = max(0, lost - self._reported_lost) if self.works else 0
         self._reported_lost = max(lost, self._reported_lost)
-        if report.lag_ms != probe.UNKNOWN_LAG:
-            self._reported_lag = now, report.lag_ms / 1000
         return more
 
     def receive_answer(self, answer: int, received: int | None, now: float) -> float | None:
@@ -320,10 +306,6 @@ class PathState:
         expired = [token for token, asked in self._waiting.items() if now >= asked.sent_at + c.QUESTION_LIFETIME_S]
         for token in expired:
             del self._waiting[token]
-
-    def _lag_ms(self, now: float) -> int:
-        recent = sorted(lag for at, lag in self._lags if at >= now - c.LAG_WINDOW_S)
-        return min(probe.LONGEST_LAG_MS, round(1000 * recent[len(recent) // 2])) if recent else probe.UNKNOWN_LAG
 
     # The condition.
 

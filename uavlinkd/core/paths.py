@@ -55,16 +55,16 @@ class Election:
             self._better = None
             if not pool:
                 return best, ""
-            elected = min(usable or pool, key=lambda state: _cost(state, None))
+            elected = min(usable or pool, key=_cost)
             if best is None or not best.works:
                 return elected, "first" if best is None else best.reason
             return elected, "udp" if best.is_stream else "metered"
         rivals = [state for state in usable if state is not best and now >= state.returns_at]
         if best.path.is_relayed and (direct := [state for state in rivals if not state.path.is_relayed]):
-            elected = min(direct, key=lambda state: _cost(state, None))
-            if _better_than(elected, [best], now) is None:
+            elected = min(direct, key=_cost)
+            if _better_than(elected, [best]) is None:
                 return elected, "direct"
-        rival = _better_than(best, rivals, now) if rivals else None
+        rival = _better_than(best, rivals) if rivals else None
         if rival is None or rival is not self._better:
             self._better, self._better_since = rival, now
         if rival is None or now < self.due_at:
@@ -76,19 +76,16 @@ class Election:
         return rival, "loss"
 
 
-def _better_than(best: PathState, rivals: list[PathState], now: float) -> PathState | None:
+def _better_than(best: PathState, rivals: list[PathState]) -> PathState | None:
     """The best of the rivals, if its cost is lower by enough."""
-    lags = {state: lag for state in (best, *rivals) if (lag := state.lag_s(now)) is not None}
-    shown = lags if len(lags) > len(rivals) else None  # lags are comparable only if all are known
-    rival = min(rivals, key=lambda state: _cost(state, shown))
-    old, new = _cost(best, shown), _cost(rival, shown)
+    rival = min(rivals, key=_cost)
+    old, new = _cost(best), _cost(rival)
     return rival if new <= (1 - c.BETTER_SHARE) * old and new <= old - c.BETTER_BY_S else None
 
 
-def _cost(state: PathState, lags: dict[PathState, float] | None) -> float:
-    """What is compared, in seconds: one-way delay, and a penalty for loss."""
-    delay_s = (state.srtt_s or 0.0) / 2 if lags is None else lags[state]
-    return delay_s + c.LOSS_PENALTY_S * state.loss_out
+def _cost(state: PathState) -> float:
+    """What is compared, in seconds: half of the round trip, and a penalty for loss."""
+    return (state.srtt_s or 0.0) / 2 + c.LOSS_PENALTY_S * state.loss_out
 
 
 Route = tuple[PathState, ...]

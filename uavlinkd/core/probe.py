@@ -11,8 +11,7 @@ _ZERO = bytes(2)
 ANSWER_BYTES = _PROBE.size
 """A probe that only answers: shorter, so that it fits under the longer header into the length of its question."""
 QUESTION_BYTES = ANSWER_BYTES + len(_ZERO)
-UNKNOWN_LAG = 0xFFFF
-LONGEST_LAG_MS = UNKNOWN_LAG - 1
+_UNUSED = 0xFFFF
 _FRAMES, _PADDING = 1, 2
 MAX_COUNT = 2**32 - 1
 
@@ -24,12 +23,11 @@ class Probe(NamedTuple):
     answer: int  # the question that it answers; 0 without one
     sent: int  # datagrams of this session along this path, this one included
     received: int
-    lag_ms: int = UNKNOWN_LAG  # how much later copies arrive along this path than along the first
 
     def encode(self, frames: bytes = b"", padding: int = 0) -> bytes:
         """The record, and behind it whole frames or ``padding`` bytes."""
         flags = _FRAMES if frames else _PADDING if padding else 0
-        fields = self.question, self.answer, self.sent & MAX_COUNT, self.received & MAX_COUNT, self.lag_ms
+        fields = self.question, self.answer, self.sent & MAX_COUNT, self.received & MAX_COUNT, _UNUSED
         record = _PROBE.pack(PROBE, flags, *fields) + (_ZERO if self.question else b"")
         return record + frames + bytes(padding)
 
@@ -38,7 +36,7 @@ def parse_probe(payload: bytes) -> tuple[Probe, bytes] | None:
     """The probe in a payload that begins with its type, and the frames behind it. None if it is invalid."""
     if len(payload) < ANSWER_BYTES:
         return None
-    _, flags, question, answer, sent, received, lag_ms = _PROBE.unpack_from(payload)
+    _, flags, question, answer, sent, received, _ = _PROBE.unpack_from(payload)
     size = QUESTION_BYTES if question else ANSWER_BYTES
     is_alone = len(payload) == size
     is_valid = (
@@ -50,4 +48,4 @@ def parse_probe(payload: bytes) -> tuple[Probe, bytes] | None:
     )
     if not is_valid:
         return None
-    return Probe(question, answer, sent, received, lag_ms), payload[size:] if flags == _FRAMES else b""
+    return Probe(question, answer, sent, received), payload[size:] if flags == _FRAMES else b""

@@ -153,8 +153,7 @@ def _receive_copy(
                     state.received += 1
                     first = peer.paths.with_number(number)
                     if is_recent and first is not None:
-                        first.note_copy(0.0, now)
-                        state.note_copy(lag_s, now)
+                        first.copy_lag_s, state.copy_lag_s = 0.0, lag_s
                 if is_recent and len(datagram) - header_bytes - session.tag_bytes in _ANSWERED_BYTES:
                     out = _answer_copy(peer, session, session.reopen(datagram, header_bytes, counter), state, now)
     peer.traffic.drops[DropReason.DUPLICATE if is_recent else DropReason.LATE_COPY] += 1

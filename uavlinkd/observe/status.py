@@ -327,10 +327,9 @@ def _member_status(relay: RelayService, member: RelayMember, now: float) -> dict
 def paths_status(link: PeerLink | RelayLink, way_of: WayOf, now: float) -> list[dict[str, object]]:
     """Each path to a peer, the best first, then the configured ones.
 
-    ``carries`` has the classes of frames that go along it now. Losses are shares of recent datagrams, ``lag_s`` is by
-    how much our copies arrive later along it than along the first path. ``number`` stays the same as long as the path
-    is known, and is below 256. ``relay`` is the one through which it leads, and ``relay_address`` where it is
-    reached; null for a direct path.
+    ``carries`` has the classes of frames that go along it now. Losses are shares of recent datagrams.
+    ``number`` stays the same as long as the path is known, and is below 256. ``relay`` is the one through which it
+    leads, and ``relay_address`` where it is reached; null for a direct path.
     """
     return [_path_status(link, state, way_of, now) for state in _best_first(link)]
 
@@ -370,7 +369,6 @@ def _path_status(link: PeerLink | RelayLink, state: PathState, way_of: WayOf, no
         "carries": [cls.value for cls, route in peer.paths.routes.items() if peer.is_up and state in route],
         "answered_s": now - state.answered_at if state.is_validated else None,
         "jitter_s": state.rttvar_s,
-        "lag_s": state.lag_s(now),
         "bytes_received": state.bytes_received,
         "bytes_sent": state.bytes_sent,
         "datagrams_received": state.datagrams_received,

@@ -29,7 +29,7 @@ _STYLES: Final = {
 }
 _SHOWN_FINDINGS: Final = 20
 _SHOWN_MEMBERS: Final = 30
-_WIDE: Final = 100  # from so many columns on, the table of paths has lag and bytes too
+_WIDE: Final = 100  # from so many columns on, the table of paths has bytes too
 
 
 def render_status(status: Status, width: int = 80) -> RenderableType:
@@ -190,7 +190,7 @@ def _rate(bytes_s: float) -> str:
 
 def _paths(peers: Sequence[tuple[str, list[Status]]], width: int) -> Table:
     """The paths of these peers, with as many columns as have room. Pairs of numbers are in/out."""
-    more = ("lag ms", "MB") if width >= _WIDE else ()
+    more = ("MB",) if width >= _WIDE else ()
     table = _table("path", whole=("state", "carries", "rtt ms", "loss %", "kB/s", *more))
     for name, paths in peers:
         table.add_row(Text(name, style="bold"))
@@ -211,7 +211,6 @@ def _cells(path: Status, address: str) -> list[Text]:
         Text(rtt),
         Text(f"{100 * path['loss_in']:.0f}/{100 * path['loss_out']:.0f}"),
         Text(f"{_short(path['bytes_in_s'] / 1e3)}/{_short(path['bytes_out_s'] / 1e3)}"),
-        Text("-" if path["lag_s"] is None else _short(1000 * path["lag_s"])),
         Text(f"{_short(path['bytes_received'] / 1e6)}/{_short(path['bytes_sent'] / 1e6)}"),
     ]
 
