@@ -41,36 +41,27 @@ class RelayHandles:
         self._inward: dict[tuple[int, SocketAddress, int], Path] = {}
         self._outward: dict[Path, tuple[SocketAddress, int]] = {}
         self._assigned: dict[tuple[str, Path], set[int]] = {}  # those that lead somewhere, by relay
-        self._waiting: dict[tuple[str, Path], list[int]] = {}  # handles that another relay or address has, by relay
 
     def assign(self, relay: str, at: Path, handles: Iterable[int]) -> None:
         """These are all handles on the path ``at`` to the relay of this name from now on.
 
         A path to a relay is never relayed: whatever a relay sends, no datagram goes to a host that is not an address.
-        A relay in the middle answers at the address of another relay. It must not end the handles of that one.
-        A handle that both assign leads along the first one, and along the other one when that ends.
+        A relay in the middle answers at the address of another relay. It must not end the handles of that one. A
+        handle that both assign leads along the first one. The other one gets it with a later record, if it is free.
         """
         wanted = set[int]() if at.is_relayed else set(handles)
         own = self._assigned.pop((relay, at), set())
         for handle in own - wanted:
             del self._outward[self._inward.pop((at.socket, at.address, handle))]
-        if kept := own & wanted:
-            self._assigned[relay, at] = kept
-        self._waiting.pop((relay, at), None)
-        self._add(relay, at, wanted - kept)
-        waiting, self._waiting = self._waiting, {}
-        for (name, path), those in waiting.items():
-            self._add(name, path, those)
-
-    def _add(self, relay: str, at: Path, handles: Iterable[int]) -> None:
-        for handle in handles:
+        kept = own & wanted
+        for handle in wanted - kept:
             path, key = relayed(at.socket, relay, handle), (at.socket, at.address, handle)
-            if path in self._outward or key in self._inward:  # a relay with two addresses, or two with one address
-                self._waiting.setdefault((relay, at), []).append(handle)
-            else:
-                self._assigned.setdefault((relay, at), set()).add(handle)
+            if path not in self._outward and key not in self._inward:
+                kept.add(handle)
                 self._inward[key] = path
                 self._outward[path] = at.address, handle
+        if kept:
+            self._assigned[relay, at] = kept
 
     def address_of(self, path: Path) -> SocketAddress | None:
         """The relay's address along a relayed path. None if its handle is gone, or it is another path."""
