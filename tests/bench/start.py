@@ -12,8 +12,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from statistics import median
 from typing import Final, NamedTuple
@@ -21,6 +21,7 @@ from typing import Final, NamedTuple
 from tests.bench.daemons import configuration, peer, rules
 from tests.bench.measure import resident_bytes
 from tests.daemon import frames
+from tests.limited_cpu import limited_cpu
 from tests.waiting import PATIENCE_S
 from uavlinkd.config import keys
 from uavlinkd.lab.sim.loopback_ports import free_ports
@@ -30,20 +31,30 @@ LIBRARIES: Final = "import asyncio, cryptography.hazmat.primitives.asymmetric.x2
 """What every daemon of this kind imports. Its processor time is the unit of a start in tests."""
 
 
+Launcher = tuple[str, ...]
+
+
 class Start(NamedTuple):
-    """``cpu_s``: processor time from exec until a frame of its client left the peer. ``rss``: resident bytes then."""
+    """``cpu_s``: processor time from exec until a frame of its client left the peer, which took ``time_s``.
+
+    ``rss``: resident bytes then.
+    """
 
     cpu_s: float
+    time_s: float
     rss: int
 
 
 @contextmanager
-def started(python: str = sys.executable) -> Iterator[Pair]:
-    """A pair of daemons, of which the peer runs. Both are of the package that ``python`` imports."""
+def started(python: str = sys.executable, launchers: Sequence[Launcher] = ((), ())) -> Iterator[Pair]:
+    """A pair of daemons, of which the peer runs. Both are of the package that ``python`` imports.
+
+    ``launchers``: what is written before the command of each.
+    """
     with tempfile.TemporaryDirectory(prefix="uavstart-") as name, socket.socket(type=socket.SOCK_DGRAM) as client:
         client.bind(("127.0.0.1", 0))
         client.settimeout(SEND_EVERY_S)
-        pair = Pair(Path(name), client, python)
+        pair = Pair(Path(name), client, python, launchers)
         try:
             yield pair
         finally:
@@ -53,8 +64,9 @@ def started(python: str = sys.executable) -> Iterator[Pair]:
 class Pair:
     """The daemon that is measured, and its peer. The only client is at both ends."""
 
-    def __init__(self, folder: Path, client: socket.socket, python: str) -> None:
+    def __init__(self, folder: Path, client: socket.socket, python: str, launchers: Sequence[Launcher]) -> None:
         self._folder, self._client = folder, client
+        self._launchers = dict(zip(("near", "far"), launchers, strict=True))
         self._command = [python, "-m", "uavlinkd", "run", "--config"]
         # An environment that forbids bytecode would make this measure the compiler.
         self._environ = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
@@ -79,11 +91,13 @@ class Pair:
         for side, text in (("near", near), ("far", far)):
             (folder / f"{side}.toml").write_text(text)
         self._far = self._run("far")
+        self._starts = 0
+        """Each sends another frame: late ones of the daemon before are not its own."""
 
     def _run(self, side: str) -> subprocess.Popen[bytes]:
         with (self._folder / f"{side}.log").open("ab") as log:
             return subprocess.Popen(
-                [*self._command, str(self._folder / f"{side}.toml")],
+                [*self._launchers[side], *self._command, str(self._folder / f"{side}.toml")],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
@@ -91,18 +105,19 @@ class Pair:
             )
 
     def start(self) -> Start:
-        """Start the daemon, send frames until one has passed, and end the daemon."""
+        """Start the daemon, send frames until one has passed, and kill the daemon: its peer notices nothing."""
+        began = time.monotonic()
         near = self._run("near")
         try:
             self._until_passed(near)
-            return Start(process_seconds(near.pid), resident_bytes(near.pid))
+            return Start(process_seconds(near.pid), time.monotonic() - began, resident_bytes(near.pid))
         finally:
-            near.terminate()
+            near.kill()
             near.wait()
 
     def _until_passed(self, near: subprocess.Popen[bytes]) -> None:
-        self._drain()
-        frame, deadline = frames.heartbeat(1), time.monotonic() + PATIENCE_S
+        self._starts += 1
+        frame, deadline = frames.heartbeat(1, seq=self._starts % 256), time.monotonic() + PATIENCE_S
         while time.monotonic() < deadline:
             self._client.sendto(frame, ("127.0.0.1", self._endpoint))
             try:
@@ -113,15 +128,6 @@ class Pair:
             except ConnectionRefusedError:  # ICMP: the endpoint is not open yet
                 time.sleep(SEND_EVERY_S)
         raise TimeoutError("no frame passes: " + (self._folder / "near.log").read_text())
-
-    def _drain(self) -> None:
-        """Discard frames of the daemon that ended before."""
-        self._client.setblocking(False)
-        try:
-            while self._client.recv(4096):
-                pass
-        except OSError:
-            self._client.settimeout(SEND_EVERY_S)
 
     def end(self) -> None:
         self._far.terminate()
@@ -149,13 +155,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--starts", type=int, default=15)
     parser.add_argument("--python", default=sys.executable, help="the interpreter of the daemons")
+    parser.add_argument("--share", type=float, help="of a core, by a control group for each daemon, such as 0.12")
     options = parser.parse_args()
-    with started(options.python) as pair:
+    with ExitStack() as stack:
+        groups = [stack.enter_context(limited_cpu(options.share)).launcher for _ in range(2) if options.share]
+        pair = stack.enter_context(started(options.python, groups or ((), ())))
         pair.start()  # writes the bytecode
         both = [(pair.start(), libraries_seconds(options.python)) for _ in range(options.starts)]
     starts, libraries = zip(*both, strict=True)
     cpu, unit = [start.cpu_s for start in starts], libraries
     print(f"CPU until a frame passes: {1000 * min(cpu):.0f} ms at best, median {1000 * median(cpu):.0f} ms")
+    print(f"time: {min(start.time_s for start in starts):.2f} to {max(start.time_s for start in starts):.2f} s")
     print(f"the libraries alone: {1000 * min(unit):.0f} ms at best, median {1000 * median(unit):.0f} ms")
     print(f"ratio: {min(cpu) / min(unit):.2f} at best, of medians {median(cpu) / median(unit):.2f}")
     print(f"resident: {max(start.rss for start in starts) / 1e6:.1f} MB")

@@ -13,9 +13,9 @@ import warnings
 from collections.abc import Callable
 
 from cryptography.exceptions import InvalidSignature, InvalidTag, UnsupportedAlgorithm
+from cryptography.hazmat.bindings._rust import openssl
 from cryptography.hazmat.primitives.asymmetric import dh, mlkem
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
-from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
 from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.hmac import HMAC
@@ -114,6 +114,11 @@ def _nonce(counter: int) -> bytes:
     return b"\0\0\0\0" + counter.to_bytes(8, "little")
 
 
+_x25519 = openssl.x25519
+"""What the classes of X25519 call after they have imported all other algorithms, 3 MB, to ask whether this one exists.
+cryptography's version is bounded, and the vectors of tests hold it."""
+
+
 class KeyPair:
     """An X25519 key pair (RFC 7748), static or ephemeral."""
 
@@ -122,7 +127,7 @@ class KeyPair:
     def __init__(self, private: bytes) -> None:
         if len(private) != KEY_BYTES:
             raise ValueError(f"an X25519 private key has {KEY_BYTES} bytes, not {len(private)}")
-        self._private = X25519PrivateKey.from_private_bytes(private)
+        self._private = _x25519.from_private_bytes(private)
         self.public = self._private.public_key().public_bytes_raw()
         """The public key, 32 bytes."""
 
@@ -132,7 +137,7 @@ class KeyPair:
         Raises ``INVALID_KEY_SHARE`` for a point of low order, whose secret is public (RFC 7748, section 6.1).
         """
         try:
-            return self._private.exchange(X25519PublicKey.from_public_bytes(public))
+            return self._private.exchange(_x25519.from_public_bytes(public))
         except ValueError:
             raise Drop(DropReason.INVALID_KEY_SHARE) from None
 
