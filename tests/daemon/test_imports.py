@@ -65,6 +65,39 @@ async def imported(hook: Path, *packages: str) -> list[str]:
     return [name for name in modules if name.startswith(packages)]
 
 
+NOT_CONFIGURED = (
+    *(
+        "argcomplete",
+        "cobs",
+        "matplotlib",
+        "prometheus_client",
+        "pydantic",
+        "pymavlink",
+        "rich",
+        "serialx",
+        "starlette",
+    ),
+    *("uvicorn", "websockets", "cryptography.hazmat.primitives.serialization"),
+    *(f"uavlinkd.{room}" for room in ("authority", "fleet", "lab", "relay", "web")),
+    *(f"uavlinkd.link.{module}" for module in ("fleet", "member_questions", "newcomers", "web_listener")),
+    *(f"uavlinkd.endpoints.{module}" for module in ("serial", "tcp", "tls_channel", "web_connect", "web_stream")),
+)
+"""What a daemon with one peer and an endpoint of UDP does not need. ``pydantic_core`` is another package."""
+
+
+async def test_a_daemon_imports_what_its_file_needs(stage: Stage) -> None:
+    """Each module costs processor time at the start, and memory for as long as the daemon runs."""
+    a, b = stage.pair()
+    a.add_endpoint("autopilot")
+    hook, environ = hooked(stage, HOOK)
+    await a.start(environ)
+    await b.start()
+    await a.until_linked()
+    assert await a.stop() == 0
+    unneeded = {name for name in await imported(hook, *NOT_CONFIGURED) if not name.startswith("pydantic_core")}
+    assert unneeded == set()
+
+
 async def test_a_daemon_imports_no_laboratory(stage: Stage) -> None:
     """Nor what the page speaks HTTP with, nor pymavlink, with every part in use: endpoints, a reload."""
     a, b = stage.pair()

@@ -7,9 +7,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-from uavlinkd.authority.trust import HeldCertificate
 from uavlinkd.config.members import DEFAULT_POLICIES, fleet_link, member_peer
 from uavlinkd.config.model import (
     Config,
@@ -41,8 +40,11 @@ from uavlinkd.core.path import RELAY_HOST
 from uavlinkd.core.settings import Link, PeerSettings, Redundancy, Timers
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.mavlink.policy.settings import PolicyError, read_settings
-from uavlinkd.relay.forwarding import MemberSettings, RelayLimits
 from uavlinkd.system.addresses import IPV6_UDP_BYTES
+
+if TYPE_CHECKING:
+    from uavlinkd.authority.trust import HeldCertificate
+    from uavlinkd.relay.forwarding import MemberSettings, RelayLimits
 
 VERIFYING_SHARE: Final = 0.05
 """Share of the budget that the echo requests and replies of one end may use."""
@@ -297,10 +299,14 @@ def _relay_server(file: Sections) -> RelayServer | None:
 
 
 def _member(file: Sections, section: Values, link: Link) -> MemberSettings:
+    from uavlinkd.relay.forwarding import MemberSettings  # noqa: PLC0415  only if configured
+
     keys = MemberSection(section.valid)
     peer = PeerSettings(keys.name, keys.public_key, file.secret(section, "psk_file"), link, initiates=False)
     return MemberSettings(peer, keys.max_peers, _limits(keys.bits_s))
 
 
 def _limits(bits_s: int) -> RelayLimits:
+    from uavlinkd.relay.forwarding import RelayLimits  # noqa: PLC0415  only if configured
+
     return RelayLimits(max(1, bits_s // _BITS_OF_DATAGRAM), bits_s)

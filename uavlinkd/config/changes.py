@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from uavlinkd.config.model import Config, ConfigError, EndpointConfig, FleetConfig, PeerConfig, Problem
-from uavlinkd.relay.forwarding import MemberSettings
+
+if TYPE_CHECKING:
+    from uavlinkd.relay.forwarding import MemberSettings
 
 _FIXED = {
     "name": "name",
@@ -21,7 +23,7 @@ _FIXED = {
 }
 """Fields of the configuration that cannot change while the daemon runs, with the key of each in the file."""
 _NEEDS_RESTART = "has changed, and a reload changes peers, members and policies only: restart the daemon"
-_Section = TypeVar("_Section", PeerConfig, EndpointConfig, MemberSettings)
+_Section = TypeVar("_Section", PeerConfig, EndpointConfig, "MemberSettings")
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import combinations
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-from uavlinkd.authority.enrolment import MOST_CONTACTS
-from uavlinkd.authority.trust import HeldCertificate
 from uavlinkd.config.build import fleet_policies, member_role, policy_data, policy_problems
 from uavlinkd.config.problems import Found, Sections, Values, role_of, unique
 from uavlinkd.config.relay_rules import over_ip
@@ -15,6 +13,9 @@ from uavlinkd.config.schema import ENROLL_AGAIN
 from uavlinkd.core.certificates import MemberRole, fleet_id_of, is_certified, verified_bulletin
 from uavlinkd.core.crypto import AuthorityKey
 from uavlinkd.mavlink.policy.settings import PolicyError, read_settings
+
+if TYPE_CHECKING:
+    from uavlinkd.authority.trust import HeldCertificate
 
 
 def check(file: Sections) -> Found:
@@ -51,6 +52,8 @@ def _signatures(file: Sections) -> Found:
 
 
 def _contacts(file: Sections) -> Found:
+    from uavlinkd.authority.enrolment import MOST_CONTACTS  # noqa: PLC0415  only if configured
+
     if len(file.contacts) > MOST_CONTACTS:
         yield "contact", f"has {len(file.contacts)} sections: write at most {MOST_CONTACTS}, the most reliable ones"
     pinned = {section.get("public_key"): section for section in (*file.peers, *file.relays, *file.members)}

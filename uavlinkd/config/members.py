@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-from uavlinkd.authority.constants import CERTIFIED_PEERS
-from uavlinkd.authority.trust import Pinned
 from uavlinkd.config.model import Config, FleetConfig, PeerConfig, PolicyData
 from uavlinkd.config.relay_rules import MOST_MEMBERS
 from uavlinkd.core import constants as c
@@ -16,7 +14,10 @@ from uavlinkd.core.certificates import Certificate, MemberRole
 from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.mavlink.policy.roles import ROLES
 from uavlinkd.mavlink.policy.settings import read_settings
-from uavlinkd.relay.forwarding import MemberSettings
+
+if TYPE_CHECKING:
+    from uavlinkd.authority.trust import Pinned
+    from uavlinkd.relay.forwarding import MemberSettings
 
 _VEHICLE: Final[PolicyData] = {"role": "vehicle"}
 DEFAULT_POLICIES: Final[Mapping[MemberRole, Mapping[MemberRole, PolicyData]]] = {
@@ -39,6 +40,8 @@ def most_members(config: Config) -> int:
     """How many members by certificate the daemon may have at once."""
     if config.fleet is None:
         return 0
+    from uavlinkd.authority.constants import CERTIFIED_PEERS  # noqa: PLC0415  only if configured
+
     return CERTIFIED_PEERS if config.relay_server is None else MOST_MEMBERS
 
 
@@ -63,6 +66,8 @@ def member_peer(fleet: FleetConfig, key: bytes, certificate: Certificate) -> Pee
 
 def reserved(config: Config, fleet: FleetConfig) -> Pinned:
     """What the configuration reserves for its own peers, relays and members."""
+    from uavlinkd.authority.trust import Pinned  # noqa: PLC0415  only if configured
+
     pinned = [peer for peer in config.peers if not peer.settings.is_certified]
     members = () if config.relay_server is None else config.relay_server.members
     own = {*(peer.settings for peer in pinned), *(relay.settings for relay in config.relays)}
@@ -81,6 +86,9 @@ def _systems_of(peer: PeerConfig) -> frozenset[int]:
 
 
 def relay_member(fleet: FleetConfig, key: bytes, certificate: Certificate) -> MemberSettings:
+    from uavlinkd.authority.constants import CERTIFIED_PEERS  # noqa: PLC0415  only if configured
+    from uavlinkd.relay.forwarding import MemberSettings  # noqa: PLC0415  only if configured
+
     link = replace(fleet.link, features=c.FEATURE_RECORDS | c.FEATURE_FLEET)
     peer = PeerSettings(certificate.name, key, None, link, initiates=False, is_certified=True)
     return MemberSettings(peer, CERTIFIED_PEERS, fleet.member_limits)

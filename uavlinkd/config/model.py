@@ -6,9 +6,8 @@ import socket
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-from uavlinkd.authority.trust import HeldCertificate
 from uavlinkd.core.certificates import MemberRole
 from uavlinkd.core.crypto import AuthorityKey, Secret
 from uavlinkd.core.path import RELAY_HOST, SERIAL_HOST
@@ -16,9 +15,12 @@ from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.endpoints.url import EndpointUrl, SerialUrl
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.mavlink.policy.compilation import Policy
-from uavlinkd.relay.forwarding import MemberSettings, RelayLimits
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.terminal import UsageError
+
+if TYPE_CHECKING:
+    from uavlinkd.authority.trust import HeldCertificate
+    from uavlinkd.relay.forwarding import MemberSettings, RelayLimits
 
 SERIAL = Address(SERIAL_HOST, 0)  # the other end of a serial network
 PolicyData = Mapping[str, object]

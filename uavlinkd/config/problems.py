@@ -11,17 +11,19 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pydantic_core import ErrorDetails
 
-from uavlinkd.authority.trust import HeldCertificate
 from uavlinkd.config import schema
 from uavlinkd.config.model import ConfigError, Problem
 from uavlinkd.config.section import Key, Section, read
 from uavlinkd.core.certificates import MemberRole
 from uavlinkd.core.crypto import Secret, x25519_public_key
 from uavlinkd.mavlink.policy.settings import INSTEAD_OF_DENIAL
+
+if TYPE_CHECKING:
+    from uavlinkd.authority.trust import HeldCertificate
 
 
 class Values(NamedTuple):

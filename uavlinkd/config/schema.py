@@ -11,11 +11,10 @@ from collections.abc import Callable
 from contextlib import suppress
 from ipaddress import IPv4Address, IPv6Address, ip_address
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from pydantic_core import CoreSchema
 
-from uavlinkd.authority.trust import HeldCertificate
 from uavlinkd.config.keys import decode_key, is_canonical_public_key
 from uavlinkd.config.model import SERIAL, HttpsServer, PeerAddress
 from uavlinkd.config.section import (
@@ -40,6 +39,9 @@ from uavlinkd.endpoints.url import EndpointUrl, SerialUrl, parse_line, parse_url
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.system.addresses import Address, AddressError, parse_address, parse_place
 from uavlinkd.system.base64_text import from_base64
+
+if TYPE_CHECKING:
+    from uavlinkd.authority.trust import HeldCertificate
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
 _INTERFACE = re.compile(r"[^\s/:]{1,15}")  # as dev_valid_name() of Linux
@@ -218,12 +220,18 @@ def _signed(parse: Callable[[bytes], object], what: str) -> CoreSchema:
     return parsed(check)
 
 
+def _certificate(data: bytes) -> HeldCertificate:
+    from uavlinkd.authority.trust import HeldCertificate  # noqa: PLC0415  only if configured
+
+    return HeldCertificate(parse_certificate(data), data)
+
+
 NAME: Final = parsed(_name)
 FILE_NAME: Final = parsed(_file_name)
 PUBLIC_KEY: Final = parsed(_public_key)
 PEER_ADDRESSES: Final = checked(each(parsed(_peer_address)), _addresses)
 BUDGET: Final = checked(integer(0, 10**9), _budget)
-CERTIFICATE: Final = _signed(lambda data: HeldCertificate(parse_certificate(data), data), "a certificate")
+CERTIFICATE: Final = _signed(_certificate, "a certificate")
 FRAME_ROLE: Final = choice("vehicle", "operator", "observer")
 
 

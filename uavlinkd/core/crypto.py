@@ -115,7 +115,7 @@ def _nonce(counter: int) -> bytes:
 
 
 _x25519 = openssl.x25519
-"""What the classes of X25519 call after they have imported all other algorithms, 3 MB, to ask whether this one exists.
+"""What the classes of X25519 call after they imported all other algorithms, 3 MB, to ask whether this one exists.
 cryptography's version is bounded, and the vectors of tests hold it."""
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING
 
 from structlog.typing import FilteringBoundLogger
 
@@ -13,7 +14,6 @@ from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import LinkedPeer, Output
 from uavlinkd.endpoints.ports import LocalPort
 from uavlinkd.link.evidence import Evidence
-from uavlinkd.link.fleet_members import FleetMembers
 from uavlinkd.link.journal import DaemonJournal
 from uavlinkd.link.local_endpoints import LocalEndpoints
 from uavlinkd.link.peer_link import PeerLink
@@ -23,10 +23,13 @@ from uavlinkd.link.relays import Relays
 from uavlinkd.link.switch import Switch
 from uavlinkd.mavlink.payloads import screen
 from uavlinkd.mavlink.routing import Router
-from uavlinkd.relay.service import RelayService, RelayShell
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.guard import FaultGuard
 from uavlinkd.system.stall import StallWatch
+
+if TYPE_CHECKING:
+    from uavlinkd.link.fleet_members import FleetMembers
+    from uavlinkd.relay.service import RelayService
 
 
 class DaemonParts:
@@ -67,6 +70,8 @@ class DaemonParts:
         self.relay: RelayService | None = None
         """That of this daemon, if it is one."""
         if config.relay_server is not None:
+            from uavlinkd.relay.service import RelayService, RelayShell  # noqa: PLC0415  only if configured
+
             shell = RelayShell(
                 entropy=os.urandom,
                 clock=monotonic,

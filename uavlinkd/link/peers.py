@@ -6,8 +6,6 @@ from uavlinkd.config.changes import ConfigChanges
 from uavlinkd.config.model import Config, PeerConfig
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.settings import PeerSettings
-from uavlinkd.link.fleet_members import FleetMembers
-from uavlinkd.link.fleet_shell import FleetShell
 from uavlinkd.link.parts import DaemonParts
 from uavlinkd.link.peer_link import Carriage, PeerLink
 from uavlinkd.system.clock import monotonic
@@ -24,6 +22,9 @@ class Peers:
         self._parts = parts
         self._carriage = carriage
         if (fleet := parts.config.fleet) is not None:
+            from uavlinkd.link.fleet_members import FleetMembers  # noqa: PLC0415  only if configured
+            from uavlinkd.link.fleet_shell import FleetShell  # noqa: PLC0415  only if configured
+
             known = parts.node, parts.links, parts.relays, parts.relay, parts.evidence
             parts.fleet = FleetMembers(parts.config, fleet, FleetShell(*known, self, carriage.perform))
 

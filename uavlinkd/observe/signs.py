@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Final
 
-from uavlinkd.authority.trust import BulletinVerdict
 from uavlinkd.config.keys import encode_key
 from uavlinkd.core import constants as c
 from uavlinkd.core.drops import Detail, DropReason
@@ -171,7 +170,11 @@ def fleet_state_degraded(moment: Moment) -> Signs:
 
 def bulletin_conflict(moment: Moment) -> Signs:
     """By whom a bulletin came that contradicts that of this daemon."""
-    noticed = {} if moment.daemon.fleet is None else moment.daemon.fleet.noticed(moment.now)
+    if (fleet := moment.daemon.fleet) is None:
+        return
+    from uavlinkd.authority.trust import BulletinVerdict  # noqa: PLC0415  only if configured
+
+    noticed = fleet.noticed(moment.now)
     for event in (BulletinVerdict.CONFLICT.value, BulletinVerdict.SHRINKS.value):
         if event in noticed:
             yield {"by": noticed[event][1]}

@@ -8,16 +8,14 @@ import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path as FilePath
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from uavlinkd import __version__
-from uavlinkd.authority.enrolment import fingerprint_of
 from uavlinkd.config.keys import encode_key
 from uavlinkd.core.path import Path, SocketAddress, relay_name
 from uavlinkd.core.path_state import PathState
 from uavlinkd.core.peer import Peer
 from uavlinkd.endpoints.ports import Endpoint
-from uavlinkd.link.fleet_members import FleetMembers
 from uavlinkd.link.parts import DaemonParts
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.relay_link import RelayLink
@@ -31,8 +29,11 @@ from uavlinkd.observe.signs import is_contested
 from uavlinkd.observe.traffic_signs import codes_there, name_of_problem, stops_frames
 from uavlinkd.ops import LOG_SCHEMA, STATUS_SCHEMA
 from uavlinkd.ops.log import shown
-from uavlinkd.relay.service import RelayMember, RelayService
 from uavlinkd.system.addresses import Address
+
+if TYPE_CHECKING:
+    from uavlinkd.link.fleet_members import FleetMembers
+    from uavlinkd.relay.service import RelayMember, RelayService
 
 WayOf = Callable[[Path], tuple[str | None, SocketAddress | None]]
 """The name of a path's network, if the configuration names any, and the relay's address along a relayed path."""
@@ -133,6 +134,8 @@ def fleet_status(fleet: FleetMembers, links: Mapping[str, PeerLink], now: float)
     """What a daemon knows of its fleet. ``events``: their age in seconds. ``bulletins``: the number that each peer
     stated. ``absent``: the keys of members that have not come since the start.
     """
+    from uavlinkd.authority.enrolment import fingerprint_of  # noqa: PLC0415  only if configured
+
     trust = fleet.trust
     own = None if trust.own is None else trust.own.certificate
     return {
