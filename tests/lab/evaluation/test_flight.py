@@ -166,6 +166,3 @@ async def test_quick_run(tmp_path: Path) -> None:
     assert all(findings.believed("errors_m", link) for link in LinkKind)
     assert "late_copy" in findings.noticed(LinkKind.OURS, AttackPhase.REPLAY)
     assert "bad_tag" in findings.noticed(LinkKind.OURS, AttackPhase.ALTER)
-    interventions = [json.loads(line) for line in (tmp_path / "mitm-flight-uavlinkd.jsonl").read_text().splitlines()]
-    attacks = {line["attack"] for line in interventions if line["event"] == "intervention"}
-    assert attacks >= {"duplicate", "displace-positions", "hold", "drop"}

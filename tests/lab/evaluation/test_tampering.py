@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from statistics import median
 
@@ -141,8 +140,3 @@ async def test_quick_run(tmp_path: Path) -> None:
     report = (tmp_path / "tampering.md").read_text()
     assert all(trial.attack in report for trial in ours)
     assert "bad_handshake" in (tmp_path / "uavlinkd-handshake-0-drone0.log").read_text()
-    interventions = [json.loads(line) for line in (tmp_path / "mitm-data.jsonl").read_text().splitlines()]
-    assert any(line["event"] == "intervention" and line["attack"] == "bit-flip" for line in interventions)
-    on_line = [json.loads(line) for line in (tmp_path / "mitm-line.jsonl").read_text().splitlines()]
-    cuts = {line["detail"].split()[1] for line in on_line if line.get("attack") == "line-cut"}
-    assert len(cuts) >= 0.4 * by_name["line frames cut at every offset"].attempts

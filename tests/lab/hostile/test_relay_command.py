@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import signal
 import sys
 from collections.abc import AsyncIterator, Iterable
@@ -110,12 +109,12 @@ async def _running(relay: DaemonProcess, *arguments: str) -> AsyncIterator[Path]
     assert not [form for form in secret_forms(relay.private_key) if form in errors.decode()]
 
 
-async def test_process_between_two_daemons(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+async def test_process_between_two_daemons(capsys: pytest.CaptureFixture[str]) -> None:
     """Without an attack frames pass. With attacks nothing false is accepted, and each attack is counted."""
     async with Stage() as stage:
         relay = relay_for(stage)
         pair = RelayedPair(stage, relay)
-        async with _running(relay, f"--log={tmp_path / 'log'}", "--seed=3") as control:
+        async with _running(relay, "--seed=3") as control:
             await pair.start()
             for flow in pair.ends():
                 await flow.pour(range(200))
@@ -134,8 +133,6 @@ async def test_process_between_two_daemons(tmp_path: Path, capsys: pytest.Captur
             assert drops.keys() >= {"bad_tag", "duplicate"}
             daemon_drops = (await pair.one.status())["drops"]
             assert daemon_drops.keys() >= {"frames_not_allowed", "relay_unknown_handle"}
-    lines = [json.loads(line) for line in (tmp_path / "log").read_text().splitlines()]
-    assert (lines[0]["event"], lines[0]["seed"], lines[-1]["event"]) == ("relay_started", 3, "relay_stopped")
     assert capsys.readouterr().out.count("attacks") == 1
 
 

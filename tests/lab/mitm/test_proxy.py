@@ -1,9 +1,8 @@
-"""The man in the middle with real sockets: listeners, strangers, control socket, log."""
+"""The man in the middle with real sockets: listeners, strangers, control socket."""
 
 from __future__ import annotations
 
 import asyncio
-import json
 import signal
 import sys
 from collections.abc import AsyncIterator, Callable
@@ -130,13 +129,13 @@ async def test_control_socket_changes_and_tells(tmp_path: Path) -> None:
 
 
 async def test_command_runs_until_a_stop_request(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """As a process: it forwards, answers on its control socket, and ends on SIGTERM with status 0 and a whole log."""
+    """As a process: it forwards, answers on its control socket, and ends on SIGTERM with status 0."""
     a, b = await open_client(), await open_client()
     ports = free_port(), free_port()
     config = tmp_path / "mitm.toml"
     config.write_text(pair_between(a.address[1], b.address[1], *ports))
     arguments = [
-        *(f"--config={config}", f"--log={tmp_path / 'log'}", f"--control-socket={tmp_path / 'control'}"),
+        *(f"--config={config}", f"--control-socket={tmp_path / 'control'}"),
         *("--attack=extend,kinds=any,direction=a>b", "--seed=3"),
     ]
     process = await asyncio.create_subprocess_exec(
@@ -159,9 +158,7 @@ async def test_command_runs_until_a_stop_request(tmp_path: Path, capsys: pytest.
         _, errors = await process.communicate()
     assert process.returncode == 0
     assert b"Traceback" not in errors
-    lines = [json.loads(line) for line in (tmp_path / "log").read_text().splitlines()]
-    assert lines[0]["seed"] == 3
-    assert lines[-1]["event"] == "mitm_stopped"
+    assert b"mitm_stopped" in errors
     a.close()
     b.close()
 

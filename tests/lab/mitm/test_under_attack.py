@@ -37,7 +37,6 @@ EXPECTED: dict[str, set[Reason]] = {
     "corrupt-share": {Reason.BAD_HANDSHAKE},
     "alter-indices": {Reason.HEADER_MISMATCH},
     "alter-macs": {Reason.BAD_MAC1},
-    "splice-handshake": {Reason.BAD_HANDSHAKE},
     "replay-initiation": {Reason.DUPLICATE},  # at once: it looks like a copy along another path
     "replay-response": {Reason.DUPLICATE},
     "replay-cookie": {Reason.COOKIE_REQUIRED},
@@ -57,9 +56,7 @@ EXPECTED: dict[str, set[Reason]] = {
     "flood-envelopes": {Reason.BAD_TAG},
     "raw-mavlink": {Reason.RAW_MAVLINK},
     "flood-initiations": {Reason.BAD_HANDSHAKE, Reason.COOKIE_REQUIRED},
-    "flood-replays": {Reason.REPLAYED_INITIATION},
     "flood-garbage": {Reason.MALFORMED, Reason.RAW_MAVLINK},
-    "stranger-scan": {Reason.MALFORMED},
     "amplification-probe": {Reason.COOKIE_REQUIRED, Reason.REPLAYED},
     "forge-hints": {Reason.UNKNOWN_INDEX},
     "forge-cookie": {Reason.BAD_COOKIE},
@@ -85,8 +82,14 @@ DISTURBS: dict[str, str] = {
 }
 COSTS_NOTHING = {
     *("replay-initiation", "replay-response", "replay-data", "duplicate", "reflect", "misroute"),
-    *("counter-jump", "forge-data", "flood-envelopes", "raw-mavlink", "flood-initiations", "flood-replays"),
-    *("flood-garbage", "stranger-scan", "amplification-probe", "forge-hints", "forge-cookie", "roam"),
+    *(
+        "counter-jump",
+        "forge-data",
+        "flood-envelopes",
+        "raw-mavlink",
+        "flood-initiations",
+    ),
+    *("flood-garbage", "amplification-probe", "forge-hints", "forge-cookie", "roam"),
     *("cross-initiations", "reorder", "move"),
 }
 """Attacks that add datagrams and do not withhold any for long."""

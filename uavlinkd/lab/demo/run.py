@@ -115,7 +115,7 @@ async def run_demo(
         # The summary replaces the live screen; after Ctrl-C it remains.
         live = stack.enter_context(Live(console=console, auto_refresh=False)) if show and not serve else None
         try:
-            async with DaemonStage(NAMES, folder, MiddleHere(NAMES, None, 0), link, rate_hz=RATE_HZ) as stage:
+            async with DaemonStage(NAMES, folder, MiddleHere(NAMES, 0), link, rate_hz=RATE_HZ) as stage:
                 demo = Demo(stage, live)
                 with _ended_by_q(demo) if show else nullcontext():
                     summary = await demo.run(seconds, specs, serve)

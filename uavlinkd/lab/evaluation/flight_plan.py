@@ -6,8 +6,7 @@ import math
 import struct
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
@@ -56,7 +55,6 @@ ATTACKS: Final = tuple(phase for phase in AttackPhase if phase is not AttackPhas
 """RESULTS-flight.md has what each does."""
 
 POSITION_RATE_HZ: Final = 10.0
-SAMPLE_S: Final = 0.1
 ALTERED_SHARE: Final = 0.5
 _AFTER_GENUINE_S: Final = 0.02
 """A replay arrives this long after a genuine position, and replaces it until the next one."""
@@ -222,28 +220,6 @@ def _frames_at(datagram: bytes) -> list[int]:
     return places
 
 
-@dataclass(slots=True)
-class Flown:
-    """The track of one aircraft, from the positions that it sends. Times are seconds, ascending."""
-
-    times: list[float] = field(default_factory=list)
-    places: list[Place] = field(default_factory=list)
-
-    def add(self, now: float, place: Place) -> None:
-        self.times.append(now)
-        self.places.append(place)
-
-    def at(self, now: float) -> Place:
-        """The place at a time, between two positions sent; before the first and after the last, that one."""
-        after = bisect_right(self.times, now)
-        if after in (0, len(self.times)):
-            return self.places[min(after, len(self.times) - 1)]
-        share = (now - self.times[after - 1]) / (self.times[after] - self.times[after - 1])
-        one, other = self.places[after - 1], self.places[after]
-        east_m = one.east_m + share * (other.east_m - one.east_m)
-        return Place(east_m, one.north_m + share * (other.north_m - one.north_m))
-
-
 @dataclass(frozen=True, slots=True)
 class Belief:
     """A position that a receiver accepted, and believes until the next one."""
@@ -252,7 +228,6 @@ class Belief:
     sent_at: float
     """When the aircraft sent it; for an altered one, when it was accepted."""
     place: Place
-    provenance: Provenance
 
 
 class Receiver:
@@ -278,34 +253,9 @@ class Receiver:
         self.frames.append((now, provenance))
         place = self._origin.place_in(frame)
         if place is not None:
-            self.beliefs.append(Belief(now, now if sent_at is None else sent_at, place, provenance))
+            self.beliefs.append(Belief(now, now if sent_at is None else sent_at, place))
 
-
-@dataclass(frozen=True, slots=True)
-class PositionSample:
-    """What was flown and what was believed at one time."""
-
-    at: float
-    flown: Place
-    belief: Belief
-
-    @property
-    def error_m(self) -> float:
-        return self.flown.distance_m(self.belief.place)
-
-    @property
-    def age_s(self) -> float:
-        """The time since the aircraft sent the believed position; of an altered one, since it was accepted."""
-        return self.at - self.belief.sent_at
-
-
-def samples(
-    flown: Flown, beliefs: Sequence[Belief], begin_s: float, end_s: float, interval_s: float
-) -> Iterator[PositionSample]:
-    """One sample each ``interval_s``, from the first belief on."""
-    times = [belief.accepted_at for belief in beliefs]
-    for number in range(int((end_s - begin_s) / interval_s)):
-        at = begin_s + number * interval_s
-        last = bisect_right(times, at) - 1
-        if last >= 0:
-            yield PositionSample(at, flown.at(at), beliefs[last])
+    def belief_at(self, now: float) -> Belief | None:
+        """What the receiver believes at a time; None before the first position."""
+        last = bisect_right(self.beliefs, now, key=lambda belief: belief.accepted_at) - 1
+        return self.beliefs[last] if last >= 0 else None

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import struct
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from contextlib import AsyncExitStack
 from functools import partial
@@ -22,19 +22,16 @@ from uavlinkd.lab.evaluation.flight_plan import (
     GLOBAL_POSITION_INT,
     PAIR,
     POSITION_RATE_HZ,
-    SAMPLE_S,
     SYSTEM_IDS,
     AttackPhase,
     DisplacePositions,
     Drift,
     FlightSettings,
-    Flown,
     LinkKind,
     Origin,
-    PositionSample,
+    Place,
     Provenance,
     Receiver,
-    samples,
 )
 from uavlinkd.lab.evaluation.flight_report import FlightFindings, flight_problems, sections, summary
 from uavlinkd.lab.evaluation.frame import Evaluation, Work
@@ -66,7 +63,7 @@ class FlyingCopter:
         self._vehicle.set_mode(Mode.GUIDED)
         self._vehicle.take_off(path[0].up)
         while not self._vehicle.has_arrived():
-            self._vehicle.step(SAMPLE_S)
+            self._vehicle.step(1 / POSITION_RATE_HZ)
         self._sent = 0
 
     def fly(self, duration_s: float) -> bytes:
@@ -117,13 +114,13 @@ class _Run:
         self._work = work
         self._settings = work.settings
         self._origin = Origin(HOME.latitude_deg, HOME.longitude_deg)
-        self._flown = {name: Flown() for name in PAIR}
+        self._flown: dict[str, list[tuple[float, Place]]] = {name: [] for name in PAIR}
         self._sent: dict[str, dict[bytes, float]] = {name: {} for name in PAIR}
         self._receivers = {
             kind: {name: Receiver(self._origin, self._sent[_other(name)]) for name in PAIR} for kind in LinkKind
         }
         link = {"rekey_after_s": self._settings.rekey_after_s}
-        self._middles = {kind: self._middle(kind) for kind in LinkKind}
+        self._middles = {kind: MiddleHere(PAIR, self._settings.seed) for kind in LinkKind}
         self._paper = PaperStage(PAIR, self._middles[LinkKind.PAPER], rate_hz=0.0, renew_s=None)
         self._ours = _SwarmStage(PAIR, work.folder, self._middles[LinkKind.OURS], link, rate_hz=0.0)
         self._stages: dict[LinkKind, Stage] = {LinkKind.PAPER: self._paper, LinkKind.OURS: self._ours}
@@ -132,11 +129,6 @@ class _Run:
         self._is_relayed = False
         self._began_at = monotonic()
         self._phases: list[tuple[AttackPhase, float, float]] = []
-
-    def _middle(self, kind: LinkKind) -> MiddleHere:
-        log = self._work.out / f"mitm-flight-{kind}.jsonl"
-        log.unlink(missing_ok=True)  # of an earlier run
-        return MiddleHere(PAIR, log, self._settings.seed)
 
     def _on_received(self, kind: LinkKind, name: str, datagram: bytes, now: float) -> None:
         for frame in split_datagram(datagram, SplitCounters()):
@@ -176,7 +168,7 @@ class _Run:
                 place = self._origin.place_in(frame)
                 assert place is not None
                 self._sent[name][frame] = now
-                self._flown[name].add(now, place)
+                self._flown[name].append((now, place))
                 for stage in self._stages.values():
                     stage.send(name, frame)
             flown_s = now
@@ -246,23 +238,27 @@ class _Run:
             await asyncio.sleep(_NOTICE_S)
 
     def _add_errors(self) -> None:
-        """The errors and ages of the positions that the receivers believed in each phase, ten samples a second."""
+        """What the receivers believed each time an aircraft sent its position, by phase: error and age."""
         for kind, receivers in self._receivers.items():
-            errors: dict[AttackPhase, list[PositionSample]] = {}
+            errors_m, ages_s = (
+                defaultdict[AttackPhase, list[float]](list),
+                defaultdict[AttackPhase, list[float]](list),
+            )
             for name, receiver in receivers.items():
                 before = AttackPhase.QUIET
                 for phase, begin_s, end_s in self._phases:
-                    for sample in samples(self._flown[_other(name)], receiver.beliefs, begin_s, end_s, SAMPLE_S):
+                    for at, place in self._flown[_other(name)]:
+                        belief = receiver.belief_at(at) if begin_s <= at < end_s else None
+                        if belief is None:
+                            continue
                         # An attack has an effect until a position is accepted after its end.
-                        is_over = sample.belief.accepted_at >= begin_s
+                        is_over = belief.accepted_at >= begin_s
                         cause = before if phase is AttackPhase.QUIET and not is_over else phase
-                        errors.setdefault(cause, []).append(sample)
+                        errors_m[cause].append(round(place.distance_m(belief.place), 2))
+                        ages_s[cause].append(round(at - belief.sent_at, 3))
                     before = phase
-            for phase, chosen in errors.items():
-                values = {
-                    "errors_m": [round(one.error_m, 2) for one in chosen],
-                    "ages_s": [round(one.age_s, 3) for one in chosen],
-                }
+            for phase in errors_m:
+                values = {"errors_m": errors_m[phase], "ages_s": ages_s[phase]}
                 self._work.add(Record("believed", {"link": kind.value, "phase": phase.value}, values))
 
 

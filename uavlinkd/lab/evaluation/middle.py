@@ -8,7 +8,6 @@ import socket
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from pathlib import Path
 from time import monotonic
 from typing import Any, Protocol
 
@@ -85,14 +84,12 @@ class MiddleHere:
     def __init__(
         self,
         names: Sequence[str],
-        log: Path | None,
         seed: int,
         paths: int = 1,
         radios: Sequence[tuple[str, RadioSettings]] = (),
     ) -> None:
         directions = AttackContext.between(*names, paths=paths).directions
         self.ports = dict(zip(directions, free_ports(len(directions)), strict=True))
-        self._log = log
         self._seed = seed
         self._radios = tuple(radios)
         self._proxy: Proxy | None = None
@@ -109,7 +106,7 @@ class MiddleHere:
     async def start(self, addresses: Mapping[str, int], public_keys: Mapping[str, bytes]) -> None:
         peers = tuple(MitmPeer(name, Address(HOST, port), public_keys.get(name)) for name, port in addresses.items())
         links = tuple(_links(self.ports))
-        proxy = Proxy(ProxySettings(peers, links, radios=self._radios, seed=self._seed, log=self._log))
+        proxy = Proxy(ProxySettings(peers, links, radios=self._radios, seed=self._seed))
         proxy.log = silent_log()
         await proxy.start()
         self._proxy = proxy
@@ -132,7 +129,7 @@ class MiddleHere:
 
 
 def silent_log() -> Any:
-    """A logger without output: the proxy's journal has its interventions."""
+    """A logger without output: the proxy counts its interventions."""
     above_all = structlog.make_filtering_bound_logger(logging.CRITICAL)
     return structlog.wrap_logger(structlog.ReturnLogger(), wrapper_class=above_all)
 

@@ -63,8 +63,6 @@ class Stage(ABC):
         self.rate_hz = rate_hz
         self.receive: Callable[[str, bytes, float], None] = ledger.on_received
         """Gets what the clients receive: the name of the receiver, the datagram and the time."""
-        self.unwritten: dict[str, set[str]] = {name: set() for name in names}
-        """By drone: what a killed daemon counted. It logs its totals when it stops."""
         self._traffic: asyncio.Task[None] | None = None
 
     async def __aenter__(self) -> Self:
@@ -237,9 +235,7 @@ class DaemonStage(Stage):
     async def restart(self, name: str) -> None:
         """Kill the daemon and restart it."""
         drone = self.drones[name]
-        counters = _counters(await drone.ask())
-        self._before[name] += counters
-        self.unwritten[name] |= set(counters)
+        self._before[name] += _counters(await drone.ask())
         await drone.stop(signal.SIGKILL)
         await asyncio.sleep(0.4)  # long enough for replay attacks to detect the restart
         drone.status = {}

@@ -124,7 +124,7 @@ HANDSHAKE_PLANS: Final = (
         TrialPlan(name, HANDSHAKE, (f"{name},message=initiation", f"{name},message=response"), paper)
         for names, has_paper in (
             (("tamper-key", "replace-key", "random", "invalid-element"), True),
-            (("suite-downgrade", "corrupt-share", "alter-indices", "alter-macs", "splice-handshake"), False),
+            (("suite-downgrade", "corrupt-share", "alter-indices", "alter-macs"), False),
         )
         for name in names
         for paper in ([name] if has_paper else [None])
@@ -212,9 +212,7 @@ FLOOD_PLANS: Final = plan_rows(
 flood-envelopes | flood-envelopes,rate_per_s=3000 | paper=same is_silent
 flood-initiations | flood-initiations,rate_per_s=1500
 flood-initiations, no public key | flood-initiations,mac1=bad,rate_per_s=1500 | is_silent is_variant
-flood-replays | flood-replays,rate_per_s=1500 | least_s=1.3
 flood-garbage | flood-garbage,rate_per_s=1500 | paper=same is_silent
-stranger-scan | stranger-scan,rate_per_s=1500 | paper=same is_silent
 amplification-probe | amplification-probe,rate_per_s=1500
 forge-hints | forge-hints,rate_per_s=1500
 """,
@@ -359,8 +357,6 @@ initiations with certificates extended | extend,kinds=certificate | restarts nee
 certificates cut off and added | certificate-length {_UNANSWERED} | restarts needs=bad_handshake
 records replayed | replay-data,kinds=record,copies=20 | restarts needs=duplicate
 flood of the length of certificates | flood-initiations,certificate=true,rate_per_s=1500 | needs=bad_handshake
-flood of recorded certificates | flood-replays,kinds=certificate,rate_per_s=1500 {_UNANSWERED}
-    | restarts needs=replayed_initiation
 """,
     least_s=3.0,
     takes_away=True,

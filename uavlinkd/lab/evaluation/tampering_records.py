@@ -177,8 +177,7 @@ class TamperingFindings(RunRecords):
         relay = [trial for trial in self.on(PAPER) if trial.attack == RELAY and trial.false_frames]
         if self.on(PAPER) and [trial.verdict for trial in relay] != [Verdict.SUCCEEDED]:
             lines.append("the two-sided relay did not succeed against the paper's protocol: the relay does not work")
-        unlogged = [item for end in self.of("end") for item in end.values.get("unlogged", [])]
-        return lines + [f"counted and never logged: {item}" for item in unlogged]
+        return lines
 
     def summary(self) -> dict[str, Any]:
         facts: dict[str, Any] = {"quick": self.run.get("quick")}

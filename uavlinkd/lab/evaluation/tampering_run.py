@@ -13,7 +13,6 @@ from pathlib import Path
 from random import Random
 from typing import Any, Final
 
-from uavlinkd.core.drops import DropReason
 from uavlinkd.lab.evaluation import tampering_plan as plans
 from uavlinkd.lab.evaluation.commands import STAGES
 from uavlinkd.lab.evaluation.fleet_stages import FleetStage, member_attacks
@@ -51,14 +50,14 @@ def _rekeying(rekey_after_s: float, reject_after_s: float) -> Link:
     return {"rekey_after_s": rekey_after_s, "reject_after_s": reject_after_s}
 
 
-def _here(names: Sequence[str], folder: Path, log: Path, seed: int) -> MiddleHere:
+def _here(names: Sequence[str], folder: Path, seed: int) -> MiddleHere:
     del folder
-    return MiddleHere(names, log, seed)
+    return MiddleHere(names, seed)
 
 
-def _on_two_paths(names: Sequence[str], folder: Path, log: Path, seed: int) -> MiddleHere:
+def _on_two_paths(names: Sequence[str], folder: Path, seed: int) -> MiddleHere:
     del folder
-    return MiddleHere(names, log, seed, paths=2, radios=(SLOWER,))
+    return MiddleHere(names, seed, paths=2, radios=(SLOWER,))
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,8 +70,8 @@ class _Lane:
     """Frames per second of each client; up to 1: the share of the settings' rate."""
     rows: Sequence[TrialPlan]
     kind: type[DaemonStage] = DaemonStage
-    middle: Callable[[Sequence[str], Path, Path, int], Any] = _here
-    """Makes the man in the middle from the names, the folder, the log and the seed."""
+    middle: Callable[[Sequence[str], Path, int], Any] = _here
+    """Makes the man in the middle from the names, the folder and the seed."""
     silent: Sequence[str] = ()
 
 
@@ -103,7 +102,6 @@ class _Run:
     def __init__(self, work: Work[TamperingSettings]) -> None:
         self._work = work
         self._settings = work.settings
-        self._unlogged: list[str] = []
 
     async def run(self) -> dict[str, Any]:
         chosen = self._settings.only or STAGES
@@ -117,7 +115,7 @@ class _Run:
                     group.create_task(lane)
         except ExceptionGroup as failed:  # the first is the cause: the others were cancelled
             raise failed.exceptions[0] from None
-        return {"unlogged": self._unlogged}
+        return {}
 
     def _add(self, trial: Trial) -> None:
         self._work.add(trial.to_record())
@@ -128,17 +126,11 @@ class _Run:
     def _chosen(self, rows: Sequence[TrialPlan]) -> list[TrialPlan]:
         return [plan for plan in rows if not (self._settings.quick and plan.is_variant)]
 
-    def _log(self, label: str) -> Path:
-        """The log file of a man in the middle, without the lines of an earlier run."""
-        path = self._work.out / f"mitm-{label}.jsonl"
-        path.unlink(missing_ok=True)
-        return path
-
     def _stage(self, label: str, lane: _Lane) -> DaemonStage:
-        folder, log, seed = self._work.folder / label, self._log(label), self._settings.seed
+        folder, seed = self._work.folder / label, self._settings.seed
         folder.mkdir()
         rate_hz = lane.rate_hz if lane.rate_hz > 1 else lane.rate_hz * self._settings.rate_hz
-        made = lane.middle(lane.names, folder, log, seed)
+        made = lane.middle(lane.names, folder, seed)
         return lane.kind(lane.names, folder, made, lane.link, rate_hz=rate_hz, silent=lane.silent)
 
     async def _run_lane(self, label: str, lane: _Lane) -> None:
@@ -166,21 +158,12 @@ class _Run:
         async with stage:
             await bench.run_control()
             await work(bench)
-            counted = {name: set(+counters) for name, counters in (await stage.notices()).items()}
         for name, lines in stage.logs().items():
             text = "".join(f"{line}\n" for line in lines)
             (self._work.out / f"{stage.system}-{label}-{name}.log").write_text(text, encoding="utf-8")
-            logged = {str(line.get(field)) for line in lines for field in ("reason", "problem")}
-            # Everyday drops and problems have no line of their own, but are counted when the daemon stops.
-            logged |= {DropReason.DUPLICATE, DropReason.LATE_COPY} | {
-                reason for line in lines for reason in line.get("counted", ())
-            }
-            missing = {reason for reason in counted[name] if reason.removeprefix("refused_") not in logged}
-            if lines:
-                self._unlogged += [f"{label}: {name}: {reason}" for reason in sorted(missing - stage.unwritten[name])]
 
     async def _paper(self) -> None:
-        middle = MiddleHere(PAIR, self._log("paper"), self._settings.seed)
+        middle = MiddleHere(PAIR, self._settings.seed)
         # Both ends run in this process.
         stage = PaperStage(PAIR, middle, rate_hz=100.0 if self._settings.quick else 250.0)
 

@@ -62,12 +62,12 @@ class MiddleLine:
     back what they should receive. It has no keys, but it knows the framing: it makes frames with a valid CRC.
     """
 
-    def __init__(self, names: Sequence[str], folder: Path, log: Path | None, seed: int) -> None:
+    def __init__(self, names: Sequence[str], folder: Path, seed: int) -> None:
         del names
         self.ports: Mapping[Direction, int] = {}
         self.devices = {name: folder / end for end, name in _ENDS.items()}
         left, right = self.devices.values()
-        self._modems = ModemPorts(PortSettings(left, right, SIK, seed=seed, log=log))
+        self._modems = ModemPorts(PortSettings(left, right, SIK, seed=seed))
         self._modems.log = silent_log()
 
     async def start(self, addresses: Mapping[str, int], public_keys: Mapping[str, bytes]) -> None:
@@ -106,13 +106,13 @@ class LineStage(DaemonStage):
 class MiddleRelay:
     """A hostile relay in this process. ``names``: of its members."""
 
-    def __init__(self, names: Sequence[str], folder: Path, log: Path | None, seed: int) -> None:
+    def __init__(self, names: Sequence[str], folder: Path, seed: int) -> None:
         del folder
         self.ports: Mapping[Direction, int] = {}
         """Of a proxy; members reach a relay by its own port."""
         (self.port,) = free_ports(1)
         self._names = tuple(names)
-        self._log, self._seed = log, seed
+        self._seed = seed
         self._private = os.urandom(c.KEY_BYTES)
         self.public_key = KeyPair(self._private).public
 
@@ -130,7 +130,6 @@ class MiddleRelay:
             listen=(Address(HOST, self.port),),
             server=RelayServer(tuple(MemberSettings(member, RELAY_PEERS, AMPLE) for member in members), AMPLE),
             seed=self._seed,
-            log=self._log,
         )
         self.relay = HostileRelay(settings)
         self.relay.log = silent_log()

@@ -106,7 +106,7 @@ class Pair:
         names, ports = (_INITIATOR, _RESPONDER), free_ports(4)
         self.drones = {name: DroneProcess(name, folder / name, *ports[2 * n :][:2]) for n, name in enumerate(names)}
         initiator, responder = self.drones.values()
-        middle = MiddleHere(names, None, 0)
+        middle = MiddleHere(names, 0)
         stack.push_async_callback(middle.stop)
         await middle.start({name: drone.port for name, drone in self.drones.items()}, {})
         await middle.attack([], [self.watch])

@@ -17,8 +17,6 @@ from uavlinkd.core import constants as c
 from uavlinkd.core import wire
 from uavlinkd.core.drops import Drop
 from uavlinkd.core.probe import ANSWER_BYTES, PROBE, QUESTION_BYTES, parse_probe
-from uavlinkd.core.problem_reports import PROBLEM_REPORT, parse_problem_report
-from uavlinkd.core.refusals import REFUSAL_REPORT, parse_report
 from uavlinkd.core.suites import Suite
 
 
@@ -154,18 +152,6 @@ def envelope_of(datagram: bytes) -> Envelope | None:
         return None
 
 
-def is_report(datagram: bytes) -> bool:
-    """Whether an envelope seems to carry a refusal or problem report. In a confidential session that is a guess."""
-    envelope = envelope_of(datagram)
-    if envelope is None:
-        return False
-    payload = datagram[envelope.header_bytes :]
-    payloads = [payload[:-tag_bytes] for tag_bytes in wire.TAG_LENGTHS if len(payload) > tag_bytes]
-    if payload[0] == PROBLEM_REPORT:
-        return any(parse_problem_report(one) is not None for one in payloads)
-    return payload[0] == REFUSAL_REPORT and any(parse_report(one) is not None for one in payloads)
-
-
 _ECHO_BYTES = frozenset(
     len(wire.Echo(is_reply, 0, 0, 0).encode()) + tag_bytes
     for is_reply in (False, True)
@@ -233,14 +219,13 @@ KindFilter = Literal[
     "response",
     "cookie",
     "envelope",
-    "report",
     "record",
     "probe",
     "frames",
 ]
 KINDS: Final = (
-    "any, handshake, initiation, certificate (an initiation with one), response, cookie, envelope, report (a refusal"
-    " or problem report in the clear), record (of fleets and relays, likewise), probe (by its length, or in the clear"
+    "any, handshake, initiation, certificate (an initiation with one), response, cookie, envelope, record (of"
+    " fleets and relays, in the clear), probe (by its length, or in the clear"
     " before frames), or frames (envelopes that are neither probes nor echoes)"
 )
 
@@ -255,8 +240,6 @@ def matches_kind(kinds: KindFilter, datagram: bytes) -> bool:
             return kind in HANDSHAKE
         case "certificate":
             return has_certificate(datagram)
-        case "report":
-            return is_report(datagram)
         case "record":
             return is_record(datagram)
         case "probe":

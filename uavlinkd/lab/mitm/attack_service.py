@@ -1,20 +1,13 @@
-"""What a man in the middle, emulated modems and a hostile relay share while they run: journal, timer and requests.
-
-The journal is the log of a run: one JSON line per intervention, and totals for floods. The first :data:`LOG_DETAIL`
-interventions of each attack and operation have a line each. Later ones are summed up, so that a flood does not fill
-the disk.
-"""
+"""What a man in the middle, emulated modems and a hostile relay share while they run: totals, timer and requests."""
 
 from __future__ import annotations
 
 import asyncio
-import json
-import os
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
 from types import MappingProxyType
@@ -27,31 +20,25 @@ from uavlinkd.lab.mitm.attack import NEVER, Attack, AttackContext, AttackError, 
 from uavlinkd.lab.mitm.attacks import ATTACKS, AttackSpec, parse_attack
 from uavlinkd.lab.mitm.channel import AttackChannel
 from uavlinkd.ops.control import ControlServer
-from uavlinkd.ops.log import LogFile
 from uavlinkd.system.tasks import on_signal
 
-LOG_DETAIL = 1000
-"""Interventions of one attack and operation that have a line each."""
 SUM_INTERVAL_S = 10.0
-"""How often the interventions without a line of their own are summed up."""
+"""How often the totals of attacks that go on are logged."""
 
 
 class Journal:
-    """Appends to the file, if there is one, and logs the start and the totals of each attack for the operator."""
+    """Counts the interventions, and logs the start and the totals of each attack for the operator."""
 
-    def __init__(self, path: Path | None, log: FilteringBoundLogger, now: float) -> None:
+    def __init__(self, log: FilteringBoundLogger) -> None:
         self.counts: Counter[tuple[str, str]] = Counter()
-        self._began_at = now
         self._log = log
-        self._not_logged: Counter[tuple[str, str]] = Counter()
         self._logged: Counter[tuple[str, str]] = Counter()
         self._sum_at = NEVER
-        self._descriptor = None if path is None else os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
-        self._file = None if self._descriptor is None else LogFile(self._descriptor)
 
     def event(self, name: str, now: float, **facts: object) -> None:
+        """Log an event of the service."""
+        del now
         self._log.info(name, **facts)
-        self._write({"event": name, "at": round(now - self._began_at, 6), **facts})
 
     def add(self, done: Intervention) -> None:
         key = (done.attack, done.operation.value)
@@ -66,22 +53,11 @@ class Journal:
             )
         if self._sum_at == NEVER:
             self._sum_at = done.at + SUM_INTERVAL_S
-        if self.counts[key] > LOG_DETAIL:
-            self._not_logged[key] += 1
-        elif self._file is not None:
-            facts = {"at": round(done.at - self._began_at, 6), "direction": str(done.direction)}
-            self._write({"event": "intervention", **asdict(done), **facts})
 
     def flush(self, now: float) -> None:
         if now < self._sum_at:
             return
         self._sum_at = NEVER
-        at = None if now == NEVER else round(now - self._began_at, 6)
-        for (attack, operation), count in self._not_logged.items():
-            self._write(
-                {"event": "interventions_summed", "at": at, "attack": attack, "operation": operation, "count": count}
-            )
-        self._not_logged.clear()
         for key, count in self.counts.items():
             if count > self._logged[key]:
                 self._log.warning("attack_continued", attack=key[0], operation=key[1], count=count)
@@ -91,21 +67,9 @@ class Journal:
         return self._sum_at
 
     def close(self) -> None:
+        """Log the last totals."""
         self._sum_at = min(self._sum_at, 0.0)
         self.flush(NEVER)
-        if self._descriptor is not None:
-            os.close(self._descriptor)
-            self._descriptor = self._file = None
-
-    def _write(self, facts: dict[str, object]) -> None:
-        if self._file is None:
-            return
-        lost = self._file.lost
-        if lost:
-            facts = {**facts, "lines_lost_before": lost}
-        self._file.write(json.dumps(facts) + "\n")
-        if self._file.lost and not lost:  # a full disk does not stop the proxy
-            self._log.error("journal_not_written")
 
 
 REQUESTS = '"statistics", "stop", "attack none" or "attack NAME,key=value ..."'
@@ -119,7 +83,6 @@ class RunSettings:
 
     seed: int = 0
     """Of all random choices."""
-    log: Path | None = None
     control_socket: Path | None = None
 
 
@@ -146,11 +109,11 @@ class Service(ABC):
             BindError: an address cannot be bound, or a host name cannot be resolved.
             AttackError: the peers do not allow an attack.
             ControlError: the control socket cannot be used.
-            OSError: the log file cannot be written, or a device cannot be made.
+            OSError: a device cannot be made.
         """
 
     async def stop(self) -> None:
-        """End, with the statistics as the last line of the journal."""
+        """End, with the statistics in the log."""
         self._stop_timer()
         statistics = self.statistics()
         await self._close()
@@ -174,12 +137,12 @@ class Service(ABC):
             await self.stop()
 
     async def _open(self) -> None:
-        """Open the control socket and the journal, or close everything."""
+        """Open the control socket, or close everything."""
         try:
             if self._run.control_socket is not None:
                 self._control = ControlServer(self._run.control_socket, self.answer)
                 await self._control.start()
-            self.journal = Journal(self._run.log, self.log, self._began_at)
+            self.journal = Journal(self.log)
         except BaseException:
             await self._close()
             raise

@@ -62,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         settings = load_proxy_settings(options.config) if options.config is not None else ProxySettings((), ())
     except SettingsError as error:
         return fail(error, WRONG)
-    given = {name: getattr(options, name) for name in ("seed", "log", "control_socket")}
+    given = {name: getattr(options, name) for name in ("seed", "control_socket")}
     given["attacks"] = tuple(options.attack) or None
     settings = replace(settings, **{name: value for name, value in given.items() if value is not None})
     if options.ask is not None:
@@ -77,8 +77,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         asyncio.run(Proxy(settings).run(options.seconds))
     except (BindError, ControlError, AttackError) as error:
         return fail(error)
-    except OSError as error:
-        return fail(f"cannot write the log {settings.log}: {error.strerror or error}")
     return OK
 
 
@@ -127,7 +125,6 @@ def _modem(arguments: Sequence[str]) -> int:
         modem,
         tuple(options.attack),
         seed=options.seed or 0,
-        log=options.log,
         control_socket=options.control_socket,
     )
     set_up_logging("info", "auto")

@@ -41,7 +41,6 @@ def add_attack_options(parser: argparse.ArgumentParser, parse: Callable[[str], o
         help="an attack; repeat it for a chain in which each attack gets the output of the one before",
     )
     parser.add_argument("--seed", type=int, metavar="N", help="equal seeds cause equal attacks (default: 0)")
-    parser.add_argument("--log", metavar="FILE", type=Path, help="append each intervention to FILE, in JSON lines")
     parser.add_argument("--seconds", metavar="N", type=read_by(_seconds), help="stop after N seconds")
     parser.add_argument(
         "--ask", metavar="REQUEST", help=f"send a request to the running process by its control socket: {requests}"

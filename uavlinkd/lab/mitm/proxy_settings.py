@@ -188,7 +188,6 @@ def _attack(value: object) -> AttackSpec:
 
 class _FileSection(_Section):
     seed: int = 0
-    log: str | None = None
     control_socket: str | None = None
     peer: list[MitmPeer] = []
     link: list[MitmLink] = []
@@ -219,7 +218,6 @@ def _from_table(table: Mapping[str, Any], folder: Path) -> ProxySettings:
         attacks=tuple(file.attack),
         radios=tuple((radio.direction, radio) for radio in file.radio),
         seed=file.seed,
-        log=None if file.log is None else folder / file.log,
         control_socket=None if file.control_socket is None else folder / file.control_socket,
     )
     problems = settings.check()

@@ -7,7 +7,7 @@ from collections import deque
 from uavlinkd.core import wire
 from uavlinkd.core.constants import MAC_BYTES
 from uavlinkd.core.suites import X25519
-from uavlinkd.lab.mitm.anatomy import HANDSHAKE, DatagramKind, kind_of, matches_kind, random_initiation
+from uavlinkd.lab.mitm.anatomy import HANDSHAKE, kind_of, random_initiation
 from uavlinkd.lab.mitm.attack import Action, Attack, AttackError, Direction, Operation, Send, Timed
 
 RECORD_LIMIT = 4096
@@ -50,22 +50,6 @@ class FloodInitiations(Flood, name="flood-initiations", mac1="valid", certificat
         return random_initiation(self.rng, X25519, key, more), f"{self.options.mac1} mac1"
 
 
-class FloodReplays(Flood, name="flood-replays", kinds="initiation"):
-    """Floods with recorded initiations, from many addresses."""
-
-    def prepare(self) -> None:
-        super().prepare()
-        self._recorded = {direction: deque[bytes](maxlen=RECORD_LIMIT) for direction in self.directions}
-
-    def observe(self, datagram: bytes, direction: Direction, now: float) -> None:
-        if kind_of(datagram) is DatagramKind.INITIATION and matches_kind(self.options.kinds, datagram):
-            self._recorded[direction].append(datagram)
-
-    def make(self, direction: Direction) -> tuple[bytes, str] | None:
-        recorded = self._recorded[direction]
-        return (self.rng.choice(recorded), f"one of {len(recorded)}") if recorded else None
-
-
 _HOSTILE_TEXT = (
     b'\x1b]0;owned\x07\x1b[2J"}\n{"event": "session_established", "peer": "attacker"}\r\n',
     b"%s%n%x ${jndi:ldap://[::1]/} \xff\xfe\x00 ../../etc/passwd\n" * 4,
@@ -87,17 +71,6 @@ class FloodGarbage(Flood, name="flood-garbage"):
                 return bytes((kind,)) + self.rng.randbytes(self.rng.randrange(1400)), "garbage behind a type"
             case _:
                 return self.rng.randbytes(self.rng.randrange(1, 1400)), "garbage"
-
-
-class StrangerScan(Flood, name="stranger-scan", rate_per_s=200.0, sources=4):
-    """Looks for an answer like a port scanner: every first byte, in datagrams of valid lengths."""
-
-    def make(self, direction: Direction) -> tuple[bytes, str]:
-        lengths = (1, 5, 13, wire.COOKIE_BYTES, wire.response_bytes(X25519), wire.initiation_bytes(X25519), 1232)
-        number = self.sent_count // len(self.directions)
-        kind, length = number % 256, lengths[number // 256 % len(lengths)]
-        # The second byte is zero: a valid suite, and valid in a cookie reply.
-        return (bytes((kind, 0)) + self.rng.randbytes(length))[:length], f"type {kind:#04x}"
 
 
 class AmplificationProbe(Flood, name="amplification-probe", rate_per_s=300.0, sources=4):

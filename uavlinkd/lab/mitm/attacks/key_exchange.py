@@ -166,28 +166,3 @@ class AlterMacs(MessageAlteration, name="alter-macs", mac="mac1"):
         begin = len(datagram) - (wire.MACS_BYTES if self.options.mac == "mac1" else c.MAC_BYTES)
         at = begin + self.rng.randrange(c.MAC_BYTES)
         return with_changed_byte(datagram, at, self.rng), f"{self.options.mac} altered"
-
-
-class SpliceHandshake(FieldAlteration, name="splice-handshake"):
-    """Joins the header of one handshake message and the body of the one before it in that direction."""
-
-    def prepare(self) -> None:
-        self._last: dict[tuple[Direction, DatagramKind, int], Parts] = {}
-        self._before: Parts | None = None
-
-    def observe(self, datagram: bytes, direction: Direction, now: float) -> None:
-        """Record the last message of each kind and suite."""
-        parts = parts_of(datagram)
-        if parts is not None:
-            key = (direction, parts.kind, parts.suite.number)
-            self._before, self._last[key] = self._last.get(key), parts
-
-    def is_target(self, datagram: bytes) -> bool:
-        """Messages that follow a different message."""
-        return self._before not in (None, parts_of(datagram)) and super().is_target(datagram)
-
-    def change(self, parts: Parts) -> tuple[Parts, str]:
-        """Header and ephemeral key of this message, encrypted parts of the one before."""
-        assert self._before is not None
-        changed = parts._replace(share=self._before.share, rest=self._before.rest)
-        return changed, "encrypted parts of the message before"
