@@ -12,15 +12,14 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
-import socket
 import time
 from collections import Counter
 from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack, suppress
+from pathlib import Path
 from time import monotonic
 from typing import Any
 
-from uavlinkd.config.keys import generate_psk
 from uavlinkd.core import wire
 from uavlinkd.core.crypto import KeyPair, Secret
 from uavlinkd.core.node import Node
@@ -29,12 +28,11 @@ from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.core.suites import Suite
 from uavlinkd.lab.child_processes import private_folder
 from uavlinkd.lab.evaluation.ledger import numbered_frame
-from uavlinkd.lab.evaluation.middle import HOST, MiddleHere
+from uavlinkd.lab.evaluation.middle import MiddleHere
 from uavlinkd.lab.evaluation.records import EvaluationError, Record, Status, Value, cpu_seconds
-from uavlinkd.lab.evaluation.stage import until
+from uavlinkd.lab.evaluation.stage import DaemonStage, until
 from uavlinkd.lab.mitm.attack import Action, Direction, PassiveAttack, Send
-from uavlinkd.lab.sim.drone_process import DroneError, DroneProcess
-from uavlinkd.lab.sim.loopback_ports import free_ports
+from uavlinkd.lab.sim.drone_process import DroneError
 from uavlinkd.mavlink.frames import SplitCounters, split_datagram
 
 _THERE = PeerPath(0, ("127.0.0.1", 2))
@@ -88,54 +86,49 @@ class Watch(PassiveAttack):
         return [Send(datagram, direction)]
 
 
-class Pair:
-    """Two daemons, a client of each, and the proxy between them."""
+class TimedPair(DaemonStage):
+    """Two daemons, a client of each, and a proxy between them that drops everything until :attr:`watch` is open."""
 
-    def __init__(self, suite: Suite) -> None:
+    def __init__(self, folder: Path, suite: Suite) -> None:
+        names = (_INITIATOR, _RESPONDER)
+        super().__init__(names, folder, MiddleHere(names, 0), {"suites": [suite.name]}, rate_hz=0.0)
         self.watch = Watch()
         self.arrived_at: float | None = None
         """When the first frame arrived at the responder's client."""
-        self._link: dict[str, object] = {"suites": [suite.name]}
-        self._clients: dict[str, socket.socket] = {}
+        self.receive = self._on_received
         self._number = 0
         self._delivered = asyncio.Event()
 
-    async def open(self, stack: AsyncExitStack) -> None:
-        """Start all. The end of ``stack`` stops it."""
-        folder = stack.enter_context(private_folder("uavlinkd-"))
-        names, ports = (_INITIATOR, _RESPONDER), free_ports(4)
-        self.drones = {name: DroneProcess(name, folder / name, *ports[2 * n :][:2]) for n, name in enumerate(names)}
-        initiator, responder = self.drones.values()
-        middle = MiddleHere(names, 0)
-        stack.push_async_callback(middle.stop)
-        await middle.start({name: drone.port for name, drone in self.drones.items()}, {})
-        await middle.attack([], [self.watch])
-        address = f"{HOST}:{middle.ports[Direction(_INITIATOR, _RESPONDER)]}"
-        psk = generate_psk()
-        for drone, peer, addresses in ((responder, initiator, []), (initiator, responder, [address])):
-            drone.share_psk(psk, "pair.psk")
-            drone.configure(self._link, [peer.as_peer("", "pair.psk", addresses=addresses)])
-            stack.push_async_callback(drone.stop, signal.SIGKILL)  # a close message would be traffic
-            await drone.start()
-        loop = asyncio.get_running_loop()
-        for name, drone in self.drones.items():
-            await until(drone.ask, f"{name} did not start")
-            client = self._clients[name] = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-            client.setblocking(False)
-            client.connect((HOST, drone.endpoint_port))
-        loop.add_reader(self._clients[_RESPONDER], self._on_readable)
-        stack.callback(loop.remove_reader, self._clients[_RESPONDER])
-        self._clients[_RESPONDER].send(numbered_frame(2, 0))  # the daemon learns its client
+    def addresses(self, one: str, other: str) -> list[object]:
+        """The addresses of the responder; it has none of the initiator."""
+        return super().addresses(one, other) if one == _INITIATOR else []
 
-    def _on_readable(self) -> None:
-        if split_datagram(self._clients[_RESPONDER].recv(65536), SplitCounters()):
-            self.arrived_at = self.arrived_at or monotonic()
+    async def open(self) -> None:
+        """Start the proxy, which drops everything, and the daemons. Each has answered, and knows its client."""
+        for name in self.names:
+            self.configure(name)
+        await self.middle.start(*self.attacked())
+        await self.middle.attack([], [self.watch])
+        self._clients.open(self.names)
+        for name, drone in self.drones.items():
+            await drone.start()
+            await until(drone.ask, f"{name} did not start")
+        self.send(_RESPONDER, numbered_frame(2, 0))
+
+    async def close(self) -> None:
+        """Kill both daemons: a close message would be traffic."""
+        await asyncio.gather(*(drone.stop(signal.SIGKILL) for drone in self.drones.values()))
+        await super().close()
+
+    def _on_received(self, name: str, datagram: bytes, now: float) -> None:
+        if name == _RESPONDER and split_datagram(datagram, SplitCounters()):
+            self.arrived_at = self.arrived_at or now
             self._delivered.set()
 
     def send_frame(self) -> None:
         """Send a new frame to the initiator's daemon."""
         self._number += 1
-        self._clients[_INITIATOR].send(numbered_frame(1, self._number))
+        self.send(_INITIATOR, numbered_frame(1, self._number))
 
     def cpu_s(self) -> dict[str, float]:
         return {f"cpu_{name}_s": cpu_seconds(drone.pid) for name, drone in self.drones.items()}
@@ -171,8 +164,9 @@ async def measured(kind: str, point: dict[str, Value], measure: Awaitable[dict[s
 async def time_handshake(suite: Suite) -> dict[str, Any]:
     """One handshake between two new processes with new keys."""
     async with AsyncExitStack() as stack:
-        pair = Pair(suite)
-        await pair.open(stack)
+        pair = TimedPair(stack.enter_context(private_folder("uavlinkd-")), suite)
+        stack.push_async_callback(pair.close)
+        await pair.open()
         watch = pair.watch
 
         async def has_initiated() -> bool:
