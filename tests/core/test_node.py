@@ -635,7 +635,7 @@ def test_a_fault_while_an_envelope_is_received_leaves_all_timers_of_its_peer_soo
     def fail(*arguments: Any) -> Any:
         raise RuntimeError("planted")
 
-    monkeypatch.setattr("uavlinkd.core.node.receive_envelope", fail)
+    monkeypatch.setattr("uavlinkd.core.session.Session.open", fail)
     with pytest.raises(RuntimeError, match="planted"):
         pair.b.receive(envelope, 1.0)
     assert pair.b.node.next_deadline() <= 1.0 + c.RECOVER_S

@@ -168,7 +168,7 @@ def test_frame_larger_than_an_envelope_is_dropped_alone(pair: Pair) -> None:
     limit = pair.a.session.payload_limit
     fits, too_large = b"\xfd" + bytes(limit - 1), b"\xfd" + bytes(limit)
     outputs = pair.a.send(1.0, FRAME, too_large, fits, too_large)
-    assert of(outputs, Dropped) == [Dropped(DropReason.TOO_LARGE, pair.a.peer)] * 2
+    assert of(outputs, Dropped) == [Dropped(DropReason.TOO_LARGE, pair.a.peer, None, 2)]
     delivered = [payload for datagram in datagrams(outputs) for payload in payloads(pair.b.receive(datagram, 1.0))]
     assert delivered == [FRAME, fits]
     assert pair.a.peer.traffic.drops[DropReason.TOO_LARGE] == 2

@@ -12,6 +12,7 @@ from fastcrc.crc16 import mcrf4xx
 
 from tests.fuzz.engine import Run, Script
 from tests.link.inside import most_flows
+from tests.link.lone_line import lone_line
 from tests.link.test_switch import Client, policy
 from tests.mavlink.inside import gate_tables, most_addresses, remembered_frames
 from uavlinkd.link import switch as switching
@@ -226,7 +227,8 @@ def make_switch() -> Run:
             refused[refusal] += 1
 
         drops = cast("DaemonJournal", SimpleNamespace(add_refused=count))
-        switch = Switch(router, StallWatch(monotonic(), lambda _: None), drops)
+        switch, stall = Switch(router, drops), StallWatch(monotonic(), lambda _: None)
+        line = lone_line(switch, stall, drops)
         clients = [Client(str(number)) for number in range(len(POLICIES))]
         policies = [policy(**rules) for rules in POLICIES]
         for client, rules in zip(clients, policies, strict=True):
@@ -241,7 +243,7 @@ def make_switch() -> Run:
             number = what % len(clients)
             raw = b"".join(made(script) for _ in range(1 + (what >> 6)))
             frames = split_datagram(raw, SplitCounters())
-            switch.forward(clients[number].port, frames, now, switch.stall.turn(monotonic()))
+            line.forward(clients[number].port, frames, now, stall.turn(monotonic()))
             _check_received(clients, number, frames)
         _check_tables(router, switch, policies)
 

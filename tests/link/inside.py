@@ -23,4 +23,4 @@ def set_own_sockets(relays: Relays, own: Sequence[OwnSocket]) -> None:
 
 def most_flows(switch: Switch) -> int:
     """The number of flows that are remembered of the port with the most."""
-    return max((len(known.flows) for known in switch._ports.values()), default=0)
+    return max((len(known.flows) for known in switch.ports.values()), default=0)

@@ -17,16 +17,21 @@ from tests.samples import attitude, command, raws
 from uavlinkd.config.model import PeerConfig
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.drops import DropReason
+from uavlinkd.core.node import Node
 from uavlinkd.core.outputs import Deliver, Dropped, Output, SessionEstablished, Transmit
 from uavlinkd.core.path import Path, relayed
 from uavlinkd.core.relay_records import wrap
 from uavlinkd.core.settings import PeerSettings
+from uavlinkd.core.timers import Schedule
 from uavlinkd.core.wire import ENVELOPE_STARTS
 from uavlinkd.link import carrier as module
 from uavlinkd.link.carrier import FrameCarrier
+from uavlinkd.link.journal import DaemonJournal
+from uavlinkd.link.line import Line
 from uavlinkd.link.parts import DaemonParts
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.relay_link import RELAYED_START, RelayHandles
+from uavlinkd.link.switch import Switch
 from uavlinkd.link.turns import (
     SHARED_BYTES,
     STARTS_OF_A_FRAME,
@@ -68,31 +73,41 @@ class Scene:
             handshake_source=lambda datagram, path, now: (path, datagram[:2]) if datagram[:1] == b"\1" else None,
             initiations_from=lambda path: [(path, HANDSHAKES[4])],
             next_deadline=lambda: NEVER,
+            schedule=Schedule(),
             drops=dict.fromkeys(DropReason, 0),
         )
         drops = SimpleNamespace(
             add=lambda event, reason, name, count, *_: self.dropped.append((reason, name, count)),
             add_dropped=lambda dropped, now: self.refused.append(dropped),
+            write=lambda *_: None,
         )
         parts = SimpleNamespace(
             node=node,
             stall=self.stall,
             link_of={self.peer: self.link},
-            switch=SimpleNamespace(forward=self.forward),
             peer_sockets=SimpleNamespace(budgets={}, handles=self.handles),
             relays=SimpleNamespace(
                 by_name={},
                 next_at=NEVER,
                 on_event=lambda *_: None,
             ),
-            events=SimpleNamespace(write=lambda *_: None),
             relay=None,
             fleet=None,
             config=SimpleNamespace(fleet=None),
-            drops=drops,
+            journal=drops,
             evidence=SimpleNamespace(add_dropped=lambda *_: None),
         )
         self.relays, self.node = parts.relays, node
+        line = Line(
+            cast("Switch", None),
+            self.stall,
+            cast("DaemonJournal", drops),
+            cast("Node", node),
+            parts.link_of,
+            parts.peer_sockets,
+        )
+        line.forward = self.forward  # type: ignore[method-assign,assignment]
+        self.line = parts.line = line
         self.carrier = FrameCarrier(cast("DaemonParts", parts))
 
     def receive(self, datagram: bytes, path: Path, now: float, *, is_screened: bool = False) -> list[Output]:
@@ -110,7 +125,7 @@ class Scene:
 
     def read(self, *datagrams: bytes) -> None:
         """One wake-up."""
-        self.carrier.receive(
+        self.line.receive(
             AT_A.socket, [(datagram, AT_A.address) for datagram in datagrams], monotonic(), self.stall.epoch, 0.0
         )
 

@@ -9,8 +9,10 @@ from typing import cast
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
+from tests.link.lone_line import lone_line
 from tests.mavlink.inside import remembered_frames
 from tests.mavlink.policy.smuggling import SET_MODE, v1, v2
+from uavlinkd.core.peer import Peer as CorePeer
 from uavlinkd.endpoints.ports import Endpoint, LocalPort, PortHandler
 from uavlinkd.link import switch as switch_module
 from uavlinkd.link.journal import DaemonJournal, ShellReason
@@ -63,6 +65,7 @@ class Peer(PeerLink):
     def __init__(self) -> None:
         self.name = "peer"
         self.received: list[bytes] = []
+        self.peer = cast("CorePeer", SimpleNamespace(paths=SimpleNamespace(is_multiple=True)))
 
     def send(self, frames: Sequence[Frame], source: Source, now: float, waited_s: float) -> None:
         self.received += [raw for raw, _ in frames]
@@ -77,7 +80,8 @@ class Stage:
         self.withheld: list[tuple[str, Refusal]] = []
         self.stall = StallWatch(monotonic(), lambda _: None)
         drops = cast("DaemonJournal", SimpleNamespace(add_refused=self.refuse, add=self.drop))
-        self.switch = Switch(self.router, self.stall, drops)
+        self.switch = Switch(self.router, drops)
+        self.line = lone_line(self.switch, self.stall, drops)
         self.stale = 0
         self.a, self.b, self.c = (Client(name) for name in "abc")
         for client in (self.a, self.b, self.c):
@@ -94,7 +98,7 @@ class Stage:
 
     def forward(self, source: LocalPort, frames: Sequence[Frame], now: float) -> None:
         """Frames that were read just now."""
-        self.switch.forward(source, frames, now, self.stall.turn(monotonic()))
+        self.line.forward(source, frames, now, self.stall.turn(monotonic()))
 
     def delivered(self) -> tuple[int, int, int]:
         """How many frames each client received since the last call."""
@@ -156,7 +160,7 @@ def test_copies_are_looked_for_where_a_frame_can_arrive_again(stage: Stage) -> N
     stage.switch.set_policy(peer, policy(system_ids=[1, 2]))
     for number in range(3, 6):
         stage.forward(stage.a.port, [attitude(number)], 0.2)
-        stage.switch.forward(peer, [attitude(number)], 0.2, stage.stall.epoch)
+        stage.line.forward(peer, [attitude(number)], 0.2, stage.stall.epoch)
     assert (len(peer.received), stage.delivered()) == (6, (0, 0, 0))
     assert stage.router.unrouted == {Unrouted.DUPLICATE: 3}
     stage.switch.add(stage.b.port, policy(system_ids=[3]))
@@ -223,7 +227,7 @@ def test_memory_is_bounded(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(switch_module, "MAX_FLOWS", 16)
     for system in range(1, 200):
         stage.forward(stage.a.port, [attitude(1, system)], 0.0)
-        assert len(stage.switch._ports[stage.a.port].flows) <= 16
+        assert len(stage.switch.ports[stage.a.port].flows) <= 16
     assert stage.delivered() == (0, 199, 199)
 
 
@@ -253,7 +257,7 @@ def test_frames_from_before_a_pause_are_dropped_and_counted(stage: Stage, monkey
     read_in = stage.stall.turn(monotonic())
     paused = monotonic() + 2 * STALL_S
     monkeypatch.setattr(switch_module, "monotonic", lambda: paused)
-    stage.switch.forward(stage.a.port, [attitude(1), attitude(2)], paused, read_in)
+    stage.line.forward(stage.a.port, [attitude(1), attitude(2)], paused, read_in)
     assert (stage.delivered(), stage.stale, stage.stall.dropped) == ((0, 0, 0), 2, {"a": 2})
-    stage.switch.forward(stage.a.port, [attitude(3)], paused, read_in + 1)
+    stage.line.forward(stage.a.port, [attitude(3)], paused, read_in + 1)
     assert stage.delivered() == (0, 1, 1)

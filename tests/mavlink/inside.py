@@ -10,7 +10,7 @@ from uavlinkd.mavlink.routing import Router
 
 def remembered_frames(router: Router[Any]) -> int:
     """The number of frames that are remembered to find repetitions."""
-    return len(router.sendings._seen)
+    return len(router.sendings.seen)
 
 
 def most_addresses(router: Router[Any]) -> int:

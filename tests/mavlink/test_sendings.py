@@ -131,7 +131,7 @@ def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     for i in range(500):
         r.route(beat(b"%d" % i), "a", 0.0)
         r.sendings.note_own(b"own %d" % i, ["a"], 20.0 * i)
-        assert len(r.sendings._seen) + len(r.sendings._seen_before) <= 33
+        assert len(r.sendings.seen) + len(r.sendings.seen_before) <= 33
 
 
 class Bridge(NamedTuple):

@@ -8,8 +8,8 @@ from collections import deque
 from uavlinkd.core import constants as c
 from uavlinkd.core.constants import ARRIVALS, REPLAY_WINDOW
 
-_BLOCK_BITS = 64
-_BLOCKS = REPLAY_WINDOW // _BLOCK_BITS + 1
+BLOCK_BITS = 64
+BLOCKS = REPLAY_WINDOW // BLOCK_BITS + 1
 """One more than the window has: the newest block is not full."""
 _NONE = array("Q")
 
@@ -21,31 +21,32 @@ class ReplayWindow:
     A counter above :attr:`highest` is never used.
     """
 
-    __slots__ = ("_blocks", "highest")
+    __slots__ = ("blocks", "highest")
 
     def __init__(self) -> None:
         self.highest = -1
         """The highest counter accepted, -1 before the first."""
-        self._blocks = _NONE
+        self.blocks = _NONE
+        """The ring, once there is a counter."""
 
     def is_used(self, counter: int) -> bool:
         """Whether a counter up to the highest must not be accepted: it was before, or is below the window."""
         if counter <= self.highest - REPLAY_WINDOW:
             return True
-        return bool(self._blocks[counter // _BLOCK_BITS % _BLOCKS] >> counter % _BLOCK_BITS & 1)
+        return bool(self.blocks[counter // BLOCK_BITS % BLOCKS] >> counter % BLOCK_BITS & 1)
 
     def mark(self, counter: int) -> None:
         """Remember an authentic counter that was not used."""
-        block = counter // _BLOCK_BITS
+        block = counter // BLOCK_BITS
         if counter > self.highest:
-            newest = self.highest // _BLOCK_BITS  # -1 before the first counter
+            newest = self.highest // BLOCK_BITS  # -1 before the first counter
             if block > newest:
-                if not self._blocks:  # not before: a relay may have many sessions that were never confirmed
-                    self._blocks = array("Q", bytes(8 * _BLOCKS))
-                for cleared in range(max(newest, block - _BLOCKS) + 1, block + 1):
-                    self._blocks[cleared % _BLOCKS] = 0
+                if not self.blocks:  # not before: a relay may have many sessions that were never confirmed
+                    self.blocks = array("Q", bytes(8 * BLOCKS))
+                for cleared in range(max(newest, block - BLOCKS) + 1, block + 1):
+                    self.blocks[cleared % BLOCKS] = 0
             self.highest = counter
-        self._blocks[block % _BLOCKS] |= 1 << counter % _BLOCK_BITS
+        self.blocks[block % BLOCKS] |= 1 << counter % BLOCK_BITS
 
 
 class CounterHistory:

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 from uavlinkd.core import constants as c
 from uavlinkd.core import establish, probing, wire
-from uavlinkd.core.admission import Admission, CookieRequired
+from uavlinkd.core.admission import Admission
 from uavlinkd.core.cookie import CookieJar, MacKeys
 from uavlinkd.core.crypto import Entropy, KeyPair, Secret
 from uavlinkd.core.drops import Drop, DropReason
@@ -22,7 +22,7 @@ from uavlinkd.core.outputs import CertificateShown, Deliver, Dropped, Output, Pe
 from uavlinkd.core.path import Path, SocketAddress, SocketFacts
 from uavlinkd.core.peer import Peer, Shared
 from uavlinkd.core.probing import ask_candidates
-from uavlinkd.core.receive import receive_envelope
+from uavlinkd.core.receive import Receiver
 from uavlinkd.core.receive_handshake import HandshakeReceiver, ShownInitiation
 from uavlinkd.core.refusals import Refused
 from uavlinkd.core.relay_records import FleetRecord, Record
@@ -37,7 +37,7 @@ PEERS_AT_ONCE = 8
 """Peers that one call of :meth:`Node.handle_timeout` handles: datagrams wait meanwhile."""
 
 
-class Node:
+class Node(Receiver):
     """All peers of one identity.
 
     Without ``screen`` all frames must be new. ``takes_certificates``: the shell decides on :class:`CertificateShown`.
@@ -61,10 +61,10 @@ class Node:
         self._last_seen: Counter[SocketAddress] = Counter()  # where peers have proved to be, and how many
         self.facts = SocketFacts()
         """About the networks behind the sockets."""
-        self._schedule = Schedule[Peer]()
+        self.schedule = Schedule[Peer]()
         identity, admission = KeyPair(private_key.reveal()), Admission(self._is_known, now, most_admitted)
         cookies = CookieJar(MacKeys(identity.public), entropy, now)
-        self._handshakes = HandshakeReceiver(identity, cookies, self._indices, admission, self.facts, self._schedule)
+        self._handshakes = HandshakeReceiver(identity, cookies, self._indices, admission, self.facts, self.schedule)
         self._certificate = b""
         self._provisional: set[Peer] = set()
         self._handshakes.takes_certificates = takes_certificates
@@ -109,7 +109,7 @@ class Node:
             self._provisional.add(peer)
             peer.provisional_until = now + c.UNCONFIRMED_LIFETIME_S
             peer.set_expiry()
-            self._schedule.update(peer)
+            self.schedule.update(peer)
         try:
             return self._handshakes.answer(peer, shown.initiation, now)
         except Drop as drop:
@@ -161,7 +161,7 @@ class Node:
         self._forget_addresses(peer)
         out = establish.close(peer, now, sends=closes)
         peer.paths.clear()
-        self._schedule.remove(peer)
+        self.schedule.remove(peer)
         return out
 
     def find(self, public_key: bytes) -> Peer | None:
@@ -234,7 +234,7 @@ class Node:
             peer.timers.set(Timer.SILENCE, now + peer.lost_after_s)
         peer.set_paths_timer()
         peer.set_initiate()
-        self._schedule.update(peer)
+        self.schedule.update(peer)
 
     # Inputs.
 
@@ -242,7 +242,7 @@ class Node:
         """Send frames of one class that are here together to a peer, in as few envelopes as hold them."""
         out = send_frames(peer, frames, now, cls)
         if peer.timers.next_at < peer.timers.scheduled_at:
-            self._schedule.update(peer)
+            self.schedule.update(peer)
         return out
 
     def report_refusals(self, peer: Peer, changed: Iterable[Refused], now: float) -> list[Output]:
@@ -283,7 +283,7 @@ class Node:
         While that goes on, the best path is asked regularly, also if it is the only one.
         """
         out = ask_candidates(peer, now)
-        self._schedule.update(peer)
+        self.schedule.update(peer)
         return out
 
     def ask(self, peer: Peer, path: Path, now: float) -> list[Output]:
@@ -294,50 +294,21 @@ class Node:
         out = ask_for_echo(peer, session, now, (state,))
         if peer.paths.has_several:
             out += probing.ask(peer, session, state, now) + probing.update(peer, now)
-        self._schedule.update(peer)
+        self.schedule.update(peer)
         return out
-
-    def receive(self, datagram: bytes, path: Path, now: float, *, is_screened: bool = False) -> list[Output]:
-        """What to do about a datagram. Never raises, whatever the bytes.
-
-        ``is_screened``: it passed :meth:`screen` before it waited.
-        """
-        try:
-            if datagram[:1] not in wire.ENVELOPE_STARTS:
-                if not is_screened:
-                    self._handshakes.screen(datagram, path, now)
-                return self._handshakes.receive(datagram, path, now)
-            header = wire.parse_envelope_header(datagram)
-            peer, session = self._indices.owners.get(header[0], (None, None))
-            if peer is None or not isinstance(session, Session):
-                return self._receive_stray(datagram, header[0], path, now)
-            if self.facts.peer_at:
-                self.facts.check_network(peer, path)
-            out = receive_envelope(peer, session, datagram, header, path, now)
-            if peer.timers.next_at < peer.timers.scheduled_at:
-                self._schedule.update(peer)
-            return out
-        except CookieRequired as drop:
-            return [drop.reply, self._count(datagram, drop, path)]
-        except Drop as drop:
-            return [self._count(datagram, drop, path)]
-        except Exception:
-            if (claimed := self._claimed_peer(datagram)) is not None:
-                self._wake(claimed, now)
-            raise
 
     def handle_timeout(self, now: float) -> list[Output]:
         """Do what is due, for at most :data:`PEERS_AT_ONCE`. Call it at :meth:`next_deadline`, or at any time."""
         out: list[Output] = []
         for _ in range(PEERS_AT_ONCE):
             out += self.handle_next(now)
-            if now < self._schedule.next_at:
+            if now < self.schedule.next_at:
                 break
         return out
 
     def handle_next(self, now: float) -> list[Output]:
         """Do what is due of the peer whose turn it is: a fault costs no other one its timers or outputs."""
-        due = self._schedule.pop(now, 1)
+        due = self.schedule.pop(now, 1)
         if not due:
             return []
         (peer,) = due
@@ -348,25 +319,19 @@ class Node:
         except Exception:
             self._wake(peer, now)
             raise
-        self._schedule.update(peer)
+        self.schedule.update(peer)
         return out
 
     def next_deadline(self) -> float:
         """When :meth:`handle_timeout` is to be called next; infinity for never."""
-        return self._schedule.next_at
-
-    def _wake(self, peer: Peer, now: float) -> None:
-        """A fault left the work for a peer half-done. All its timers expire soon: each finds what is due."""
-        for timer, at in enumerate(peer.timers.deadlines):
-            peer.timers.set(Timer(timer), min(at, now + c.RECOVER_S))
-        self._schedule.update(peer)
+        return self.schedule.next_at
 
     def close(self, now: float) -> list[Output]:
         """Close the sessions with every peer, first those along a relay: its own close ends their handles."""
         out: list[Output] = []
         for peer in sorted(self.peers.values(), key=lambda peer: peer.path is None or not peer.path.is_relayed):
             out += establish.close(peer, now)
-            self._schedule.remove(peer)
+            self.schedule.remove(peer)
         return out
 
     # For a busy shell.
@@ -424,17 +389,6 @@ class Node:
         """Count a datagram that a busy shell does not hand over: more wait than their share."""
         return self._count(datagram, Drop(DropReason.OVER_SHARE), path)
 
-    # Envelopes without a session.
-
-    def _receive_stray(self, datagram: bytes, index: int, path: Path, now: float) -> list[Output]:
-        if self._indices.is_quarantined(index, now):
-            raise Drop(DropReason.LATE)
-        out: list[Output] = []
-        if (peer := self._by_address.get(path.place)) is not None:
-            out += establish.receive_hint(peer, now)
-            self._schedule.update(peer)
-        return [*out, self._count(datagram, Drop(DropReason.UNKNOWN_INDEX), path)]
-
     # Where peers are.
 
     def _is_known(self, address: SocketAddress) -> bool:
@@ -445,17 +399,3 @@ class Node:
         for path in peer.paths.configured:
             if self._by_address.get(path.place) is peer:
                 del self._by_address[path.place]
-
-    # Drops.
-
-    def _count(self, datagram: bytes, drop: Drop, path: Path) -> Dropped:
-        if (peer := self._claimed_peer(datagram)) is not None:
-            return peer.drop_datagram(drop.reason, path, drop.detail)
-        self.drops[drop.reason] += 1
-        return Dropped(drop.reason, None, path, 1, drop.detail)
-
-    def _claimed_peer(self, datagram: bytes) -> Peer | None:
-        """The peer whose session or handshake the header names: a claim, good for a counter and no more."""
-        index = wire.claimed_receiver_index(datagram)
-        owner = self._indices.owners.get(index) if index else None
-        return None if owner is None else owner[0]

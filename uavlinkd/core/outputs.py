@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
 
 from uavlinkd.core.drops import Detail, DropReason
 from uavlinkd.core.path import Path
@@ -15,6 +16,10 @@ class LinkedPeer(Protocol):
     @property
     def name(self) -> str:
         """Its name in the configuration of this node."""
+
+
+new_tuple: Callable[..., Any] = tuple.__new__
+"""Makes an output from its class and all its fields, without the Python function that a named tuple has for it."""
 
 
 class Transmit(NamedTuple):

@@ -1,28 +1,36 @@
-"""Envelopes from a peer."""
+"""The datagrams of peers: what a frame passes, and what is done about everything else in an envelope."""
 
 from __future__ import annotations
 
+from collections import Counter
 from contextlib import suppress
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from uavlinkd.core import constants as c
 from uavlinkd.core import freshness, probing, wire
+from uavlinkd.core.admission import CookieRequired
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.early import EarlyEnvelope
-from uavlinkd.core.establish import adopt, receive_close
-from uavlinkd.core.outputs import Deliver, Output, RecordReceived
-from uavlinkd.core.path import Path
+from uavlinkd.core.establish import adopt, receive_close, receive_hint
+from uavlinkd.core.initiator import Pending
+from uavlinkd.core.outputs import Deliver, Dropped, Output, RecordReceived, new_tuple
+from uavlinkd.core.path import Path, SocketAddress, SocketFacts
 from uavlinkd.core.path_state import PathCondition, PathState
 from uavlinkd.core.paths import Route
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.probe import ANSWER_BYTES, PROBE, QUESTION_BYTES
 from uavlinkd.core.problem_reports import ProblemReport
+from uavlinkd.core.receive_handshake import HandshakeReceiver
 from uavlinkd.core.refusals import RefusalReport
 from uavlinkd.core.relay_records import FleetRecord, parse_record
 from uavlinkd.core.send import may_echo, send_echo
 from uavlinkd.core.session import Session
-from uavlinkd.core.timers import Timer
+from uavlinkd.core.sessions import Indices
+from uavlinkd.core.timers import Schedule, Timer
 
+_unpack_short = wire.SHORT_HEADER.unpack_from
+_SHORT_LEAST: Final = wire.SHORT_HEADER_BYTES + wire.TAG_LENGTHS[0]
+_NOBODY: Final = (None, None)
 _PROBE = bytes((PROBE,))
 _ANSWERED_BYTES = ANSWER_BYTES, QUESTION_BYTES, wire.ECHO_REQUEST_BYTES
 """Payloads of these lengths may want an answer along each path by which they come."""
@@ -42,88 +50,187 @@ class Arrived(NamedTuple):
     """Whether the peer has been sending on newer keys for a while."""
 
 
-def receive_envelope(
-    peer: Peer, session: Session, datagram: bytes, header: tuple[int, int, int], path: Path, now: float
-) -> list[Output]:
-    """Open an envelope and act on it. ``header``: as :func:`wire.parse_envelope_header` returns it.
+class Receiver:
+    """What a node does about one datagram. :class:`uavlinkd.core.node.Node` has the peers, and sets these."""
 
-    Raises Drop: as :meth:`Session.open`, or ``REPLAYED``; then nothing was changed.
-    """
-    _, counter, header_bytes = header
-    payload = session.open(datagram, header_bytes, counter, now)
-    out: list[Output] = []
-    sessions, traffic = peer.sessions, peer.traffic
-    state, size = peer.paths.by_path.get(path), len(datagram)
-    if payload is None:
-        return _receive_copy(peer, session, datagram, header, path, now)
-    traffic.envelopes_received += 1
-    traffic.bytes_received += size
+    facts: SocketFacts
+    """About the networks behind the sockets."""
+    drops: Counter[DropReason]
+    """Datagrams that name no peer; those that name one are counted there."""
+    schedule: Schedule[Peer]
+    """When each peer has something to do. Its ``next_at`` is :meth:`uavlinkd.core.node.Node.next_deadline`."""
+    _indices: Indices[tuple[Peer, Session | Pending]]
+    _handshakes: HandshakeReceiver
+    _by_address: dict[SocketAddress, Peer]
+    """Where peers are configured."""
+
+    def receive(self, datagram: bytes, path: Path, now: float, *, is_screened: bool = False) -> list[Output]:
+        """What to do about a datagram. Never raises, whatever the bytes.
+
+        ``is_screened``: it passed the screen of handshake messages before it waited.
+        """
+        try:
+            # The usual way of a frame from here on has no call but that which opens the envelope.
+            size = len(datagram)
+            if size >= _SHORT_LEAST and datagram[0] == wire.SHORT_ENVELOPE:
+                _, index, counter = _unpack_short(datagram)
+                header_bytes = wire.SHORT_HEADER_BYTES
+            elif datagram[:1] in wire.ENVELOPE_STARTS:
+                index, counter, header_bytes = wire.parse_envelope_header(datagram)
+            else:
+                if not is_screened:
+                    self._handshakes.screen(datagram, path, now)
+                return self._handshakes.receive(datagram, path, now)
+            peer, session = self._indices.owners.get(index, _NOBODY)
+            if peer is None or not isinstance(session, Session):
+                return self._receive_stray(datagram, index, path, now)
+            if self.facts.peer_at:
+                self.facts.check_network(peer, path)
+            payload = session.open(datagram, header_bytes, counter, now)
+            if payload is None:
+                copied = _receive_copy(peer, session, datagram, (index, counter, header_bytes), path, now)
+                self.schedule.update(peer)
+                return copied
+            out: list[Output] = []
+            sessions, traffic = peer.sessions, peer.traffic
+            traffic.envelopes_received += 1
+            traffic.bytes_received += size
+            state = peer.paths.by_path.get(path)
+            is_candidate = False
+            if state is None or sessions.unconfirmed:
+                state, is_candidate = _settle(peer, session, path, now, out)
+            state.datagrams_received += 1
+            state.bytes_received += size
+            state.received_at = now
+            is_superseded = False
+            if session is sessions.current:
+                state.received += 1
+            else:
+                is_superseded = sessions.is_superseded(session, now)
+            if session.arrivals is not None:
+                session.arrivals.note(counter, state.number, now)
+            is_new = now <= session.trusted_until and not is_superseded
+            if is_new:
+                session.trusted_until = now + c.LATE_AFTER_S
+                peer.received_at = now
+                peer.unanswered_since = None
+                if not peer.is_up:
+                    out += peer.note_received(now)
+            elif not peer.is_up and not is_superseded:
+                out += freshness.question(peer, session, now)
+            if state.condition is not PathCondition.USABLE and payload[:1] != _PROBE:
+                _ask_path(peer, session, state, now, out, is_candidate=is_candidate)
+            if not payload:
+                pass
+            elif (
+                payload[0] >= wire.FRAMES_FROM
+                and is_new
+                and peer.early is None
+                and now < session.verification.look_at
+            ):
+                traffic.out_of_order += counter < session.window.highest
+                order = 0 if session.arrivals is None else session.order_base + counter
+                out.append(new_tuple(Deliver, (peer, payload, order)))
+            else:
+                arrived = Arrived(peer, session, counter, state, now, is_new, is_superseded)
+                _receive_other(arrived, payload, out)
+            if peer.timers.next_at < peer.timers.scheduled_at:
+                self.schedule.update(peer)
+            return out
+        except CookieRequired as drop:
+            return [drop.reply, self._count(datagram, drop, path)]
+        except Drop as drop:
+            return [self._count(datagram, drop, path)]
+        except Exception:
+            if (claimed := self._claimed_peer(datagram)) is not None:
+                self._wake(claimed, now)
+            raise
+
+    def _wake(self, peer: Peer, now: float) -> None:
+        """A fault left the work for a peer half-done. All its timers expire soon: each finds what is due."""
+        for timer, at in enumerate(peer.timers.deadlines):
+            peer.timers.set(Timer(timer), min(at, now + c.RECOVER_S))
+        self.schedule.update(peer)
+
+    def _receive_stray(self, datagram: bytes, index: int, path: Path, now: float) -> list[Output]:
+        """An envelope of no session."""
+        wire.parse_envelope_header(datagram)  # may be malformed
+        if self._indices.is_quarantined(index, now):
+            raise Drop(DropReason.LATE)
+        out: list[Output] = []
+        if (peer := self._by_address.get(path.place)) is not None:
+            out += receive_hint(peer, now)
+            self.schedule.update(peer)
+        return [*out, self._count(datagram, Drop(DropReason.UNKNOWN_INDEX), path)]
+
+    def _count(self, datagram: bytes, drop: Drop, path: Path) -> Dropped:
+        if (peer := self._claimed_peer(datagram)) is not None:
+            return peer.drop_datagram(drop.reason, path, drop.detail)
+        self.drops[drop.reason] += 1
+        return Dropped(drop.reason, None, path, 1, drop.detail)
+
+    def _claimed_peer(self, datagram: bytes) -> Peer | None:
+        """The peer whose session or handshake the header names: a claim, good for a counter and no more."""
+        index = wire.claimed_receiver_index(datagram)
+        owner = self._indices.owners.get(index) if index else None
+        return None if owner is None else owner[0]
+
+
+def _settle(peer: Peer, session: Session, path: Path, now: float, out: list[Output]) -> tuple[PathState, bool]:
+    """The slot of a path. Returns also whether it is new. The first envelope of a session confirms it."""
+    sessions = peer.sessions
     if session.local_index in sessions.unconfirmed:
         waiting = sessions.unconfirmed[session.local_index]
         out += adopt(peer, session, path, now, waiting.certificate)
         if session is sessions.current:
             out += probing.ask_everywhere(peer, session, now, waiting)
-        state = peer.paths.find(path)
-    is_candidate = state is None
-    if state is None:
-        state = probing.learn(peer, path, now)
-    state.datagrams_received += 1
-    state.bytes_received += size
-    state.received_at = now
-    if session is sessions.current:
-        state.received += 1
-    if session.arrivals is not None:
-        session.arrivals.note(counter, state.number, now)
+    state = peer.paths.find(path)
+    return (probing.learn(peer, path, now), True) if state is None else (state, False)
 
-    is_superseded = session is not sessions.current and sessions.is_superseded(session, now)
-    is_new = now <= session.trusted_until and not is_superseded
-    if is_new:
-        session.trusted_until = now + c.LATE_AFTER_S
-        peer.received_at = now
-        peer.unanswered_since = None
-        if not peer.is_up:
-            out += peer.note_received(now)
-    elif not peer.is_up and not is_superseded:
-        out += freshness.question(peer, session, now)
 
-    if state.condition is not PathCondition.USABLE and payload[:1] != _PROBE:
-        is_asked = peer.paths.has_several or not state.is_configured  # else by echo requests
-        least_s = peer.paths.facts.least_probe_s(path)
-        if is_asked and session is sessions.current and probing.wants_question(state, now, least_s):
-            out += probing.ask(peer, session, state, now)
-        if is_candidate:
-            out += probing.update(peer, now)
-    if not payload:
-        return out
-    is_along_best = payload[0] < wire.FRAMES_FROM  # if frames follow: a probe is in front of them
-    if is_along_best:
-        arrived = Arrived(peer, session, counter, state, now, is_new, is_superseded)
-        controlled, payload = _receive_control(arrived, payload)
-        out += controlled
-        if not payload:
-            return out
-    early = peer.early
+def _ask_path(
+    peer: Peer, session: Session, state: PathState, now: float, out: list[Output], *, is_candidate: bool
+) -> None:
+    """Something came along a path that is not usable: ask along it, if that is due."""
+    is_asked = peer.paths.has_several or not state.is_configured  # else by echo requests
+    least_s = peer.paths.facts.least_probe_s(state.path)
+    if is_asked and session is peer.sessions.current and probing.wants_question(state, now, least_s):
+        out += probing.ask(peer, session, state, now)
+    if is_candidate:
+        out += probing.update(peer, now)
+
+
+def _receive_other(arrived: Arrived, payload: bytes, out: list[Output]) -> None:
+    """Act on the payload of an envelope that is not frames to be delivered at once."""
+    if payload[0] < wire.FRAMES_FROM:
+        _receive_control(arrived, payload, out)
+    else:
+        _receive_frames(arrived, payload, out, is_along_best=False)
+
+
+def _receive_frames(arrived: Arrived, payload: bytes, out: list[Output], *, is_along_best: bool) -> None:
+    """Deliver frames, hold them, or let them wait for others. ``is_along_best``: a probe was in front of them."""
+    peer, session, counter, now = arrived.peer, arrived.session, arrived.counter, arrived.now
+    early, traffic = peer.early, peer.traffic
     traffic.out_of_order += (
         counter < session.window.highest if early is None else session.order_base + counter < early.highest
     )
-    if is_superseded:
+    if arrived.is_superseded:
         out += peer.drop(DropReason.DELAYED, 1)
-    elif not is_new:
+    elif not arrived.is_new:
         out += freshness.hold(peer, session, counter, payload, now)
     else:
-        order = 0 if session.arrivals is None else session.order_of(counter)  # without a call for one path
-        delivered: list[Output] = [Deliver(peer, payload, order)]
+        delivered: list[Output] = [Deliver(peer, payload, session.order_of(counter))]
         if now >= session.verification.look_at:
             delivered = freshness.deliver(peer, session, counter, payload, now)
         if early is not None:
             out += [output for output in delivered if not isinstance(output, Deliver)]
             frames = [output for output in delivered if isinstance(output, Deliver)]
-            envelope = EarlyEnvelope(session.order_base + counter, session, state, frames, is_along_best)
+            envelope = EarlyEnvelope(session.order_base + counter, session, arrived.state, frames, is_along_best)
             delivered = early.arrive(envelope, now)
             if early.due_at < peer.timers.deadlines[Timer.FRESHNESS]:
                 peer.timers.set(Timer.FRESHNESS, early.due_at)
         out += delivered
-    return out
 
 
 def _receive_copy(
@@ -171,30 +278,32 @@ def _answer_copy(peer: Peer, session: Session, payload: bytes, state: PathState,
     return []
 
 
-def _receive_control(arrived: Arrived, payload: bytes) -> tuple[list[Output], bytes]:
-    """Act on a control record. Returns the frames behind it too."""
+def _receive_control(arrived: Arrived, payload: bytes, out: list[Output]) -> None:
+    """Act on a control record, and on the frames behind it."""
     peer, session, state, now = arrived.peer, arrived.session, arrived.state, arrived.now
     try:
         control = wire.parse_control(payload)
     except Drop as drop:
-        return [peer.drop_datagram(drop.reason, state.path)], b""
+        out.append(peer.drop_datagram(drop.reason, state.path))
+        return
     match control:
         case wire.Echo() as echo:
-            return _receive_echo(peer, session, echo, state, now), b""
+            out += _receive_echo(peer, session, echo, state, now)
         case wire.ProbeAndFrames(probe, frames):
-            return probing.receive_probe(peer, session, probe, state, now), frames
+            out += probing.receive_probe(peer, session, probe, state, now)
+            if frames:
+                _receive_frames(arrived, frames, out, is_along_best=True)
         case wire.Close():
-            return receive_close(peer, session, now), b""
+            out += receive_close(peer, session, now)
         case wire.SealedRecord(sealed):
-            return _receive_record(arrived, sealed), b""
+            out += _receive_record(arrived, sealed)
         case RefusalReport() | ProblemReport():  # pragma: no branch  # the last kinds there are
             feature = c.FEATURE_REFUSALS if isinstance(control, RefusalReport) else c.FEATURE_PROBLEMS
             if not session.parameters.features & feature:
-                return [peer.drop_datagram(DropReason.BAD_CONTROL, state.path)], b""
-            if arrived.is_superseded:
-                return [], b""
-            out = freshness.receive_report(peer, session, arrived.counter, control, now, is_new=arrived.is_new)
-            return out, b""
+                out.append(peer.drop_datagram(DropReason.BAD_CONTROL, state.path))
+            elif not arrived.is_superseded:
+                is_new = arrived.is_new
+                out += freshness.receive_report(peer, session, arrived.counter, control, now, is_new=is_new)
 
 
 def _receive_record(arrived: Arrived, sealed: bytes) -> list[Output]:

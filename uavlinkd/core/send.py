@@ -8,7 +8,7 @@ from uavlinkd.core import constants as c
 from uavlinkd.core import wire
 from uavlinkd.core.constants import NEVER
 from uavlinkd.core.drops import DropReason
-from uavlinkd.core.outputs import Output, Transmit
+from uavlinkd.core.outputs import Output, Transmit, new_tuple
 from uavlinkd.core.path import FREE, Path
 from uavlinkd.core.path_measures import NO_REPEATS
 from uavlinkd.core.path_state import PathState
@@ -43,28 +43,42 @@ def send_frames(peer: Peer, frames: Sequence[bytes], now: float, cls: Class) -> 
         _note_activity(peer, now)
     if paths.is_multiple and cls is not Class.CRITICAL and len(route) == 1:
         asks_at = route[0].question_at - c.QUESTION_EARLY_S
-    out: list[Output] = []
-    batch: list[bytes] = []
-    size = 0
-    for frame in frames:
-        if size + len(frame) > limit:
-            if batch:
-                out += seal(peer, session, b"".join(batch), route, now)
-                batch, size = [], 0
-            if len(frame) > session.payload_limit:
-                out += peer.drop(DropReason.TOO_LARGE, 1)
-                continue
-        batch.append(frame)
-        size += len(frame)
-    if batch:
-        payload = b"".join(batch)
-        if now >= asks_at:
-            payload = _ask_too(peer, session, route[0], payload, limit, now)
-        out += seal(peer, session, payload, route, now)
+    if len(frames) == 1 and len(frames[0]) <= limit:
+        payloads, too_large = [frames[0]], 0
+    else:
+        payloads, too_large = _payloads(frames, limit, session.payload_limit)
+    if now >= asks_at and payloads:
+        payloads[-1] = _ask_too(peer, session, route[0], payloads[-1], limit, now)
+    out = send_payloads(peer, session, payloads, route, now)
+    if too_large:
+        out += peer.drop(DropReason.TOO_LARGE, too_large)
     if keeps:
         sent = (output.datagram for output in out if isinstance(output, Transmit))
         _remember(peer, dict.fromkeys(sent), now)
     return out
+
+
+def _payloads(frames: Sequence[bytes], limit: int, longest: int) -> tuple[list[bytes], int]:
+    """Frames in as few payloads of at most ``limit`` bytes as hold them; a longer frame has one of its own.
+
+    Returns also how many frames are too large for any.
+    """
+    payloads: list[bytes] = []
+    batch: list[bytes] = []
+    size = too_large = 0
+    for frame in frames:
+        if size + len(frame) > limit:
+            if batch:
+                payloads.append(b"".join(batch))
+                batch, size = [], 0
+            if len(frame) > longest:
+                too_large += 1
+                continue
+        batch.append(frame)
+        size += len(frame)
+    if batch:
+        payloads.append(b"".join(batch))
+    return payloads, too_large
 
 
 def _remember(peer: Peer, datagrams: Iterable[bytes], now: float) -> None:
@@ -124,34 +138,54 @@ def seal(
     *,
     is_answer: bool = False,
 ) -> list[Output]:
-    """Send an envelope along each path of a route, the same bytes.
+    """Send one envelope, as :func:`send_payloads`."""
+    return send_payloads(peer, session, (payload,), route, now, is_answer=is_answer)
 
-    It expects an answer, unless it is one: two ends must not answer each other endlessly.
+
+def send_payloads(
+    peer: Peer,
+    session: Session,
+    payloads: Sequence[bytes],
+    route: Route,
+    now: float,
+    *,
+    is_answer: bool = False,
+) -> list[Output]:
+    """Send each payload in an envelope, the same bytes along each path of a route.
+
+    They expect an answer, unless they are one: two ends must not answer each other endlessly.
     """
-    if session.send_counter >= c.SESSION_ENVELOPE_LIMIT:
-        return peer.drop(DropReason.NO_SESSION, 1)
-    datagram = session.seal(payload, now)
+    out: list[Output] = []
+    traffic = peer.traffic
+    is_counted = session is peer.sessions.current
+    before = session.send_counter
+    for payload in payloads:
+        if session.send_counter >= c.SESSION_ENVELOPE_LIMIT:
+            out += peer.drop(DropReason.NO_SESSION, 1)
+            continue
+        datagram = session.seal(payload, now)
+        size, is_copy = len(datagram), False
+        traffic.envelopes_sent += 1
+        if session.send_counter == c.REKEY_AFTER_ENVELOPES:
+            peer.set_initiate()
+        for state in route:
+            if (is_copy and not peer.paths.carries(state, size)) or not (state.is_proven or state.allows(size)):
+                continue
+            state.sent += is_counted
+            state.datagrams_sent += 1
+            state.bytes_sent += size
+            traffic.datagrams_sent += 1
+            traffic.bytes_sent += size
+            out.append(new_tuple(Transmit, (datagram, state.path, is_copy)))
+            is_copy = True
+    if session.send_counter == before:
+        return out
     peer.sent_at = now
     if peer.unanswered_since is None and not is_answer:
         peer.unanswered_since = now
         peer.echo_at = now + peer.echo_after_s
         if now + peer.silence_s < peer.timers.deadlines[Timer.SILENCE]:
             peer.timers.set(Timer.SILENCE, now + peer.silence_s)
-    if session.send_counter == c.REKEY_AFTER_ENVELOPES:
-        peer.set_initiate()
-    traffic, size = peer.traffic, len(datagram)
-    traffic.envelopes_sent += 1
-    is_counted = session is peer.sessions.current
-    out: list[Output] = []
-    for state in route:
-        if (out and not peer.paths.carries(state, size)) or not (state.is_proven or state.allows(size)):
-            continue
-        state.sent += is_counted
-        state.datagrams_sent += 1
-        state.bytes_sent += size
-        traffic.datagrams_sent += 1
-        traffic.bytes_sent += size
-        out.append(Transmit(datagram, state.path, bool(out)))
     return out
 
 

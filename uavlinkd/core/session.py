@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from uavlinkd.core import constants as c
 from uavlinkd.core import wire
-from uavlinkd.core.counters import Arrivals, CounterHistory, ReplayWindow
+from uavlinkd.core.counters import BLOCK_BITS, BLOCKS, Arrivals, CounterHistory, ReplayWindow
 from uavlinkd.core.crypto import AeadKey, MacKey, equal, hkdf_expand
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.handshake import Keys
@@ -17,6 +17,7 @@ EnvelopeKey = MacKey | AeadKey
 """The key of one direction: of HMAC-SHA256, or in a confidential session of ChaCha20-Poly1305."""
 
 
+_pack_short = wire.SHORT_HEADER.pack
 _DIRECTIONS = b" initiator to responder", b" responder to initiator"
 
 
@@ -135,7 +136,10 @@ class Session:
         if now >= self._sent_history.next_at:
             self._sent_history.note(counter - 1, counter, now)
         self.send_counter = counter + 1
-        header = wire.envelope_header(self.remote_index, counter)
+        if counter < c.SHORT_COUNTER_LIMIT:
+            header = _pack_short(wire.SHORT_ENVELOPE, self.remote_index, counter)
+        else:
+            header = wire.envelope_header(self.remote_index, counter)
         key = self._send
         if isinstance(key, AeadKey):
             return header + key.seal(counter, payload, header)
@@ -206,9 +210,13 @@ class Session:
             self.first_received_at = now
         if now >= self._received_history.next_at:
             self._received_history.note(window.highest, self.received, now)
-        if is_overtaken:
-            self._received_history.add(counter)
-        window.mark(counter)
+        if counter == window.highest + 1 and counter % BLOCK_BITS:  # as window.mark(), without a call
+            window.highest = counter
+            window.blocks[counter // BLOCK_BITS % BLOCKS] |= 1 << counter % BLOCK_BITS
+        else:
+            if is_overtaken:
+                self._received_history.add(counter)
+            window.mark(counter)
         self.received += 1
         return payload
 

@@ -25,9 +25,10 @@ MACS_BYTES = 2 * c.MAC_BYTES
 COOKIE_BYTES = 4 + c.COOKIE_NONCE_BYTES + c.MAC_BYTES + c.AEAD_TAG_BYTES
 _INITIATION_HEADER = struct.Struct(">BBH")
 _RESPONSE_HEADER = struct.Struct(">BBHH")
-_SHORT_HEADER = struct.Struct(">BHH")
+SHORT_HEADER = struct.Struct(">BHH")
+"""Type, receiver index, counter. The path of a frame packs and unpacks it without a call."""
 _LONG_HEADER = struct.Struct(">BHI")
-SHORT_HEADER_BYTES = _SHORT_HEADER.size
+SHORT_HEADER_BYTES = SHORT_HEADER.size
 LONG_HEADER_BYTES = _LONG_HEADER.size
 
 
@@ -204,7 +205,7 @@ def parse_cookie_reply(datagram: bytes) -> CookieReply:
 def envelope_header(receiver_index: int, counter: int) -> bytes:
     """Type, receiver index, counter: five bytes while the counter is small, seven after that."""
     if counter < c.SHORT_COUNTER_LIMIT:
-        return _SHORT_HEADER.pack(SHORT_ENVELOPE, receiver_index, counter)
+        return SHORT_HEADER.pack(SHORT_ENVELOPE, receiver_index, counter)
     return _LONG_HEADER.pack(LONG_ENVELOPE, receiver_index, counter)
 
 
@@ -217,7 +218,7 @@ def parse_envelope_header(datagram: bytes) -> tuple[int, int, int]:
     if datagram[0] == SHORT_ENVELOPE:
         if len(datagram) < SHORT_HEADER_BYTES + TAG_LENGTHS[0]:
             raise Drop(DropReason.MALFORMED)
-        _, receiver_index, counter = _SHORT_HEADER.unpack_from(datagram)
+        _, receiver_index, counter = SHORT_HEADER.unpack_from(datagram)
         if not receiver_index:
             raise Drop(DropReason.MALFORMED)
         return receiver_index, counter, SHORT_HEADER_BYTES

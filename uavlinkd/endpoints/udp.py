@@ -61,28 +61,37 @@ class UdpPort(LocalPort):
     def __init__(self, endpoint: UdpEndpoint, name: str, address: SocketAddress, received_at: float | None) -> None:
         super().__init__(endpoint, name, received_at)
         self.address = address
+        self.is_closed = False
 
     def send(self, frames: Sequence[Frame], source: Source, now: float, waited_s: float = 0.0) -> None:
         """Send frames to the client, together where they fit. The endpoint counts what the kernel refuses."""
-        admit = self.delivered.admit
-        batch: list[bytes] = []
-        size = 0
+        delivered, endpoint = self.delivered, self.endpoint
+        batch, count = b"", 0
         for frame in frames:
-            data = admit(frame, source, now)
-            if not data:
-                continue
-            if size + len(data) > LOCAL_DATAGRAM_BYTES:
-                if batch:
-                    self.endpoint.send(b"".join(batch), self.address, len(batch))
-                    batch, size = [], 0
-                if len(data) > LOCAL_DATAGRAM_BYTES:  # a separator and the frame
-                    cut = len(data) - len(frame.raw)
-                    self.endpoint.send(data[:cut], self.address, 0)
-                    data = data[cut:]
-            batch.append(data)
-            size += len(data)
-        if batch:
-            self.endpoint.send(b"".join(batch), self.address, len(batch))
+            data = frame.raw
+            # As admit() does, without a call where nothing is open and no frame can begin within this one.
+            if delivered.starts or data.count(b"\xfd") + data.count(b"\xfe") != 1:
+                data = delivered.admit(frame, source, now)
+                if not data:
+                    continue
+            if count and len(batch) + len(data) > LOCAL_DATAGRAM_BYTES:
+                endpoint.send(batch, self.address, count)
+                batch, count = b"", 0
+            if len(data) > LOCAL_DATAGRAM_BYTES:  # a separator and the frame
+                cut = len(data) - len(frame.raw)
+                endpoint.send(data[:cut], self.address, 0)
+                data = data[cut:]
+            batch = batch + data if count else data
+            count += 1
+        if not count or self.is_closed:
+            return
+        try:
+            endpoint.sendto(batch, self.address)
+        except OSError as error:
+            endpoint.on_send_error(batch, self.address, count, error)
+        else:
+            endpoint.bytes_sent += len(batch)
+            endpoint.frames_sent += count
 
 
 class UdpEndpoint(Endpoint):
@@ -93,6 +102,7 @@ class UdpEndpoint(Endpoint):
 
     def __init__(self, name: str, sock: socket.socket, handler: PortHandler) -> None:
         super().__init__(name, handler)
+        self._on_frames = handler.on_frames
         self._use(sock)
         self._ports: dict[SocketAddress, UdpPort] = {}
         self._silent: set[LocalPort] = set()
@@ -105,6 +115,7 @@ class UdpEndpoint(Endpoint):
 
     def _use(self, sock: socket.socket) -> None:
         self._sock = sock
+        self.sendto = sock.sendto
         self._reports = ErrorReports(sock)
         self._reader = Reader(sock, self.take, self._on_read_error, self.handler.stall)
 
@@ -117,42 +128,54 @@ class UdpEndpoint(Endpoint):
 
     def take(self, datagrams: Datagrams, now: float, epoch: int, waited_s: float = 0.0) -> None:
         """Deliver the frames of each client, in their order."""
+        ports, streams = self._ports, self._streams
         received: dict[SocketAddress, list[Frame]] = {}
-        stale: set[SocketAddress] = set()
+        stale: set[SocketAddress] | None = None
         for datagram, address in datagrams:
-            if address not in self._ports and not self._is_welcome(address):
+            if address not in ports and not self._is_welcome(address):
                 continue
             self.bytes_received += len(datagram)
+            frames = received.get(address)
+            if frames is None:
+                frames = received[address] = []
             try:
-                frames = received.setdefault(address, [])
-                stream = self._streams.pop(address, None)
-                if stream is None:
+                fault = None
+                if not (is_stream := address in streams):
                     end, fault = parse_frames(datagram, 0, frames, self.counters, is_expected=True)
-                    if fault is not None:
-                        datagram = datagram[end:]  # noqa: PLW2901
-                        stream = StreamSplitter(self.counters, max_hold_s=MAX_HOLD_S, gives_up=True)
-                if stream is not None:
-                    frames += stream.feed(datagram, now, epoch)
-                    if not stream.is_fresh:
-                        stale.add(address)
-                    if stream.pending_bytes:
-                        self._hold(stream, address)
+                if (is_stream or fault is not None) and not self._feed(
+                    datagram if is_stream else datagram[end:], address, frames, now, epoch
+                ):
+                    stale = (stale or set()) | {address}
             except Exception as error:  # a fault costs this datagram
                 report(error)
         for address, frames in received.items():
             try:
-                self._deliver(address, frames, now, STALE if address in stale else epoch, waited_s)
+                port = ports.get(address)
+                if frames and (port is None or port in self._silent):
+                    port = self._admitted(address, now)
+                if port is not None and frames:
+                    port.received_at = now
+                    self._on_frames(port, frames, now, STALE if stale and address in stale else epoch, waited_s)
             except Exception as error:  # of this client
                 report(error)
 
-    def _deliver(self, address: SocketAddress, frames: list[Frame], now: float, epoch: int, waited_s: float) -> None:
-        port = (self._ports.get(address) or self._admit(address, now)) if frames else None
-        if port is not None:
-            port.received_at = now
-            if port in self._silent:
-                self._silent.remove(port)
-                self.handler.on_port_active(port)
-            self.handler.on_frames(port, frames, now, epoch, waited_s)
+    def _feed(self, data: bytes, address: SocketAddress, frames: list[Frame], now: float, epoch: int) -> bool:
+        """Add the frames that these bytes of a sender complete. Returns whether they began in this epoch."""
+        stream = self._streams.pop(address, None)
+        if stream is None:
+            stream = StreamSplitter(self.counters, max_hold_s=MAX_HOLD_S, gives_up=True)
+        frames += stream.feed(data, now, epoch)
+        if stream.pending_bytes:
+            self._hold(stream, address)
+        return stream.is_fresh
+
+    def _admitted(self, address: SocketAddress, now: float) -> UdpPort | None:
+        """The client at an address: a new one, or one that was silent."""
+        port = self._ports.get(address) or self._admit(address, now)
+        if port is not None and port in self._silent:
+            self._silent.remove(port)
+            self.handler.on_port_active(port)
+        return port
 
     def _hold(self, stream: StreamSplitter, address: SocketAddress) -> None:
         """Keep an unfinished frame. Senders that are not clients cannot displace those of clients."""
@@ -166,16 +189,23 @@ class UdpEndpoint(Endpoint):
         if address not in self._ports:
             return
         try:
-            self._sock.sendto(datagram, address)
+            self.sendto(datagram, address)
         except OSError as error:
-            last = send_again(self._sock, datagram, address, error, self._take_errors)
-            if last is not None:
-                self.failures[failure_name(last)] += frames
-                if last.errno != errno.ECONNREFUSED:  # which is about an earlier datagram, perhaps to another client
-                    self._on_failed(address, last.errno)
-                return
-        self.bytes_sent += len(datagram)
-        self.frames_sent += frames
+            self.on_send_error(datagram, address, frames, error)
+        else:
+            self.bytes_sent += len(datagram)
+            self.frames_sent += frames
+
+    def on_send_error(self, datagram: bytes, address: SocketAddress, frames: int, error: OSError) -> None:
+        """A datagram was not sent. Send it again if the error is about an earlier one; count any other."""
+        last = send_again(self._sock, datagram, address, error, self._take_errors)
+        if last is None:
+            self.bytes_sent += len(datagram)
+            self.frames_sent += frames
+            return
+        self.failures[failure_name(last)] += frames
+        if last.errno != errno.ECONNREFUSED:  # which is about an earlier datagram, perhaps to another client
+            self._on_failed(address, last.errno)
 
     def do_housekeeping(self, now: float) -> None:
         """Give up incomplete frames whose rest does not arrive, and have the kernel report errors again."""
@@ -185,10 +215,15 @@ class UdpEndpoint(Endpoint):
             frames = stream.give_up(now, epoch)
             if not stream.pending_bytes:
                 del self._streams[address]
-            self._deliver(address, frames, now, epoch if stream.is_fresh else STALE, 0.0)
+            port = self._admitted(address, now) if frames else None
+            if port is not None:
+                port.received_at = now
+                self._on_frames(port, frames, now, epoch if stream.is_fresh else STALE, 0.0)
 
     def close(self) -> None:
         super().close()
+        for port in self._ports.values():
+            port.is_closed = True
         self._ports.clear()
         self._close_socket()
 
@@ -212,6 +247,7 @@ class UdpEndpoint(Endpoint):
 
     def _forget(self, port: UdpPort) -> None:
         del self._ports[port.address]
+        port.is_closed = True
         self._silent.discard(port)
         self.handler.on_port_closed(port)
 

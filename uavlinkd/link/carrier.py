@@ -7,7 +7,7 @@ budget, for a slow client, or for their sender's turn while the daemon is busy.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Hashable, Iterable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from time import thread_time
 from typing import Final
 
@@ -21,13 +21,11 @@ from uavlinkd.core.relay_records import Bind, FleetRecord
 from uavlinkd.core.timers import Schedule
 from uavlinkd.core.wire import ENVELOPE_STARTS
 from uavlinkd.endpoints.reader import Datagrams
-from uavlinkd.link.journal import ShellReason
 from uavlinkd.link.parts import DaemonParts
 from uavlinkd.link.peer_link import Carriage, PeerLink
 from uavlinkd.link.peers import Peers
 from uavlinkd.link.relay_link import RELAYED_START, WaitingDatagram
-from uavlinkd.link.turns import Turns, cost_of
-from uavlinkd.mavlink.frames import Frame, parse_frames, pass_faults
+from uavlinkd.link.turns import Turns
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.guard import report, run
 
@@ -35,8 +33,6 @@ HANDSHAKES_S: Final = 0.01
 """CPU time for handshake messages before the envelopes have their turn: about twenty of them."""
 WAITING_HANDSHAKES: Final = 1024
 """Handshake messages that wait, at most: what is handled in half a second, one of each member of a large relay."""
-MAX_PATHS: Final = 1024
-"""Paths of received datagrams that are remembered: a frame on one of them costs no new object."""
 LOOP_TICK_S: Final = 0.001
 """A loop may fire a timer up to one tick of its clock early. The timer is set later by this."""
 TURN_S: Final = 0.003
@@ -55,7 +51,12 @@ class FrameCarrier:
         self._node = parts.node
         self._stall = parts.stall
         self._links = parts.link_of
-        self._switch = parts.switch
+        self._line = line = parts.line
+        self.perform = line.perform
+        line.on_output, line.on_several, line.unwrap = self._on_output, self._receive_several, self._unwrap
+        line.drop_held, line.arm = self._drop_held, self.arm
+        if parts.relay is not None:
+            line.on_read = self._settle_relay
         self._sockets = parts.peer_sockets
         self._loop = asyncio.get_running_loop()
         self._waiting = Schedule[PeerLink]()
@@ -63,64 +64,51 @@ class FrameCarrier:
         self.peers = Peers(parts, carriage)
         self._turns = Turns()
         self._handshakes: dict[Hashable, WaitingDatagram] = {}  # that wait, the newest of each source
-        self._paths: dict[tuple[int, SocketAddress], Path] = {}
-        self._read_at, self._epoch = 0.0, 0  # of the datagrams that are received now
-        self._frames: dict[PeerLink, list[Frame]] = {}  # delivered, but not forwarded yet
-        self._is_turn = False  # frames gather until its end
-        self._cost = 0
         self._turned_at = 0.0  # when a round of turns ended last
         self._timer: asyncio.TimerHandle | None = None
-        self._timer_at = NEVER
+        line.timer_at = NEVER
 
     # Datagrams in.
 
-    def receive(self, socket: int, datagrams: Datagrams, now: float, epoch: int, waited_s: float) -> None:
-        """Receive the datagrams of one wake-up from a socket, or let them wait for their senders' turns."""
-        paths = self._paths
+    def _receive_several(self, socket: int, datagrams: Datagrams, now: float, epoch: int) -> None:
+        """Receive datagrams, or let them wait for their senders' turns."""
         arrived: list[WaitingDatagram] = []
         for datagram, address in datagrams:
-            if datagram[:1] == RELAYED_START:
-                try:
-                    self._unwrap(socket, datagram, address, arrived)
-                except Exception as error:
-                    report(error)
+            if datagram[:1] != RELAYED_START:
+                arrived.append((datagram, self._line.path_of(socket, address)))
                 continue
-            path = paths.get((socket, address))
-            if path is None:
-                if len(paths) >= MAX_PATHS:
-                    paths.clear()
-                path = paths[socket, address] = Path(socket, address)
-            arrived.append((datagram, path))
-        if len(arrived) == 1 and not (self._turns.queues or self._handshakes):  # one datagram needs no clock
-            self._read_at, self._epoch = now, epoch
             try:
-                self.perform(self._node.receive(*arrived[0], now))
-            except Exception as error:  # a fault costs this datagram
+                inside = self._unwrap(socket, datagram, address)
+            except Exception as error:
                 report(error)
-            if epoch != self._stall.epoch:
-                self._drop_held()
-        elif arrived:
-            self._receive_several(arrived, now, epoch)
+            else:
+                arrived += [] if inside is None else [inside]
+        if arrived:
+            self._receive_arrived(arrived, now, epoch)
+
+    def _settle_relay(self) -> None:
         if (relay := self._parts.relay) is not None and relay.is_due:
             run(relay.settle, monotonic())
 
-    def _unwrap(self, socket: int, data: bytes, source: SocketAddress, arrived: list[WaitingDatagram]) -> None:
-        """Add the datagram inside one of a relay or a member, with its path, unless it is handled or dropped here."""
+    def _unwrap(self, socket: int, data: bytes, source: SocketAddress) -> WaitingDatagram | None:
+        """The datagram inside one of a relay or a member, with its path; None if it is handled or dropped here."""
         relays, relay = self._parts.relays, self._parts.relay
         inside = self._sockets.handles.unwrap(socket, data, source) if relays.by_name else None
         if isinstance(inside, tuple):
-            arrived.append(inside)
-        elif relay is not None:
+            return inside
+        if relay is not None:
             relay.forwarding.take(socket, data, source)
-        elif inside is not None:
-            self._drop_datagram(inside, path=(path := Path(socket, source)))
-            if inside is DropReason.RELAY_UNKNOWN_HANDLE:
-                relays.on_unknown_handle(path, monotonic())
-                self.arm()
-        else:
-            arrived.append((data, Path(socket, source)))  # the core drops it: this daemon has no relay
+            return None
+        path = Path(socket, source)
+        if inside is None:
+            return data, path  # the core drops it: this daemon has no relay
+        self._drop_datagram(inside, path=path)
+        if inside is DropReason.RELAY_UNKNOWN_HANDLE:
+            relays.on_unknown_handle(path, monotonic())
+            self.arm()
+        return None
 
-    def _receive_several(self, arrived: list[WaitingDatagram], now: float, epoch: int) -> None:
+    def _receive_arrived(self, arrived: list[WaitingDatagram], now: float, epoch: int) -> None:
         was_busy = self._is_busy
         try:
             envelopes = self._receive_handshakes(arrived, now, epoch)
@@ -131,6 +119,7 @@ class FrameCarrier:
             for datagram, path in envelopes:
                 run(self._wait, datagram, path, epoch)
         finally:  # an exception must not leave what waits without a turn
+            self._line.is_busy = self._is_busy
             if self._is_busy and not was_busy:
                 self._loop.call_soon(self._do_turns)
 
@@ -158,7 +147,7 @@ class FrameCarrier:
             else:
                 run(self._hold_handshake, datagram, path, now)
         if not was_waiting:
-            self._read_at, self._epoch = now, epoch
+            self._line.read_at, self._line.epoch = now, epoch
             self._do_handshakes()
         return envelopes
 
@@ -182,7 +171,7 @@ class FrameCarrier:
         ends_at = thread_time() + HANDSHAKES_S if len(self._handshakes) > 1 else 0.0
         while self._handshakes:
             datagram, path = self._handshakes.pop(next(iter(self._handshakes)))
-            run(self._do, datagram, path, self._read_at)
+            run(self._do, datagram, path, self._line.read_at)
             if self._handshakes and thread_time() >= ends_at:
                 break
 
@@ -195,19 +184,20 @@ class FrameCarrier:
             self._stall.turn(monotonic())
             for turn, epoch in self._turns.round():
                 self._do_turn(turn, monotonic(), epoch)
-            self._read_at, self._epoch = monotonic(), self._stall.epoch
+            self._line.read_at, self._line.epoch = monotonic(), self._stall.epoch
             self._do_handshakes()
         finally:
             self._turned_at = monotonic()
+            self._line.is_busy = self._is_busy
             if self._is_busy:
                 self._loop.call_soon(self._do_turns)
-            if (relay := self._parts.relay) is not None and relay.is_due:
-                run(relay.settle, monotonic())
+            self._settle_relay()
 
     def _do_turn(self, arriving: Iterator[WaitingDatagram], now: float, epoch: int) -> None:
         """Receive datagrams until there are no more, or the turn is over. Then forward their frames."""
         # Stale datagrams are opened too: their counters must be used up, or an attacker could replay them as new.
-        self._read_at, self._epoch, self._cost, self._is_turn = now, epoch, 0, True
+        line = self._line
+        line.read_at, line.epoch, line.cost, line.is_turn = now, epoch, 0, True
         ends_at = thread_time() + TURN_S
         try:
             for datagram, path in arriving:
@@ -215,10 +205,10 @@ class FrameCarrier:
                     self.perform(self._node.receive(datagram, path, now))
                 except Exception as error:
                     report(error)
-                if self._cost >= TURN_FRAMES or thread_time() >= ends_at:
+                if self._line.cost >= TURN_FRAMES or thread_time() >= ends_at:
                     break
         finally:
-            self._is_turn = False
+            self._line.is_turn = False
         run(self.perform, ())
         if epoch != self._stall.epoch:
             self._drop_held()
@@ -229,67 +219,19 @@ class FrameCarrier:
 
     # Outputs of the core.
 
-    def perform(self, outputs: Iterable[Output]) -> None:
-        """Execute outputs of the core. Frames that it delivers are forwarded at once, or at the end of the turn.
-
-        A fault costs one output, or the frames of one link.
-        """
-        for output in outputs:
-            try:
-                if isinstance(output, Transmit):
-                    path = output.path
-                    try:
-                        self._sockets.senders[path.socket](output.datagram, path.address)
-                    except OSError as error:
-                        self._sockets.on_send_error(path.socket, output.datagram, path.address, error)
-                elif isinstance(output, Deliver):
-                    peer, payload, order = output
-                    link = self._links.get(peer)
-                    if link is None:  # whatever a policy says
-                        self._drop_datagram(DropReason.FRAMES_NOT_ALLOWED, peer.name)
-                        continue
-                    # As split_payload, without one call.
-                    frames: list[Frame] = []
-                    position, fault = parse_frames(payload, 0, frames, link.counters, is_expected=True)
-                    if fault is not None:
-                        pass_faults(payload, position, fault, frames, link.counters)
-                    if self._is_turn:
-                        self._cost += cost_of(payload, len(frames))
-                    if order:  # the peer has several paths
-                        came, frames = len(frames), link.pick_newest(frames, order, self._read_at)
-                        if count := came - len(frames):
-                            reason = ShellReason.SUPERSEDED
-                            self._parts.journal.add("frames_dropped", reason, link.name, count, monotonic())
-                    elif link.output.repair.is_on:
-                        link.note_requests(frames, self._read_at)
-                    if link in self._frames:
-                        self._frames[link] += frames
-                    else:
-                        self._frames[link] = frames
-                elif isinstance(output, o.Dropped):
-                    now = monotonic()
-                    self._parts.journal.add_dropped(output, now)
-                    self._parts.evidence.add_dropped(output, now)
-                elif isinstance(output, o.RecordReceived):
-                    self._on_record(output)
-                elif isinstance(output, o.CertificateShown):
-                    assert self._parts.fleet is not None, "only a member takes certificates"
-                    self.perform(self._parts.fleet.answer(output, self._read_at))
-                else:
-                    self._on_event(output)
-            except Exception as error:
-                report(error)
-        if self._frames and not self._is_turn:
-            delivered, self._frames = self._frames, {}
-            for link, frames in delivered.items():
-                if link.peer not in self._links:  # revoked since these frames came
-                    continue
-                try:
-                    self._switch.forward(link, frames, self._read_at, self._epoch)
-                except Exception as error:
-                    report(error)
-        if self._node.next_deadline() < self._timer_at:
-            self.arm()
+    def _on_output(self, output: Output) -> None:
+        """Execute an output that is no datagram and no frame."""
+        if isinstance(output, o.Dropped):
+            now = monotonic()
+            self._parts.journal.add_dropped(output, now)
+            self._parts.evidence.add_dropped(output, now)
+        elif isinstance(output, o.RecordReceived):
+            self._on_record(output)
+        elif isinstance(output, o.CertificateShown):
+            assert self._parts.fleet is not None, "only a member takes certificates"
+            self.perform(self._parts.fleet.answer(output, self._line.read_at))
+        elif not isinstance(output, Deliver | Transmit):
+            self._on_event(output)
 
     def _drop_datagram(self, reason: DropReason, name: str = "", path: Path | None = None) -> None:
         """Count a datagram that the core does not drop."""
@@ -344,21 +286,21 @@ class FrameCarrier:
 
     def settle(self) -> None:
         """The core or a link may have an earlier deadline than the timer."""
-        if self._node.next_deadline() < self._timer_at or self._waiting.next_at < self._timer_at:
+        if self._node.next_deadline() < self._line.timer_at or self._waiting.next_at < self._line.timer_at:
             self.arm()
 
     def arm(self) -> None:
         """Set the one timer to the next deadline. It is moved only to an earlier time: firing too early is cheap."""
         fleet_at = NEVER if self._parts.fleet is None else self._parts.fleet.next_at
         deadline = min(self._node.next_deadline(), self._waiting.next_at, self._parts.relays.next_at, fleet_at)
-        if deadline < self._timer_at:
+        if deadline < self._line.timer_at:
             if self._timer is not None:
                 self._timer.cancel()
-            self._timer_at = deadline
+            self._line.timer_at = deadline
             self._timer = self._loop.call_later(max(0.0, deadline - monotonic()) + LOOP_TICK_S, self._on_timer)
 
     def _on_timer(self) -> None:
-        now, self._timer_at = monotonic(), -NEVER  # nothing sets the timer meanwhile
+        now, self._line.timer_at = monotonic(), -NEVER  # nothing sets the timer meanwhile
         try:
             self._stall.turn(now)
             for _ in range(PEERS_AT_ONCE):
@@ -372,7 +314,7 @@ class FrameCarrier:
             if self._parts.fleet is not None and now >= self._parts.fleet.next_at:
                 run(self._parts.fleet.do_due, now)
         finally:
-            self._timer_at = NEVER
+            self._line.timer_at = NEVER
             self.arm()
 
     def _perform_of(self, source: Callable[[float], list[Output]], now: float) -> None:
@@ -394,4 +336,4 @@ class FrameCarrier:
         self.perform(self._node.close(monotonic()))
         if self._timer is not None:
             self._timer.cancel()
-        self._timer_at = -NEVER
+        self._line.timer_at = -NEVER

@@ -96,7 +96,7 @@ class Daemon:
             raise
         self.carrier.peers.start()
         parts.peer_sockets.web.on_room = self.carrier.send_waiting
-        parts.peer_sockets.start(self.carrier.receive, self.carrier.arm)
+        parts.peer_sockets.start(parts.line.receive, self.carrier.arm)
         parts.local.start()
         self._write_warnings()
         self.log.info(

@@ -71,8 +71,8 @@ class LocalEndpoints:
         self.policies: dict[str, Policy] = {}
         """By the endpoint's name."""
         self.stall = stall
-        self.on_frames: Callable[..., None] = switch.forward
-        """Of :class:`uavlinkd.endpoints.ports.PortHandler`, without a call in between."""
+        self.on_frames: Callable[..., None]
+        """Of :class:`uavlinkd.endpoints.ports.PortHandler`: :meth:`.Line.forward`, without a call in between."""
         self._switch = switch
         self._journal = journal
         self._sources: dict[str, tuple[RadioStatusSource | None, StatusTextSource | None]] = {}

@@ -15,6 +15,7 @@ from uavlinkd.core.outputs import LinkedPeer, Output
 from uavlinkd.endpoints.ports import LocalPort
 from uavlinkd.link.evidence import Evidence
 from uavlinkd.link.journal import DaemonJournal
+from uavlinkd.link.line import Line
 from uavlinkd.link.local_endpoints import LocalEndpoints
 from uavlinkd.link.peer_link import PeerLink
 from uavlinkd.link.peer_sockets import PeerSockets
@@ -63,8 +64,10 @@ class DaemonParts:
         self.evidence = Evidence(self.links, config.public_key, relay_links)
         self.stall = StallWatch(now, journal.on_pause)
         self.peer_sockets = sockets = PeerSockets(self.stall, journal, self.evidence, log, node)
-        self.switch = Switch(Router[PeerLink | LocalPort](relays=config.relays_frames), self.stall, journal)
+        self.switch = Switch(Router[PeerLink | LocalPort](relays=config.relays_frames), journal)
+        self.line = Line(self.switch, self.stall, journal, node, self.link_of, sockets)
         self.local = LocalEndpoints(config.name, self.switch, journal, self.stall)
+        self.local.on_frames = self.line.forward
         self.relays = Relays(node, sockets, self.links, relay_links, log)
         """Those that this daemon uses."""
         self.relay: RelayService | None = None

@@ -18,7 +18,7 @@ from uavlinkd.core.problem_reports import LARGEST_PROBLEM_REPORT
 from uavlinkd.core.refusals import LARGEST_REPORT
 from uavlinkd.core.timers import Deadline, Schedule
 from uavlinkd.link.networks import NetworkBudget
-from uavlinkd.link.peer_output import RAW, PeerOutput
+from uavlinkd.link.peer_output import PeerOutput
 from uavlinkd.mavlink.flows import NewestStates
 from uavlinkd.mavlink.frames import Frame, SplitCounters
 from uavlinkd.mavlink.own_frames import LinkFigures, worst
@@ -170,16 +170,13 @@ class PeerLink:
         self.follow_paths(now)
 
     def send(self, frames: Sequence[Frame], source: Source, now: float, waited_s: float) -> None:
-        """Send frames that arrived together: at once, or when budget and coalescing delay allow it.
+        """Send frames that arrived together, along several paths, or when budget and coalescing delay allow it.
 
         ``source``: the port that sent them. ``waited_s``: how long the first of them has waited already.
         """
         self.frames_sent += len(frames)
-        if self.output.egress is not None or self.peer.paths.is_multiple or self.output.repair.is_on:
-            if self.output.send(frames, now, waited_s):
-                self.send_waiting(now)
-            return
-        self._perform(self._node.send(self.peer, list(map(RAW, frames)), now))
+        if self.output.send(frames, now, waited_s):
+            self.send_waiting(now)
 
     @property
     def gather_s(self) -> float:

@@ -66,52 +66,56 @@ class Sendings:
         self.dropped = 0
         """Copies and returns."""
         self._routes, self._received_at = routes, received_at
-        self._seen: dict[bytes, Any] = {}
-        """By the bytes of a frame: source, time, ports and number, or a `_Sending` if it arrived again."""
-        self._seen_before: dict[bytes, Any] = {}  # the same for the previous half
-        self._half_ends_at = float("-inf")
-        self._count = 0
+        self.seen: dict[bytes, Any] = {}
+        """By the bytes of a frame: source, time, ports and number, or a `_Sending` if it arrived again. The path of a
+        frame adds what is not here, without a call of :meth:`is_new`."""
+        self.seen_before: dict[bytes, Any] = {}
+        """The same for the previous half."""
+        self.half_ends_at = float("-inf")
+        """When a half of the memory is over."""
+        self.count = 0
+        """How many frames arrived."""
 
     def is_new(self, frame: Frame, source: Hashable, ports: Collection[Hashable], now: float) -> bool:
         """Whether a frame is a new sending, which goes to these ports. Remembers it; counts copies and returns."""
         raw = frame.raw
-        if now >= self._half_ends_at or len(self._seen) >= MAX_FRAMES_REMEMBERED:
+        if now >= self.half_ends_at or len(self.seen) >= MAX_FRAMES_REMEMBERED:
             self._turn(now)
-        self._count += 1
-        known = self._seen.get(raw) or self._seen_before.get(raw)
+        self.count += 1
+        known = self.seen.get(raw) or self.seen_before.get(raw)
         if known is None:
-            self._seen[raw] = source, now, ports, self._count
+            self.seen[raw] = source, now, ports, self.count
             return True
         if type(known) is tuple:
             first, at, sent_to, number = known
             known = _Sending(first, at, sent_to, number, {self._routes.get(first): 1}, at)
-            (self._seen if raw in self._seen else self._seen_before)[raw] = known
+            (self.seen if raw in self.seen else self.seen_before)[raw] = known
         quiet_s, known.arrived_at = now - known.arrived_at, now
         if self._is_return(frame, known, source, quiet_s, now) or self._is_copy(frame, known, source, now):
             self.dropped += 1
             return False
         route, arrivals = self._routes[source], known.arrivals if now - known.at < ROUTES_DIFFER_S else {}
         known.arrivals = {**arrivals, route: arrivals.get(route, 0) + 1}
-        known.source, known.at, known.ports, known.number, known.return_s = source, now, ports, self._count, None
-        self._seen[raw] = known
+        known.source, known.at, known.ports, known.number, known.return_s = source, now, ports, self.count, None
+        self.seen[raw] = known
         return True
 
     def note_own(self, raw: bytes, ports: Collection[Hashable], now: float) -> None:
         """The daemon itself sent these bytes to clients: if a client returns them, they go nowhere."""
-        if now >= self._half_ends_at:
+        if now >= self.half_ends_at:
             self._turn(now)
-        self._seen[raw] = None, now, ports, self._count
+        self.seen[raw] = None, now, ports, self.count
 
     def forget(self, raw: bytes) -> None:
         """These bytes were not delivered: the same bytes are new again."""
-        self._seen.pop(raw, None)
-        self._seen_before.pop(raw, None)
+        self.seen.pop(raw, None)
+        self.seen_before.pop(raw, None)
 
     def _turn(self, now: float) -> None:
         """Forget the older half of the frames, and circles that have ended."""
-        self._seen_before = {} if now >= self._half_ends_at + REMEMBERED_S else self._seen
-        self._seen = {}
-        self._half_ends_at = now + REMEMBERED_S
+        self.seen_before = {} if now >= self.half_ends_at + REMEMBERED_S else self.seen
+        self.seen = {}
+        self.half_ends_at = now + REMEMBERED_S
         self.circles = {port: one for port, one in self.circles.items() if now - one.returned_at < CIRCLE_S}
 
     def _is_peer(self, port: Hashable) -> bool:
@@ -145,7 +149,7 @@ class Sendings:
         ]
         is_apart = now - known.at >= REPEATED_S  # a circle with several returns of each sending cannot swell
         may_return = through and not (known.is_repeated and is_apart) and frame.header.target_system == 0
-        if self._count - known.number >= SEQUENCE or not (may_return or is_proven):
+        if self.count - known.number >= SEQUENCE or not (may_return or is_proven):
             return False
         if known.return_s is None:
             known.return_s = now - known.at

@@ -76,14 +76,15 @@ class DeliveredStream:
     Call :meth:`admit` once for each frame, in the order of delivery, and deliver all of what it returns.
     """
 
-    __slots__ = ("_authors", "_due_at", "_has_mavlink2", "_has_rare", "_starts", "_tail", "outgoing", "separators")
+    __slots__ = ("_authors", "_due_at", "_has_mavlink2", "_has_rare", "_tail", "outgoing", "separators", "starts")
 
     def __init__(self, outgoing: Gate | None = None) -> None:
         self.outgoing = outgoing
         """The rules for what goes to this client; None where nothing is withheld."""
         self.separators = 0  # how often bytes had to be put between frames of different sources
         self._tail = b""  # the stream from the first start that is still open
-        self._starts: list[hidden.Start] = []  # where in it frames may have begun that are not complete
+        self.starts: list[hidden.Start] = []
+        """Where in the stream frames may have begun that are not complete."""
         self._has_mavlink2 = self._has_rare = False  # whether the tail has such frames: some receivers reject them
         self._due_at = 0  # the tail's length at which the first of them may be complete
         self._authors: list[tuple[int, Source | None]] = []  # up to where in it whose bytes go; None: a separator
@@ -97,7 +98,7 @@ class DeliveredStream:
         """The bytes to deliver for a frame: itself, perhaps behind separator bytes. None of them: it is refused."""
         raw = frame.raw
         if raw.count(b"\xfd") + raw.count(b"\xfe") == 1:  # no other start byte but the frame's own
-            if not self._starts:
+            if not self.starts:
                 return raw
             authors = self._authors
             if len(authors) == 1 and authors[0][1] is source and len(self._tail) + len(raw) < self._due_at:
@@ -109,8 +110,8 @@ class DeliveredStream:
     def _examine(self, frame: Frame, source: Source, now: float) -> bytes:
         raw = frame.raw
         gap = b""
-        if self._starts and not self._is_only(source) and _is_urgent(frame) and self._may_be_rejected(frame):
-            gap = hidden.separator(self._tail, self._starts)
+        if self.starts and not self._is_only(source) and _is_urgent(frame) and self._may_be_rejected(frame):
+            gap = hidden.separator(self._tail, self.starts)
         while True:
             begun_at = len(self._tail) + len(gap)
             data = self._tail + gap + raw
@@ -120,7 +121,7 @@ class DeliveredStream:
             still_open: list[hidden.Start] = []
             due_at = MAX_FRAME_BYTES + len(data)
             is_hidden_elsewhere = False
-            starts = [] if gap else list(self._starts)  # all of them end within the gap
+            starts = [] if gap else list(self.starts)  # all of them end within the gap
             starts += hidden.starts_in(data, begun_at + 1)
             itself = (begun_at, True) if raw[0] == MAVLINK1 else None
             if itself is not None:
@@ -155,7 +156,7 @@ class DeliveredStream:
                 self.separators += bool(gap)
                 return gap + raw
             # Nothing that began before it goes on behind it: this happens once.
-            gap = hidden.separator(self._tail, self._starts)
+            gap = hidden.separator(self._tail, self.starts)
 
     def _may_be_rejected(self, frame: Frame) -> bool:
         """Whether a receiver of this frame may have rejected one before it, in which a header is open."""
@@ -194,11 +195,11 @@ class DeliveredStream:
     ) -> None:
         """Remember the stream from the first of these starts."""
         if not starts:
-            self._tail, self._starts, self._authors = b"", starts, []
+            self._tail, self.starts, self._authors = b"", starts, []
             return
         first = min(at for at, _ in starts)
         self._tail = data[first:]
-        self._starts = [(at - first, is_mavlink1) for at, is_mavlink1 in starts]
+        self.starts = [(at - first, is_mavlink1) for at, is_mavlink1 in starts]
         self._due_at = due_at - first
         self._authors = [(ends_at - first, source) for ends_at, source in authors if ends_at > first]
 
