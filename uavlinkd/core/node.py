@@ -22,7 +22,7 @@ from uavlinkd.core.outputs import CertificateShown, Deliver, Dropped, Output, Pe
 from uavlinkd.core.path import Path, SocketAddress, SocketFacts
 from uavlinkd.core.peer import Peer, Shared
 from uavlinkd.core.probing import ask_candidates
-from uavlinkd.core.receive import Receiver
+from uavlinkd.core.receive import DatagramReceiver
 from uavlinkd.core.receive_handshake import HandshakeReceiver, ShownInitiation
 from uavlinkd.core.refusals import Refused
 from uavlinkd.core.relay_records import FleetRecord, Record
@@ -37,7 +37,7 @@ PEERS_AT_ONCE = 8
 """Peers that one call of :meth:`Node.handle_timeout` handles: datagrams wait meanwhile."""
 
 
-class Node(Receiver):
+class Node(DatagramReceiver):
     """All peers of one identity.
 
     Without ``screen`` all frames must be new. ``takes_certificates``: the shell decides on :class:`CertificateShown`.

@@ -50,7 +50,7 @@ class Arrived(NamedTuple):
     """Whether the peer has been sending on newer keys for a while."""
 
 
-class Receiver:
+class DatagramReceiver:
     """What a node does about one datagram. :class:`uavlinkd.core.node.Node` has the peers, and sets these."""
 
     facts: SocketFacts

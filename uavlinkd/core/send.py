@@ -48,8 +48,11 @@ def send_frames(peer: Peer, frames: Sequence[bytes], now: float, cls: Class) -> 
     else:
         payloads, too_large = _payloads(frames, limit, session.payload_limit)
     if now >= asks_at and payloads:
-        payloads[-1] = _ask_too(peer, session, route[0], payloads[-1], limit, now)
-    out = send_payloads(peer, session, payloads, route, now)
+        out = send_payloads(peer, session, payloads[:-1], route, now)  # the question counts them
+        payloads = [_ask_too(peer, session, route[0], payloads[-1], limit, now)]
+        out += send_payloads(peer, session, payloads, route, now)
+    else:
+        out = send_payloads(peer, session, payloads, route, now)
     if too_large:
         out += peer.drop(DropReason.TOO_LARGE, too_large)
     if keeps:

@@ -35,7 +35,6 @@ RULES: Final[dict[str, dict[str, Any]]] = {
 }
 SIDES: Final = ("sending", "receiving")
 WARM_UP: Final = 60
-QUIET_S: Final = 1.0
 
 
 class Loop(asyncio.SelectorEventLoop):
@@ -161,12 +160,7 @@ class Pair:
         self._counting.toggle()
         callback()
         self._counting.toggle()
-
-    async def rest(self, seconds: float) -> None:
-        """Count what both daemons do without frames."""
-        self._counting.toggle()
-        await asyncio.sleep(seconds)
-        self._counting.toggle()
+        self._counting.dump("frame")
 
 
 def port_of(fd: int) -> int:
@@ -179,7 +173,7 @@ def port_of(fd: int) -> int:
 
 
 async def run(loop: Loop, counting: Counting, frames: int, paths: int) -> dict[str, int]:
-    """Count each side, and then the housekeeping of both."""
+    """Count each side."""
     pair = Pair(loop, counting)
     await pair.start(paths)
     await asyncio.sleep(0.2)
@@ -189,9 +183,6 @@ async def run(loop: Loop, counting: Counting, frames: int, paths: int) -> dict[s
     arrived = {}
     for side in SIDES:
         arrived[side] = await pair.carry(frames, side)
-        counting.dump(side)
-    await pair.rest(QUIET_S)
-    counting.dump("quiet")
     return arrived
 
 
