@@ -224,7 +224,7 @@ TRAFFIC_PLANS: Final = plan_rows(
     """
 drop, half | drop,share=0.5 | least_s=0.3 targeted takes_away
 drop, one way | drop,direction=drone0>drone1 | is_variant
-drop-heartbeats |  | takes_away needs=envelopes_missing
+drop-heartbeats |  | paper=drop-heartbeats,size=58 takes_away needs=envelopes_missing
 stretch | stretch,direction=drone0>drone1,interval_s=0.4 | least_s=5 takes_away
 stretch-one-way | stretch-one-way,direction=drone0>drone1,interval_s=0.4 | paper=none least_s=5 takes_away
 blackout, 1 s | blackout,seconds=60 | takes_away needs=envelopes_missing
@@ -236,7 +236,7 @@ blackout, kept and let go | hold,kinds=any,hold_s=10,seconds=10 | least_s=10 aft
     least_s=1.0,
 )
 """Between three drones, with a rekey per second. In ``stretch`` the delay grows with each envelope; one way, the echo
-records of the other direction are dropped."""
+records of the other direction are dropped. The paper's tag of 32 bytes makes its heartbeats 58 bytes long."""
 
 LAST_PLANS: Final = plan_rows(
     DATA,
