@@ -155,19 +155,30 @@ def test_silence_saves_up_no_more_than_a_burst() -> None:
     assert sum(meter.take(10, 3600.0) for _ in range(1000)) == pytest.approx(1000 * BURST_S, abs=1)
 
 
+def test_log_download_survives_a_pause() -> None:
+    """A process that did not run for a quarter of a second sends, or receives, at once what a download brought."""
+    relay = Relay(DEFAULT)
+    per_s, paused_s = 1_700, 0.25
+    at = [number / per_s for number in range(2 * per_s)]
+    for now in at:
+        relay.arrive(wrap(A.handle, DATAGRAM), now=max(now, 1.0 + paused_s) if now > 1.0 else now)
+    assert len(relay.sent) == len(at)
+
+
 def test_limit_of_all_members_together() -> None:
     """A datagram that exceeds it is counted for no member. Beside it the limits of a member hold again later."""
     relay = Relay(total=RelayLimits(1000, 10**9))
-    for _ in range(40):
+    for _ in range(400):
         relay.arrive(wrap(A.handle, DATAGRAM))
         relay.arrive(wrap(B.handle, DATAGRAM), path=AT_B)
     assert len(relay.sent) == pytest.approx(1000 * BURST_S, abs=1)
-    assert all(24 <= meter.datagrams <= 26 for meter in relay.meters)
+    half = len(relay.sent) / 2
+    assert all(abs(meter.datagrams - half) <= 1 for meter in relay.meters)
     assert [meter.over_limit for meter in relay.meters] == [0, 0]
-    assert relay.forwarding.dropped == {RelayReason.OVER_TOTAL: 80 - len(relay.sent)}
+    assert relay.forwarding.dropped == {RelayReason.OVER_TOTAL: 800 - len(relay.sent)}
     relay.forwarding.total.set_limits(AMPLE)
-    relay.arrive(*[wrap(A.handle, DATAGRAM)] * 200, now=1.0)
-    assert relay.meters[0].datagrams - 25 == pytest.approx(DEFAULT.datagrams_s * BURST_S, abs=2)
+    relay.arrive(*[wrap(A.handle, DATAGRAM)] * 1000, now=1.0)
+    assert relay.meters[0].datagrams - half == pytest.approx(DEFAULT.datagrams_s * BURST_S, abs=2)
 
 
 def test_member_above_its_limit_uses_up_nothing_of_the_others() -> None:
@@ -176,7 +187,7 @@ def test_member_above_its_limit_uses_up_nothing_of_the_others() -> None:
     relay = Relay(limits, total=RelayLimits(1000, 10**9))
     relay.arrive(*[wrap(A.handle, DATAGRAM)] * 1000)
     relay.arrive(*[wrap(B.handle, DATAGRAM)] * 1000, path=AT_B)
-    assert [meter.datagrams for meter in relay.meters] == [limits.datagrams_s * BURST_S] * 2
+    assert [meter.datagrams for meter in relay.meters] == pytest.approx([limits.datagrams_s * BURST_S] * 2, abs=1)
     assert RelayReason.OVER_TOTAL not in relay.forwarding.dropped
 
 
@@ -185,4 +196,4 @@ def test_limits_can_change() -> None:
     meter = Meter(RelayLimits(1000, 1_000_000_000))
     meter.take(10, 0.0)
     meter.set_limits(RelayLimits(100_000, 1_000_000_000))
-    assert sum(meter.take(10, 1.0) for _ in range(10_000)) == pytest.approx(100_000 * BURST_S, abs=1)
+    assert sum(meter.take(10, 1.0) for _ in range(100_000)) == pytest.approx(100_000 * BURST_S, abs=1)

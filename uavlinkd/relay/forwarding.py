@@ -16,8 +16,11 @@ from uavlinkd.core.relay_records import INNER_STARTS, RELAYED
 from uavlinkd.core.settings import PeerSettings
 from uavlinkd.relay.bindings import ConnectionEnd, MemberConnection
 
-BURST_S = 0.05  # A member may send what its limits allow in this time at once. The relay has no queue.
-BURST_BYTES = 1500  # and at least one datagram of this length
+BURST_S = 0.3
+"""A member may send what its limits allow in this time at once. The relay has no queue. A log download goes on after
+such a pause of the relay, or of the member: what it sent meanwhile comes at once."""
+BURST_BYTES = 1500
+"""A member may send at least one datagram of this length at once."""
 _START = bytes((RELAYED,))
 _HEADER_BYTES = 3
 
