@@ -109,10 +109,8 @@ async def _judged(world: World, pilot: Pilot, began: float) -> Figures:
     end = monotonic()
     await asyncio.sleep(2 * SETTLED_S)
     down, up = ways(world)
-    whole, critical = Comparison(), Comparison()
-    for way in (down, up):
-        whole.add(compare_by(number_of, way.sent, way.received, began, end))
-        critical.add(compare(way.only(Class.CRITICAL).sent, way.only(Class.CRITICAL).received, began, end))
+    # In a thread: it takes seconds, in which a station without heartbeats would cause the failsafe itself.
+    whole, critical = await asyncio.to_thread(_compared, (down, up), began, end)
     flown = [mode for at, mode in modes(world.vehicles[0]) if at > began]
     return {
         "sent": whole.sent,
@@ -129,12 +127,21 @@ async def _judged(world: World, pilot: Pilot, began: float) -> Figures:
     }
 
 
+def _compared(both: tuple[Way, Way], began: float, end: float) -> tuple[Comparison, Comparison]:
+    """All frames, and the critical ones, in both directions."""
+    whole, critical = Comparison(), Comparison()
+    for way in both:
+        whole.add(compare_by(number_of, way.sent, way.received, began, end))
+        critical.add(compare(way.only(Class.CRITICAL).sent, way.only(Class.CRITICAL).received, began, end))
+    return whole, critical
+
+
 def ways(world: World) -> tuple[Way, Way]:
-    """Down from the vehicle, and up to it."""
+    """Down from the vehicle, and up to it, until now."""
     (vehicle,), station = world.vehicles, world.station
     return (
-        Way(vehicle.tap.from_autopilot, [p for p in station.received if sender_of(p.frame) == vehicle.system]),
-        Way(station.sent, [p for p in vehicle.tap.to_autopilot if sender_of(p.frame) == station.system]),
+        Way([*vehicle.tap.from_autopilot], [p for p in station.received if sender_of(p.frame) == vehicle.system]),
+        Way([*station.sent], [p for p in vehicle.tap.to_autopilot if sender_of(p.frame) == station.system]),
     )
 
 
