@@ -17,7 +17,7 @@ from tests.traces import END_S, no_trace, open_once
 from uavlinkd.system import core_dumps
 
 WORKERS_PER_CORE = 2
-"""Most long tests wait for daemons, clients and containers."""
+"""Most long tests wait for daemons, clients and containers. The others use the processor: one worker for each core."""
 SLOWEST = (
     "mitm",
     "packages",
@@ -33,8 +33,10 @@ SLOWEST = (
 """Folders, the slowest tests first."""
 ALONE = ("pressure", "faults", "daemon", "link")
 """Folders whose tests measure delays, losses and processor time of real daemons: marked ``alone``."""
-LONG = ("natlab", "faults", "modem", "compose", "daemon")
-"""Folders of machines and of real daemons. Marked ``long``, except tests with the marker ``short``."""
+LONG_ALL = ("natlab", "faults", "modem", "compose", "bench", "pressure", "walkthroughs", "wireshark")
+"""Folders of machines, routers, modems, containers, other software: all is ``long``, and imported only if selected."""
+LONG = (*LONG_ALL, "daemon")
+"""Folders whose tests are marked ``long``, except those with the marker ``short``."""
 
 EXAMPLES = int(os.environ.get("UAVLINKD_EXAMPLES", "25"))
 """How many examples each property is tried with. `.ci/run` has more for the core."""
@@ -58,7 +60,17 @@ def pytest_configure() -> None:
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     """Run a whole suite in parallel. A run of chosen tests needs no workers, whose start takes seconds."""
     is_whole = config.args_source is config.ArgsSource.TESTPATHS
-    return WORKERS_PER_CORE * (os.cpu_count() or 1) if is_whole else 0
+    per_core = 1 if _leaves_out_long(config) else WORKERS_PER_CORE
+    return per_core * (os.cpu_count() or 1) if is_whole else 0
+
+
+def _leaves_out_long(config: pytest.Config) -> bool:
+    return str(config.getoption("markexpr")).startswith("not long")
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Import no module of which no test would run."""
+    return True if collection_path.name in LONG_ALL and _leaves_out_long(config) else None
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -15,10 +15,20 @@ PACKAGE = Path(uavlinkd.__file__).parent
 
 def sources(*folders: str) -> Iterator[tuple[str, str]]:
     """The path below the package and the text of every source file; of these folders only, if any are given."""
-    for path in sorted(PACKAGE.rglob("*.py")):
-        name = path.relative_to(PACKAGE).as_posix()
+    for name, text in _all_sources().items():
         if not folders or name.startswith(folders):
-            yield name, path.read_text()
+            yield name, text
+
+
+@cache
+def _all_sources() -> Mapping[str, str]:
+    return {path.relative_to(PACKAGE).as_posix(): path.read_text() for path in sorted(PACKAGE.rglob("*.py"))}
+
+
+@cache
+def parsed(source: str) -> ast.Module:
+    """The syntax tree of a source file, made once."""
+    return ast.parse(source)
 
 
 def imports(name: str, source: str) -> set[str]:
@@ -72,15 +82,18 @@ def _module(name: str) -> str:
     return f"uavlinkd/{name}".removesuffix(".py").removesuffix("/__init__").replace("/", ".")
 
 
-def _statements(name: str, source: str) -> Iterator[tuple[str, str]]:
+@cache
+def _statements(name: str, source: str) -> tuple[tuple[str, str], ...]:
     """Each import: ``from a import b`` is ("a", "b"), ``import a`` is ("a", ""). A call counts as ``importlib``."""
     package = ["uavlinkd", *name.split("/")[:-1]]
-    for node in ast.walk(ast.parse(source)):
+    found = list[tuple[str, str]]()
+    for node in ast.walk(parsed(source)):
         if isinstance(node, ast.Import):
-            yield from ((alias.name, "") for alias in node.names)
+            found += ((alias.name, "") for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             above = package[: len(package) - node.level + 1] if node.level else []
             base = ".".join([*above, *([node.module] if node.module else [])])
-            yield from ((base, alias.name) for alias in node.names)
+            found += ((base, alias.name) for alias in node.names)
         elif isinstance(node, ast.Call) and ast.unparse(node.func) in ("__import__", "importlib.import_module"):
-            yield "importlib", ""
+            found.append(("importlib", ""))
+    return tuple(found)

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import pytest
 
-from tests.imports import circle, graph, imports, is_inside, roots, sources
+from tests.imports import circle, graph, imports, is_inside, parsed, roots, sources
 
 ORDER = (
     *("system", "core", "authority", "mavlink", "endpoints", "relay", "config", "ops", "fleet", "web", "lab"),
@@ -136,7 +136,7 @@ def test_packages_do_not_share_class_names() -> None:
     """A public class can be found by its name alone."""
     packages = defaultdict[str, set[str]](set)
     for name, source in sources():
-        for node in ast.parse(source).body:
+        for node in parsed(source).body:
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                 packages[node.name].add(name.rpartition("/")[0])
     assert {name: places for name, places in packages.items() if len(places) > 1} == {}
@@ -151,7 +151,7 @@ def test_core_is_sans_io() -> None:
 def test_core_has_no_other_access_to_its_environment() -> None:
     """The core opens no files, and does not import at run time what it may not import."""
     for name, source in sources("core/"):
-        called = {ast.unparse(node.func) for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call)}
+        called = {ast.unparse(node.func) for node in ast.walk(parsed(source)) if isinstance(node, ast.Call)}
         assert not called & {"open", "print", "input", "eval", "exec", "__import__", "globals"}, name
 
 

@@ -69,6 +69,7 @@ def test_ci_runs_all_tests_without_retries() -> None:
 
 
 @pytest.mark.parametrize(("selection", "count"), [((), 1), (("-m", ""), 2)])
+@pytest.mark.long
 def test_long_tests_run_only_when_selected(tmp_path: Path, selection: tuple[str, ...], count: int) -> None:
     """With the settings of this checkout."""
     file = tmp_path / "test_it.py"

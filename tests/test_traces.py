@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from tests.test_skips import ROOT, environment
 
 DEEDS = {
@@ -57,6 +59,7 @@ os._exit(0)
 """
 
 
+@pytest.mark.long
 def test_all_that_is_left_is_named() -> None:
     """One thing after the other, in a process that has no other work."""
     script = subprocess.run(
@@ -90,6 +93,7 @@ def test_clean_again(monkeypatch): monkeypatch.setenv("SOME", "thing")
 """
 
 
+@pytest.mark.long
 def test_test_that_leaves_something_fails(tmp_path: Path) -> None:
     """It alone. What a fixture of a module leaves is an error of the module's last test."""
     (tmp_path / "test_it.py").write_text(TESTS)

@@ -27,8 +27,6 @@ from tests.bench.traffic import REPOSITORY, Flow, Traffic
 from tests.namespaces import need_namespaces
 from uavlinkd.lab.child_processes import end_with_parent
 
-pytestmark = pytest.mark.long
-
 PLAIN_HEADERS = 28
 """Headers of IPv4 and UDP."""
 CONTENDERS = {contender.name: contender for contender in all_contenders()}

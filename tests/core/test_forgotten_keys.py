@@ -40,6 +40,7 @@ class Census:
 
 
 @pytest.mark.parametrize("confidential", [False, True])
+@pytest.mark.long
 def test_rekeying_leaves_no_more_sessions_than_may_be_used(confidential: bool) -> None:
     """Of many sessions those remain that may still receive; when they are too old, the current one alone."""
     census = Census()

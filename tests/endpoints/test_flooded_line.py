@@ -15,7 +15,7 @@ import pytest
 from serialx import BaseSerial
 
 from tests.endpoints.clients import Recorder, source
-from tests.samples import ID, attitude, build, command, file_part, heartbeat, log_data, position, read
+from tests.samples import ID, attitude, build, command, file_part, heartbeat, position, read
 from uavlinkd.endpoints import serial, stream_endpoint
 from uavlinkd.endpoints.serial import SerialChannel, SerialEndpoint
 from uavlinkd.endpoints.url import SerialUrl
@@ -133,15 +133,13 @@ FLOODS: dict[str, tuple[Sequence[Make], float]] = {
 separator bytes close what a hostile one has opened."""
 HONEST: dict[str, tuple[Honest, float]] = {
     "command": ((0.23, [command]), 0.0),
-    "log": ((0.13, [log_data]), 0.0),
-    "position": ((0.11, [lambda n: position(n, 255)]), 0.0),
     "burst of commands": ((0.51, [command] * 4), 0.05),
 }
 """What the honest peer sends, and how much longer it may take: each peer has an equal share during a burst."""
 
 
 @pytest.mark.parametrize("flood", FLOODS)
-@pytest.mark.parametrize("honest", HONEST)
+@pytest.mark.parametrize("honest", ["command", pytest.param("burst of commands", marks=pytest.mark.long)])
 def test_flood_delays_another_peer_by_a_frame(monkeypatch: pytest.MonkeyPatch, honest: str, flood: str) -> None:
     """Whatever a captured peer sends, urgent or not, of however many components: the others have their share."""
     (frames, more_s), (floods, most_s) = HONEST[honest], FLOODS[flood]

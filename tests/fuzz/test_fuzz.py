@@ -15,7 +15,7 @@ from tests.fuzz.registry import TARGETS
 from tests.needs import need
 from tests.waiting import PATIENCE_S
 
-SHORT_S = 0.3
+SHORT_S = 0.1
 SLOW = ("candidates", "relay")
 """Targets whose kept corpus takes seconds."""
 MAX_CORPUS_BYTES = 400_000
@@ -30,7 +30,7 @@ def test_short_hunt_finds_no_escape(name: str) -> None:
     target, kept = TARGETS[name], corpus.load(name)
     assert kept, "a target without a corpus"
     for result in (
-        hunt(target, kept=kept, runs=len(kept) + 20),
+        hunt(target, kept=kept, runs=len(kept) + 5),
         hunt(target, kept=kept[-8:], seed=2, seconds=SHORT_S),
     ):
         assert result.escape is None, f"{result.script!r}: {result.escape!r}"

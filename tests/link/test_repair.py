@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import cast
 
+import pytest
+
 from tests.samples import command
 from uavlinkd.core.outputs import Transmit
 from uavlinkd.core.path import Path
@@ -187,6 +189,7 @@ def test_nothing_is_repeated_along_a_path_that_is_gone() -> None:
     assert not scene.copies.waiting
 
 
+@pytest.mark.long
 def test_rate_of_repeats_is_limited_on_average() -> None:
     """And at most so many envelopes wait: the least important one is dropped."""
     scene = Scene()

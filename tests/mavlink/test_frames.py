@@ -128,15 +128,15 @@ def test_datagram_of_false_starts_is_given_up() -> None:
 
 
 @splitters
-@pytest.mark.parametrize("flags", range(2, 256))
-def test_unknown_incompatible_flags_are_refused(flags: int, split: Split) -> None:
+def test_unknown_incompatible_flags_are_refused(split: Split) -> None:
     """A MAVLink 2 receiver must refuse flags that it does not know; even the frame's length is then unknown."""
     genuine = build(0, b"\1\2")
-    covered = genuine[1:2] + bytes([flags]) + genuine[3:-2]
-    raw = b"\xfd" + covered + mcrf4xx(covered + bytes([50])).to_bytes(2, "little")
-    counters = SplitCounters()
-    assert split(raw, counters) == []
-    assert counters.faults == {FrameFault.UNKNOWN_FLAGS: 1}
+    for flags in range(2, 256):
+        covered = genuine[1:2] + bytes([flags]) + genuine[3:-2]
+        raw = b"\xfd" + covered + mcrf4xx(covered + bytes([50])).to_bytes(2, "little")
+        counters = SplitCounters()
+        assert split(raw, counters) == [], flags
+        assert counters.faults == {FrameFault.UNKNOWN_FLAGS: 1}, flags
 
 
 @splitters

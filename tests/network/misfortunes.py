@@ -15,7 +15,6 @@ from uavlinkd.core import constants as c
 from uavlinkd.core.relay_records import RELAYED
 
 _FORGED = 50
-_STRANGER = ("198.51.100.66", 4000)
 
 
 class RelayMisfortunes(Befalling):

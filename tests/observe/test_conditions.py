@@ -91,6 +91,7 @@ def test_condition_that_comes_and_goes_settles(interval_s: int) -> None:
     assert ended == len(range(0, 24 * int(HOUR_S), interval_s)), "the last lines have every count"
 
 
+@pytest.mark.long
 def test_attacker_who_changes_its_attack_all_day_causes_a_bounded_number_of_lines() -> None:
     """Thousands of kinds of drops of one peer: its limit holds, and no line is lost without a count."""
     written = Written()
@@ -103,6 +104,7 @@ def test_attacker_who_changes_its_attack_all_day_causes_a_bounded_number_of_line
     assert begun + sum(line[4] for line in written.lines) >= 495
 
 
+@pytest.mark.long
 def test_all_peers_together_are_limited() -> None:
     """A hundred peers that all attack do not exceed the total limit."""
     written = Written()

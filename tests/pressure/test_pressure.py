@@ -11,8 +11,6 @@ from tests.kernel_queues import capacity
 from tests.pressure.scene import FAIR_SHARE, PLANS, watch
 from tests.waiting import Stopwatch
 
-pytestmark = pytest.mark.long
-
 SECONDS = 2.0
 AT_MOST_PER_S = 2_500.0
 FULL_PER_S = 20_000.0

@@ -57,6 +57,7 @@ def sealed(relay: FuzzedRelay, number: int, record: Record) -> bytes:
 # Candidates.
 
 
+@pytest.mark.long
 def test_captured_member_of_a_fleet_of_50_causes_at_most_the_buckets_at_a_victim() -> None:
     """It names other ports of one victim ten times a second to each of its 49 peers, which ask at most 80, then one a
     second. The total of section 22: 3,920 questions of some 45 bytes at once, then 49 a second.

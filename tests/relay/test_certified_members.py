@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from tests.relay.certified import LINK, CertifiedRelay
 from uavlinkd.authority.constants import (
     CERTIFICATES,
@@ -217,6 +219,7 @@ def test_seekers_that_share_a_victim_share_its_budget() -> None:
     assert operator.learnt == [vehicle.key, other.key]
 
 
+@pytest.mark.long
 def test_introductions_to_one_member_have_a_limit() -> None:
     """Those above it follow with renewed binds. Introductions to others have budgets of their own."""
     relay = CertifiedRelay()

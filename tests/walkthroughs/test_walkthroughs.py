@@ -49,8 +49,6 @@ def _blocks(text: str) -> Iterator[Block]:
         yield Block(host, file, body)
 
 
-pytestmark = pytest.mark.long
-
 SECTIONS = sections()
 CARRIER_NAT = """
 table ip carrier {

@@ -127,6 +127,7 @@ def test_wrong_options_are_refused_with_a_remedy(
 
 
 @pytest.mark.parametrize("missing", ["starlette", "uvicorn"])
+@pytest.mark.long
 def test_a_missing_extra_is_named(missing: str) -> None:
     """With the command that installs it. Help needs none of it."""
     for options, status in (((), FAILED), (("--help",), OK)):
@@ -150,6 +151,7 @@ def test_an_address_in_use_is_an_error(here: Path, capsys: pytest.CaptureFixture
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.long
 async def test_the_process_says_where_it_is_and_nothing_more(
     here: Path, capsys: pytest.CaptureFixture[str], number: signal.Signals
 ) -> None:

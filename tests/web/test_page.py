@@ -23,6 +23,7 @@ HOSTILE: Final = (
 )
 
 
+@pytest.mark.long
 async def test_a_daemon_that_ends_is_lost_and_comes_back(browser: Browser) -> None:
     """The page keeps no good news, says why, and needs no reload."""
     async with linked_pair(browser) as (stage, ground, page, state):
@@ -36,6 +37,7 @@ async def test_a_daemon_that_ends_is_lost_and_comes_back(browser: Browser) -> No
         await expect(headline(page)).to_have_text("1 of 1 peers up")
 
 
+@pytest.mark.long
 async def test_text_that_an_attacker_chose_is_text(browser: Browser) -> None:
     """Names, addresses, problems and reports are shown as they are, run nothing and load nothing."""
     daemon = await make_up(1)

@@ -181,6 +181,7 @@ async def test_ended_connections_by_tls_do_not_fill_the_memory(
 # Too many connections.
 
 
+@pytest.mark.long
 async def test_a_thousand_connections_of_a_stranger_take_no_place(page: Served) -> None:
     """A browser goes on, and another one can begin: also while they come, and while all of them last."""
     async with page.events() as watching:
@@ -251,6 +252,7 @@ sys.stdin.read()
 """
 
 
+@pytest.mark.long
 async def test_streams_of_one_local_user_leave_places_for_the_owner(page: Served, real_sources: None) -> None:
     """200 streams of events of `nobody`, who may look too: the owner's page goes on, and another one begins."""
     need(not os.geteuid(), "root, to run a process as another user")

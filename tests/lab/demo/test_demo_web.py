@@ -112,6 +112,7 @@ async def test_a_started_attack_is_refused_and_counted(folder: Path) -> None:
         assert list(folder.iterdir()) == []
 
 
+@pytest.mark.long
 async def test_another_site_cannot_attack(folder: Path) -> None:
     """Nor a request without an origin, nor one by a name that was made to resolve to this address."""
     async with page(folder=folder) as (_, url):
@@ -143,6 +144,7 @@ async def test_the_demo_ends_after_its_seconds(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("has_display", [True, False])
+@pytest.mark.long
 async def test_a_browser_opens_where_it_can(folder: Path, monkeypatch: pytest.MonkeyPatch, has_display: bool) -> None:
     """The browser, here a script, gets the address. Without a display, none starts."""
     with tempfile.TemporaryDirectory() as place:

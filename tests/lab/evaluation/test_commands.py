@@ -34,6 +34,7 @@ def test_failure_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert len(capsys.readouterr().err.splitlines()) == 1
 
 
+@pytest.mark.long
 def test_the_parsers_and_the_measurements_import_nothing_of_the_figures() -> None:
     """The parsers import no large modules; the measurements run without matplotlib."""
     script = (

@@ -60,9 +60,13 @@ def test_every_attack_on_the_line_is_tried_also_in_a_quick_run() -> None:
 ON_RELAY = [plan for plan in RELAYED_PLANS if not set(plan.names) & set(RELAY_ATTACKS)]
 
 
-@pytest.mark.parametrize("plan", [*ALL_PLANS, *ON_RELAY], ids=lambda plan: plan.attack)
-def test_plans_can_be_made(plan: TrialPlan) -> None:
+def test_plans_can_be_made() -> None:
     """The man in the middle accepts each line, and it fits into a request."""
+    for plan in (*ALL_PLANS, *ON_RELAY):
+        _check_plan(plan)
+
+
+def _check_plan(plan: TrialPlan) -> None:
     around = AttackContext.between(
         "drone0", "drone1", "drone2", public_keys=dict.fromkeys(("drone0", "drone1", "drone2"), bytes(32)), paths=2
     )

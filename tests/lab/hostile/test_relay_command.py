@@ -109,6 +109,7 @@ async def _running(relay: DaemonProcess, *arguments: str) -> AsyncIterator[Path]
     assert not [form for form in secret_forms(relay.private_key) if form in errors.decode()]
 
 
+@pytest.mark.long
 async def test_process_between_two_daemons(capsys: pytest.CaptureFixture[str]) -> None:
     """Without an attack frames pass. With attacks nothing false is accepted, and each attack is counted."""
     async with Stage() as stage:

@@ -200,6 +200,7 @@ def test_receiver_that_follows_every_address_loses_its_traffic(monkeypatch: pyte
     assert stage.flows[0].lost(1.5, 2.5) or stage.flows[1].lost(1.5, 2.5)
 
 
+@pytest.mark.long
 def test_receiver_with_long_cookie_replies_is_found_by_the_probe(monkeypatch: pytest.MonkeyPatch) -> None:
     """A stranger received more bytes than it sent."""
     monkeypatch.setattr(CookieJar, "reply", lambda *_: b"\x03" + bytes(2000))

@@ -198,6 +198,7 @@ def test_lanes_are_bounded_and_drop_the_oldest() -> None:
     assert link.egress.totals == {EgressDrop.OVERFLOW: 500 - kept + 480 - egress.queued_frames}
 
 
+@pytest.mark.long
 def test_memory_is_bounded_under_a_flood_of_replaceable_frames() -> None:
     """What was replaced leaves nothing behind, and flows that are empty are forgotten."""
     link = Link(SLOW)

@@ -184,6 +184,7 @@ def test_flood_drops_its_own_oldest_frames() -> None:
     assert dropped == {EgressDrop.OVERFLOW: 5000 - len(left)}
 
 
+@pytest.mark.long
 def test_queue_is_bounded_over_all_sources() -> None:
     """Many sources that flood together are bounded too, and the one that asks for little loses nothing."""
     queue, _ = make()

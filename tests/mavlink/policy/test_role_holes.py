@@ -68,6 +68,7 @@ def test_what_may_go_out_may_be_requested() -> None:
 
 
 @pytest.mark.parametrize("name", ["PARAM_REQUEST_LIST", "PARAM_EXT_REQUEST_LIST"])
+@pytest.mark.long
 def test_observer_requests_few_lists_of_parameters(name: str) -> None:
     """ArduPilot slows its telemetry to a quarter while it sends one. Two at once pass, then one in 20 s."""
     gate = Policy(OBSERVER).incoming
