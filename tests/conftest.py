@@ -17,7 +17,7 @@ from tests.traces import END_S, no_trace, open_once
 from uavlinkd.system import core_dumps
 
 WORKERS_PER_CORE = 2
-"""Most long tests wait for daemons, clients and containers. The others use the processor: one worker for each core."""
+"""Most long tests wait for daemons, clients and containers. The others compute: one worker for each core."""
 SLOWEST = (
     "mitm",
     "packages",
@@ -34,7 +34,7 @@ SLOWEST = (
 ALONE = ("pressure", "faults", "daemon", "link")
 """Folders whose tests measure delays, losses and processor time of real daemons: marked ``alone``."""
 LONG_ALL = ("natlab", "faults", "modem", "compose", "bench", "pressure", "walkthroughs", "wireshark")
-"""Folders of machines, routers, modems, containers, other software: all is ``long``, and imported only if selected."""
+"""Folders of machines, routers, containers, other software: all is ``long``, and imported only if selected."""
 LONG = (*LONG_ALL, "daemon")
 """Folders whose tests are marked ``long``, except those with the marker ``short``."""
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections import defaultdict
 from collections.abc import Callable
 
 import pytest
 
-from tests.imports import circle, graph, imports, is_inside, parsed, roots, sources
+from tests.imports import PACKAGE, circle, graph, imports, is_inside, parsed, roots, sources
 
 ORDER = (
     *("system", "core", "authority", "mavlink", "endpoints", "relay", "config", "ops", "fleet", "web", "lab"),
@@ -35,6 +36,7 @@ CORE_WITHOUT_KEYS = {
     )
 }
 """The modules of the core that contain no key and cannot use one."""
+OF_NAMED_TUPLES = {"_replace", "_asdict", "_fields", "_make"}
 HOLDERS_OF_KEYS = ("uavlinkd.lab.hostile", "uavlinkd.lab.evaluation", "uavlinkd.relay", "uavlinkd.config")
 """The packages that the man in the middle may not use, because they read or use keys."""
 LAB_OF_THE_RELAY = ("uavlinkd.lab.mitm", "uavlinkd.lab.hostile")
@@ -216,3 +218,27 @@ def test_modules_open_to_the_attacker_hold_no_key() -> None:
             todo += graph()[module]
     assert reached >= CORE_WITHOUT_KEYS
     assert "uavlinkd.core.crypto" not in reached
+
+
+HEART = ("core", "mavlink", "endpoints", "link", "system")
+"""The rooms whose private attributes only their own tests name: others ask ``tests/ROOM/inside.py``."""
+
+
+def _private_names(source: str) -> set[str]:
+    """The private functions and attributes that a source file defines."""
+    return {name for names in re.findall(r"\bdef (_[a-z]\w*)|\b(?:self|cls)\.(_[a-z]\w*)", source) for name in names}
+
+
+def test_private_attributes_of_the_heart_stay_in_their_room() -> None:
+    """A redesign of a room breaks its own tests and one file, and no test of another room."""
+    rooms = defaultdict[str, set[str]](set)
+    for name, source in sources():
+        for private in _private_names(source):
+            rooms[private].add(name.split("/")[0])
+    of_heart = {name: its for name, its in rooms.items() if its <= {*HEART}}
+    tests = PACKAGE.parent / "tests"
+    for path in sorted(tests.rglob("*.py")):
+        source, room = re.sub(r'"[^"\n]*"', "", path.read_text()), path.relative_to(tests).parts[0]
+        named = {*re.findall(r"(?<!\bself)(?<!\bcls)\.(_[a-z]\w*)", source)} - OF_NAMED_TUPLES
+        foreign = {name for name in named - _private_names(source) if room not in of_heart.get(name, {room})}
+        assert not foreign, f"{path.relative_to(tests)}: {foreign}"

@@ -237,6 +237,6 @@ def test_one_honest_path_delivers_every_critical_frame_in_time(batch: range) -> 
 @pytest.mark.long
 @pytest.mark.parametrize("fault", LIVENESS_FAULTS)
 def test_a_planted_fault_is_found(monkeypatch: pytest.MonkeyPatch, fault: str) -> None:
-    """Within some hundred histories, the rarest one within some thousand."""
+    """Within some hundred histories."""
     monkeypatch.setattr(*LIVENESS_FAULTS[fault])
-    assert any(play(seed).violations for seed in range(6000))
+    assert any(play(seed).violations for seed in range(1000))

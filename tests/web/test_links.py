@@ -7,23 +7,18 @@ import os
 import signal
 import subprocess
 import sys
-from contextlib import AsyncExitStack
 
 import pytest
 from playwright.async_api import Browser, Locator, expect
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from tests.daemon.fleet import drone_and_ground, relay_for
-from tests.daemon.frames import command_long, heartbeat
+from tests.daemon.fleet import relay_for
 from tests.daemon.harness import Stage
 from tests.daemon.process import DaemonProcess
 from tests.daemon.relay import End, Relay
 from tests.daemon.udp import shown
 from tests.waiting import Stopwatch
 from tests.web.browser import card_of, headline, linked_pair, until_lost, window
-from tests.web.served import page_of, served
-from uavlinkd.lab.sim.loopback_ports import free_port
-from uavlinkd.mavlink.policy.gate import Refusal
+from tests.web.served import served
 from uavlinkd.ops.status_words import problems
 
 pytestmark = [pytest.mark.asyncio(loop_scope="module"), pytest.mark.long]
@@ -103,33 +98,6 @@ async def terminal(daemon: DaemonProcess) -> str:
     return " ".join(output.decode().split())
 
 
-async def test_refused_frames_have_their_message_reason_and_count(browser: Browser) -> None:
-    """Both ends: the drone that refuses, and the ground station that it reports this to."""
-    async with Stage() as stage:
-        drone, ground = drone_and_ground(stage)
-        pilot, autopilot = await stage.client(), await stage.client()
-        into, into_drone = ground.add_endpoint("pilot"), drone.add_endpoint("autopilot")
-        await stage.start(drone, ground)
-        autopilot.send(heartbeat(1), into_drone)
-        for number in range(3):
-            pilot.send(command_long(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, system=9, seq=number), into)
-        refused = {"COMMAND_LONG": {"foreign_system": 3}}
-        await drone.until(lambda status: status["peers"]["ground"]["refused"]["in"] == refused)
-        async with served(drone.folder / "control.sock") as web, window(browser, web.url) as page:
-            card = card_of(page, "ground")
-            await card.get_by_text("refused by this daemon's policy").click()
-            why = Refusal.FOREIGN_SYSTEM.phrase
-            rows = [f"in{message}{why}3" for message in ("COMMAND_LONG", "MAV_CMD_COMPONENT_ARM_DISARM")]
-            await expect(card.locator("tbody").get_by_role("row")).to_have_text(rows)
-            await expect(card.get_by_text(f"dropped: 3 {why}")).to_have_count(1)
-        async with served(ground.folder / "control.sock") as web, window(browser, web.url) as page:
-            await expect(card_of(page, drone.name)).to_contain_text("reported by this peer; a captured one can lie")
-            report = card_of(page, drone.name).get_by_role("listitem")
-            await expect(report).to_have_text(
-                "it refused COMMAND_LONG MAV_CMD_COMPONENT_ARM_DISARM 3 times: foreign system"
-            )
-
-
 async def test_a_daemon_that_hangs_is_lost_within_three_seconds(browser: Browser) -> None:
     """It holds its socket open, and does not answer."""
     async with linked_pair(browser) as (_, ground, page, state):
@@ -142,34 +110,6 @@ async def test_a_daemon_that_hangs_is_lost_within_three_seconds(browser: Browser
         finally:
             await ground.send_signal(signal.SIGCONT)
         await expect(state).to_have_text("up")
-
-
-async def test_a_page_whose_server_ends_is_lost_and_comes_back(browser: Browser) -> None:
-    """By the browser's own clock. The next server may be on a machine that rebooted: its clock began again."""
-    async with Stage() as stage:
-        drone, ground = stage.pair()
-        await stage.start(drone, ground)
-        socket, port = ground.folder / "control.sock", free_port()
-        async with AsyncExitStack() as windows:
-            async with served(socket, port=port) as web:
-                page = await windows.enter_async_context(window(browser, web.url, is_interrupted=True))
-                state = card_of(page, drone.name).locator(".state")
-                await expect(state).to_have_text("up")
-            await expect(headline(page)).to_contain_text("LOST: the page's server does not answer. What is below was")
-            await expect(state).to_have_text("unknown")
-            await page.evaluate("quickest -= 1e6")
-            async with served(socket, port=port):
-                await expect(state).to_have_text("up")
-
-
-async def test_an_event_that_waited_in_a_buffer_is_no_news(browser: Browser) -> None:
-    """Each event says when it was sent. The page compares with the one that travelled fastest."""
-    async with page_of() as web, window(browser, web.url) as page:
-        state = page.get_by_role("article").locator(".state")
-        await expect(state).to_have_text("up")
-        await page.evaluate("quickest -= 4000")
-        await expect(headline(page)).to_contain_text("LOST: the page's server does not answer")
-        await expect(state).to_have_text("unknown")
 
 
 async def test_a_relay_shows_its_members(browser: Browser) -> None:

@@ -11,7 +11,7 @@ import ssl
 import sys
 from asyncio import StreamReader, StreamWriter
 from collections.abc import AsyncIterator
-from contextlib import AsyncExitStack, ExitStack, asynccontextmanager, suppress
+from contextlib import ExitStack, asynccontextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -125,25 +125,6 @@ async def test_a_request_byte_by_byte_ends_the_connection(page: Served) -> None:
 
 
 @pytest.mark.usefixtures("impatient")
-@pytest.mark.parametrize("rest", [b"", b"GET / HT", b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX"])
-async def test_half_a_second_request_ends_the_connection(page: Served, rest: bytes) -> None:
-    """The first one is answered; an idle connection is not kept longer either."""
-    async with connected(page) as (reader, writer):
-        writer.write(page.request("/icon.svg") + rest)
-        assert (await ended(reader)).count(b"HTTP/1.1 200") == 1
-
-
-@pytest.mark.usefixtures("impatient")
-async def test_half_a_body_holds_no_connection(page: Served, locked: Served) -> None:
-    """The answer does not wait for it: nothing here takes a body."""
-    for one, status in ((page, b"405"), (locked, b"401")):
-        async with connected(one) as (reader, writer):
-            own = f"http://{one.address}"
-            writer.write(one.request("/", "POST", Content_Length="1000", Origin=own) + b"half")
-            assert (await ended(reader)).split(b" ")[1] == status
-
-
-@pytest.mark.usefixtures("impatient")
 @pytest.mark.parametrize("rest", [b"", b"\x16\x03\x01", b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03"])
 async def test_half_a_tls_handshake_ends_the_connection(tmp_path: Path, rest: bytes) -> None:
     """Also one of no byte; others look meanwhile."""
@@ -179,21 +160,6 @@ async def test_ended_connections_by_tls_do_not_fill_the_memory(
 
 
 # Too many connections.
-
-
-@pytest.mark.long
-async def test_a_thousand_connections_of_a_stranger_take_no_place(page: Served) -> None:
-    """A browser goes on, and another one can begin: also while they come, and while all of them last."""
-    async with page.events() as watching:
-        await watching.until(is_answered)
-        async with AsyncExitStack() as stack:
-            for _ in range(10):
-                await stack.enter_async_context(crowd(page, 100))
-                assert (await page.ask()).status == 200
-                async with page.events() as another:
-                    await another.next()
-            await watching.next()
-            await watching.next()
 
 
 async def test_a_stranger_takes_only_its_own_places(page: Served) -> None:
@@ -298,50 +264,12 @@ async def test_what_is_not_http_ends_the_connection(page: Served, sent: bytes) -
     assert (await page.ask()).status == 200
 
 
-@pytest.mark.parametrize(
-    "sent", [b"GET / HTTP/9.9\r\n\r\n", b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n", b"GET / HTTP/0.9\r\n\r\n"]
-)
-async def test_other_versions_of_http_get_nothing(page: Served, sent: bytes) -> None:
-    assert parsed(await page.exchange(sent)).status == 421
-
-
-async def test_no_http_behind_a_request_ends_its_answer(page: Served) -> None:
-    """Behind the events, behind a request with a body, and behind an answer."""
-    events = page.request("/events")
-    assert await page.exchange(page.request("/events", "POST", Transfer_Encoding="chunked") + b"zz\r\n") == b""
-    async with connected(page) as (reader, writer):
-        writer.write(page.request("/icon.svg"))
-        await reader.readuntil(b"</svg>")
-        writer.write(b"\0\0\0\r\n\r\n")
-        assert (await ended(reader)).strip() == b""
-    async with connected(page) as (reader, writer):
-        writer.write(events.replace(b"\r\n\r\n", b"\r\nTransfer-Encoding: chunked\r\n\r\n"))
-        await reader.readuntil(b"event: ")
-        writer.write(b"zz\r\n")
-        await ended(reader)
-
-
 @pytest.mark.parametrize("form", ["GET /{}", "GET / HTTP/1.1\r\nX: {}", "GET / HTTP/1.1\r\n{}"])
 @pytest.mark.parametrize(("size", "end"), [(MAX_HEADER_BYTES, ""), (2_000_000, ""), (2_000_000, "\r\n\r\n")])
 async def test_long_headers_end_the_connection(page: Served, form: str, size: int, end: str) -> None:
     """In one line or in many."""
     filler = "X: y\r\n" * (size // 6 + 1) if form.endswith("\n{}") else "a" * size
     assert await page.exchange(form.format(filler).encode() + end.encode()) == b""
-
-
-async def test_headers_below_the_limit_are_read(page: Served) -> None:
-    """Other servers of this machine may have left many cookies."""
-    assert (await page.ask(Cookie="a" * (MAX_HEADER_BYTES - 300))).status == 200
-
-
-async def test_requests_at_once_are_answered_in_turn(page: Served) -> None:
-    """Each on the same connection."""
-    last = page.request("/absent", Connection="close")
-    sent = page.request("/icon.svg") + page.request("/page.js") + page.request("/", "HEAD") + last
-    received = await page.exchange(sent)
-    assert [line.split(b" ")[1] for line in received.split(b"HTTP/1.1")[1:]] != []
-    assert received.count(b"HTTP/1.1 200") == 3
-    assert received.count(b"HTTP/1.1 404") == 1
 
 
 async def test_events_are_not_mixed_with_another_answer(page: Served) -> None:
@@ -351,13 +279,6 @@ async def test_events_are_not_mixed_with_another_answer(page: Served) -> None:
         events = Events(reader)
         for _ in range(3):
             assert "at" in await events.next()
-
-
-async def test_head_has_no_body(page: Served) -> None:
-    for target in ("/", "/page.js"):
-        reply = await page.ask(target, "HEAD")
-        assert (reply.status, reply.body) == (200, b"")
-        assert int(reply.headers["content-length"]) > 100
 
 
 @pytest.mark.parametrize(
@@ -370,24 +291,6 @@ async def test_only_reading_is_possible(page: Served, method: str) -> None:
         assert reply.status == 405
         assert b"do not repeat" not in reply.body
         assert (await page.ask(target, method)).status == 403
-
-
-async def test_http_1_0_has_one_answer(locked: Served) -> None:
-    """Through a proxy of that kind the page works, its events included."""
-    credentials = {"Authorization": basic(PASSWORD)}
-    received = await locked.exchange(locked.request("/icon.svg", version="1.0", **credentials))
-    assert parsed(received).status == 200
-    async with connected(locked) as (reader, writer):
-        writer.write(locked.request("/events", version="1.0", **credentials))
-        await reader.readuntil(b"event: history\n")
-        await reader.readuntil(b"event: now\n")
-
-
-@pytest.mark.parametrize("protocol", ["websocket", "h2c", "TLS/1.0"])
-async def test_no_other_protocol_is_spoken(page: Served, protocol: str) -> None:
-    """The request is one of HTTP/1.1 all the same."""
-    headers = {"Connection": "Upgrade, close", "Upgrade": protocol, "Sec_WebSocket_Version": "13"}
-    assert (await page.ask("/icon.svg", **headers)).status == 200
 
 
 @pytest.mark.parametrize(
@@ -416,17 +319,6 @@ async def test_no_path_leads_to_a_file(page: Served, target: str) -> None:
     assert reply.headers.get("location", f"http://{page.address}").startswith(f"http://{page.address}")
 
 
-@pytest.mark.parametrize("name", ["..%2f..", "%00", "%3Cscript%3E", "a%0d%0aSet-Cookie:%20a", "x" * 8000, "%ff"])
-async def test_a_name_in_a_path_is_not_repeated(page: Served, name: str) -> None:
-    """The document is always the same one: its script reads the name, as text."""
-    document = (await page.ask()).body
-    reply = await page.ask(f"/peer/{name}")
-    assert (reply.status, reply.body) in ((200, document), (404, b"Not Found"))
-    async with page.events(f"/events?peer={name}") as events:
-        facts = await events.until(is_answered)
-        assert facts["cards"] == []
-
-
 # Browsers.
 
 
@@ -450,42 +342,6 @@ def busy(monkeypatch: pytest.MonkeyPatch) -> BusyDaemon:
     return BusyDaemon()
 
 
-@pytest.mark.long
-async def test_a_browser_that_does_not_read_gets_the_newest_message_afterwards(
-    monkeypatch: pytest.MonkeyPatch, busy: BusyDaemon
-) -> None:
-    """Nothing is kept for it but what the kernel has already; the others are held up by nothing."""
-    later = (
-        socket.IPPROTO_TCP,
-        "TCP_USER_TIMEOUT",
-        int(1000 * PATIENCE_S),
-    )
-    monkeypatch.setattr(server, "_OPTIONS", [*server._OPTIONS, later])
-    async with page_of(busy.answer) as page:
-        reader, writer = await slow_reader(page)
-        async with page.events() as other:
-            await other.until(is_answered)
-            before = busy.answers
-            while busy.answers < before + 400:
-                await other.next()
-        events, messages, newest = Events(reader), 0, 0
-        writer.write(page.request("/events"))
-        resumed_at = busy.answers
-        while newest < resumed_at:
-            facts = await events.next()
-            messages += 1
-            newest = int(facts.get("daemon", "answer 0").split()[1])
-        assert messages < 200
-        writer.close()
-
-
-async def slow_reader(page: Served) -> Connection:
-    """A browser with the events open, of which it reads little until it is asked to."""
-    sock = socket.socket()
-    await unread(page, sock, "127.0.0.1", page.request("/events"))
-    return await asyncio.open_connection(sock=sock, limit=1024)
-
-
 @pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="needs TCP_USER_TIMEOUT")
 async def test_a_browser_that_never_reads_is_gone_in_the_end(
     monkeypatch: pytest.MonkeyPatch, busy: BusyDaemon
@@ -498,17 +354,3 @@ async def test_a_browser_that_never_reads_is_gone_in_the_end(
         await until(lambda: busy.answers > 10)
         assert (await page.ask()).status == 0, "it has the only place"
         await until_served(page)
-
-
-async def test_twenty_browsers_at_once_get_the_same(page: Served) -> None:
-    """Each loads the page, as browsers do, and reads the events."""
-    targets = ("/", "/page.js", "/page.css", "/icon.svg")
-
-    async def browse(number: int) -> str:
-        source = f"127.0.1.{number}"
-        replies = await asyncio.gather(*(page.ask(target, source=source) for target in targets))
-        assert [reply.status for reply in replies] == [200] * len(targets)
-        async with page.events("/events" if number % 2 else "/events?peer=drone1", source) as events:
-            return str((await events.until(is_answered))["cards"][0]["name"])
-
-    assert await asyncio.gather(*map(browse, range(1, 21))) == ["drone1"] * 20

@@ -14,14 +14,14 @@ import pytest
 
 from tests.daemon.conftest import stage
 from tests.daemon.harness import Stage
-from tests.waiting import PATIENCE_S, Stopwatch, until
+from tests.waiting import PATIENCE_S, Stopwatch
 from tests.web.served import is_answered, page_of, served
 from tests.web.statuses import Status, few_facts, overview
 from uavlinkd.ops import STATUS_SCHEMA
 from uavlinkd.ops.control import Answer, ControlError
 from uavlinkd.web import watch
-from uavlinkd.web.view import MOST_CARDS, view
-from uavlinkd.web.watch import LONGEST_S, MOST_DETAILED, SAMPLES, Watcher
+from uavlinkd.web.view import view
+from uavlinkd.web.watch import LONGEST_S, Watcher
 from uavlinkd.web.watch import PATIENCE_S as ANSWER_S
 
 __all__ = ["stage"]
@@ -202,16 +202,6 @@ async def test_a_status_without_a_key_stops_nothing(missing: str) -> None:
         await message(watcher, "", is_answered)
 
 
-@pytest.mark.parametrize("problems", [{}, {"problems": None}, {"problems": [5]}, {"problems": [{}]}])
-async def test_problems_that_are_none_stop_nothing(problems: object) -> None:
-    daemon = Daemon()
-    daemon.problems = problems
-    async with watcher_of(daemon) as watcher:
-        await message(watcher, "drone1", lambda facts: True)
-        daemon.problems = {"problems": []}
-        await message(watcher, "", is_answered)
-
-
 @pytest.mark.parametrize("error", [ControlError("no daemon answers"), RecursionError(), MemoryError(), KeyError("a")])
 async def test_no_failure_of_a_question_ends_the_page(error: Exception) -> None:
     daemon = Daemon()
@@ -246,93 +236,7 @@ async def test_hostile_text_stays_in_its_event(text: str) -> None:
             assert facts["cards"][0]["word"] == "attack"
 
 
-async def test_a_peer_that_does_not_exist_has_no_card() -> None:
-    async with watcher_of(Daemon()) as watcher:
-        facts = await message(watcher, "stranger\n\nevent: x", is_answered)
-        assert (facts["cards"], facts["past"], facts["count"]) == ([], [], 1)
-
-
 # What the daemon is asked.
-
-
-@pytest.mark.parametrize("count", [1, MOST_CARDS, MOST_CARDS + 1, 200])
-async def test_the_daemon_is_asked_for_the_details_that_are_shown(count: int) -> None:
-    """Of all peers if there is a card for each, else of those that a browser looks at."""
-    names = [f"drone{number}" for number in range(count)]
-    daemon = Daemon(*names)
-    async with watcher_of(daemon) as watcher:
-        facts = await message(watcher, "", is_answered)
-        assert len(facts["cards"]) == (count if count <= MOST_CARDS else 0)
-        assert len(facts["rows"]) == (0 if count <= MOST_CARDS else count)
-        wanted = " ".join(["overview", *(names if count <= MOST_CARDS else [])])
-        await until(lambda: wanted in daemon.asked)
-        facts = await message(watcher, names[-1], lambda _: any(one.endswith(names[-1]) for one in daemon.asked))
-        assert [card["name"] for card in facts["cards"]] == [names[-1]]
-        await message(watcher, "stranger", lambda _: True)
-        assert not [request for request in daemon.asked if "stranger" in request]
-
-
-async def test_twenty_browsers_see_the_details_of_twenty_peers() -> None:
-    """Beyond that the request stays short; the figures are there all the same."""
-    names = [f"drone{number}" for number in range(200)]
-    daemon = Daemon(*names)
-    async with watcher_of(daemon) as watcher:
-        cards = await asyncio.gather(
-            *(
-                message(watcher, name, lambda _: any(len(one.split()) > MOST_DETAILED for one in daemon.asked))
-                for name in names[:99]
-            )
-        )
-        assert [facts["cards"][0]["name"] for facts in cards] == names[:99]
-    asked = {len(request.split()) - 1 for request in daemon.asked if request != "problems"}
-    assert max(asked) == MOST_DETAILED
-
-
-async def test_peers_that_come_and_go_cause_no_more_questions() -> None:
-    """A daemon whose peers have new names in each answer is asked at the same pace."""
-    daemon, count = Daemon(), 0
-
-    async def ask(request: str) -> dict[str, Any]:
-        nonlocal count
-        count += 1
-        return {"problems": []} if request == "problems" else overview([f"drone{count}"])
-
-    daemon.ask = ask  # type: ignore[method-assign]
-    watcher = Watcher(ask)
-    for _ in range(5):
-        await watcher._look(0.0)
-    assert count <= 5 + 3, "the first answer is followed by one more question"
-
-
-async def test_samples_are_those_of_ten_minutes() -> None:
-    """Each new one takes the place of the oldest; a path that was not there has none."""
-    daemon = Daemon("drone1")
-    watcher = Watcher(daemon.ask)
-    for number in range(SAMPLES + 10):
-        daemon.status["peers"]["drone1"]["paths"][0]["round_trip_s"] = number / 1000
-        await watcher._look(float(number * 10))
-    daemon.status = overview(["drone1", "drone2"])
-    await watcher._look(1e6)
-    history = watcher._history("")
-    times, losses, rates = history["drone1"][0]
-    assert len(times) == len(losses) == len(rates) == SAMPLES
-    assert (times[0], times[-2], times[-1]) == (0.011, (SAMPLES + 9) / 1000, 0.02)
-    assert history["drone2"][0][0] == (None,) * (SAMPLES - 1) + (0.02,)
-    assert watcher._history("drone2").keys() == {"drone2"}
-    assert watcher._history("stranger") == {}
-
-
-async def test_without_a_browser_the_daemon_is_asked_rarely(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A browser that comes is answered at once."""
-    monkeypatch.setattr(watch, "SAMPLE_S", 1e6)
-    daemon = Daemon()
-    async with watcher_of(daemon) as watcher:
-        await until(lambda: len(daemon.asked) >= 2)
-        await asyncio.sleep(0.1)
-        assert daemon.asked == ["overview", "problems"]
-        await message(watcher, "", lambda _: len(daemon.asked) > 5)
-        assert daemon.asked[2] == "overview drone1"
-    assert watcher._viewers == {}
 
 
 def test_a_status_of_a_peer_that_was_never_up_is_shown() -> None:
