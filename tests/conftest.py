@@ -86,6 +86,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker("long")
         if "shared_data" in getattr(item, "fixturenames", ()):
             item.add_marker("recorded")
+            item.add_marker("long")
     items.sort(
         key=lambda item: next((n for n, folder in enumerate(SLOWEST) if folder in _folders(item)), len(SLOWEST))
     )

@@ -266,14 +266,6 @@ def test_serial_network_beside_others(tmp_path: Path) -> None:
     assert config.warnings == ()
 
 
-def test_serial_network_alone_leaves_ip_as_it_is(tmp_path: Path) -> None:
-    """Names and addresses are reached by the kernel's routes, and `listen` may name an address."""
-    text = networks(SIK, '["gcs.example.org:5790", { network = "sik" }]').replace("0.0.0.0", "10.0.0.5")
-    config = load(tmp_path, text)
-    assert not config.has_ip_networks
-    assert list(used_networks(config.networks, config.peers[0].addresses[0])) == []
-
-
 @pytest.mark.parametrize(
     ("baud", "written", "air", "sent"),
     [
@@ -305,29 +297,6 @@ def test_peer_with_a_relay_needs_no_address(tmp_path: Path) -> None:
     assert config.warnings == ()
 
 
-def test_relay_may_be_a_peer_too(tmp_path: Path) -> None:
-    """Both have the addresses of the two sections, but a serial network is the peer's alone.
-
-    The peer is not reached along itself, and its session carries records.
-    """
-    at = 'addresses = ["10.13.0.9:5790", "relay.example.org:5790", { network = "sik" }]'
-    config = load(tmp_path, relays(SIK + relay(key=KEY["drone1"]) + relay("b"), at))
-    peer, (own, other) = config.peers[0], config.relays
-    assert [str(address) for address in peer.addresses] == [
-        *("10.13.0.9:5790", "relay.example.org:5790", "serial network sik")
-    ]
-    assert own.addresses == peer.addresses[:2]
-    assert (own.peer, other.peer, peer.relays) == ("drone1", None, ("b",))
-    for sections, lines in (
-        (relay(key=KEY["drone1"]), ""),
-        (relay(key=KEY["drone1"], addresses="[]"), 'addresses = ["relay.example.org:5790"]'),
-    ):
-        config = load(tmp_path, relays(sections, lines))  # the address in one of its sections
-        assert config.peers[0].addresses == config.relays[0].addresses
-        assert len(config.peers[0].addresses) == 1
-        assert config.peers[0].settings.link.features & c.FEATURE_RECORDS
-
-
 def test_relay_needs_members_and_little_else(tmp_path: Path) -> None:
     """Members have the default limits, and the core's feature for records."""
     config = load(tmp_path, HEAD + member() + member("c", more="max_peers = 7\nbits_s = 90_000"))
@@ -339,16 +308,6 @@ def test_relay_needs_members_and_little_else(tmp_path: Path) -> None:
     assert (two.name, two.most_peers, two.limits) == ("c", 7, RelayLimits(9, 90_000))
     assert one.peer.link.features & c.FEATURE_RECORDS
     assert config.relay_server.limits == RelayLimits(10**6, 10**10)
-
-
-def test_daemon_may_be_a_relay_too(tmp_path: Path) -> None:
-    """A member that is also a peer has one session for both."""
-    config = load(tmp_path, GOOD + member("drone1") + member() + "[relay_server]\nbits_s = 9000\n")
-    assert config.relay_server is not None
-    assert config.relay_server.limits == RelayLimits(1, 9000)
-    assert not config.is_only_relay
-    assert config.peers[0].settings.link.features & c.FEATURE_RECORDS
-    assert not load(tmp_path, GOOD).peers[0].settings.link.features & c.FEATURE_RECORDS
 
 
 # Warnings.

@@ -21,7 +21,7 @@ from tests.config.fleets import (
     member_file,
 )
 from uavlinkd.config.changes import compare
-from uavlinkd.config.members import member_peer, relay_member
+from uavlinkd.config.members import relay_member
 from uavlinkd.config.model import ConfigError, FleetConfig, PeerAddress
 from uavlinkd.core import constants as c
 from uavlinkd.core.certificates import Certificate, MemberRole
@@ -87,16 +87,6 @@ def test_station_that_relays_is_peer_and_relay_at_once(tmp_path: Path) -> None:
     assert [peer.relays for peer in config.peers] == [("r1",)]
 
 
-def test_stations_are_not_relays_of_each_other(tmp_path: Path) -> None:
-    """A station that relays uses relays only, and a relay uses none."""
-    station, both = certificate(_OPERATOR, "me", (201, 201)), contact(more="relays = true") + _R1
-    config = load_member(tmp_path, member_file(fleet(station) + both + "[relay_server]\n"))
-    assert [used.name for used in config.relays] == ["r1"]
-    assert not config.is_only_relay
-    config = load_member(tmp_path, HEAD + fleet(certificate(_RELAY, "me")) + both)
-    assert (config.relays, config.peers, config.is_only_relay, config.warnings) == ((), (), True, ())
-
-
 @pytest.mark.parametrize(
     ("own", "more", "policies"),
     [
@@ -118,30 +108,6 @@ def test_role_of_a_member_is_its_policy(
     """By the roles of both ends. A role without a policy has no link."""
     made = _fleet(tmp_path, member_file(fleet(certificate(own, "me"), more))).policies
     assert {role: policy.get("role") for role, policy in made.items()} == policies
-
-
-def test_observer_sends_only_requests(tmp_path: Path) -> None:
-    """Whatever the vehicle accepts."""
-    made = _fleet(tmp_path, member_file(fleet(certificate(_OBSERVER, "tablet", (254, 254)))))
-    peer = member_peer(made, bytes(32), Certificate(bytes(4), 9, _VEHICLE, (1, 3), "v1"))
-    rows = {row.subject: row for row in peer.make_policy().describe()}
-    assert rows["may speak as"].incoming == "1-3"
-    assert rows["telemetry"].incoming == "all"
-    assert rows["commands"].outgoing != "all"
-    assert rows["parameter-reads"].outgoing == "all"
-
-
-def test_policy_of_a_role_adds_to_the_usual_one(tmp_path: Path) -> None:
-    """Unless it is complete by itself."""
-    added = (
-        '[[fleet_role]]\nname = "vehicle"\nrate_in = { PING = 0 }\n'
-        '[[fleet_role]]\nname = "operator"\nallow_in = []\nallow_out = []\n'
-    )
-    assert _fleet(tmp_path, member_file(fleet(more=added))).policies == {
-        _VEHICLE: {"role": "swarm-member", "rate_in": {"PING": 0}},
-        _OPERATOR: {"allow_in": (), "allow_out": ()},
-        _OBSERVER: {"role": "observer"},
-    }
 
 
 def test_relay_needs_no_member_sections(tmp_path: Path) -> None:
@@ -259,12 +225,6 @@ def test_four_contacts_are_too_many(tmp_path: Path) -> None:
     """The line of an authority has three at most."""
     with pytest.raises(ConfigError, match="contact: has 4 sections"):
         load_member(tmp_path, member_file(fleet() + _GS * 4))
-
-
-def test_relay_of_a_fleet_listens(tmp_path: Path) -> None:
-    """Else no member could reach it."""
-    with pytest.raises(ConfigError, match="listen: is empty, so no member could reach this relay"):
-        load_member(tmp_path, TOP + fleet(certificate(_RELAY, "r2")))
 
 
 def test_revoked_certificates_are_warned_of(tmp_path: Path) -> None:

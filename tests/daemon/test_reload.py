@@ -42,10 +42,6 @@ async def client_at(stage: Stage, daemon: DaemonProcess, endpoint: str, into: So
     return client
 
 
-def url_of(at: Sockaddr) -> str:
-    return f"udpin:{at[0]}:{at[1]}"
-
-
 async def talk(a: Client, into_a: Sockaddr, b: Client, into_b: Sockaddr, stop: asyncio.Event) -> list[list[bytes]]:
     """Numbered frames in both directions in a steady rhythm, until cancelled; returns the sent frames."""
     said: list[list[bytes]] = [[], []]

@@ -2,17 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-from uavlinkd.endpoints.serial_line import SerialLine
 from uavlinkd.endpoints.web_stream import WebStream
 
 
 def held_bytes(stream: WebStream) -> int:
     """The number of bytes that a stream holds of a message that has not ended."""
     return len(stream._protocol.reader.buffer)
-
-
-def set_device(line: SerialLine, device: Any) -> None:
-    """Give a serial line another device."""
-    line._device = device

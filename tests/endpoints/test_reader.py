@@ -125,18 +125,6 @@ def pair(monkeypatch: pytest.MonkeyPatch) -> Iterator[Pair]:
     pair.receiver.close()
 
 
-@pytest.mark.parametrize(
-    "datagrams", [(b"a",), (b"",), (b"a", b"b", b"c"), (b"", b"b"), (b"a", b"", b"c"), (b"a", b"", b"")]
-)
-def test_two_wake_ups_read_a_burst(pair: Pair, datagrams: tuple[bytes, ...]) -> None:
-    """The first reads one datagram, the second the rest, empty datagrams included."""
-    pair.send(*datagrams)
-    assert pair.wake_up() == [datagrams[0]]
-    assert pair.wake_up() == list(datagrams[1:])
-    assert pair.reader._timer is None
-    assert pair.failures == []
-
-
 def test_a_socket_with_bursts_is_read_to_the_end_in_one_wake_up(pair: Pair) -> None:
     """After a read with several datagrams, the reader asks the kernel whether the next one is alone."""
     pair.send(b"a", b"b", b"c")
@@ -158,29 +146,6 @@ def test_a_busy_socket_is_read_by_a_timer(pair: Pair) -> None:
     pair.send(b"three", b"four")
     assert pair.fire() == [b"three", b"four"]
     assert pair.waited[-2:] == [PAUSE_S, PAUSE_S]
-
-
-def test_reader_without_a_pause_reads_a_busy_socket_at_once(pair: Pair) -> None:
-    """As a relay has it: what it forwards must not wait."""
-    pair.reader._pause_s = 0.0
-    for _ in range(5):
-        pair.send(b"one", b"two")
-        assert b"".join(pair.wake_up() + pair.wake_up()) == b"onetwo"
-        assert pair.reader._timer is None
-
-
-@pytest.mark.parametrize("count", [0, 1])
-def test_a_socket_that_is_no_longer_busy_is_watched_again(pair: Pair, count: int) -> None:
-    """A pause in which fewer than two datagrams came is the last one."""
-    pair.make_busy()
-    pair.send(b"two")
-    pair.fire()
-    pair.send(*[b"three"] * count)
-    assert pair.fire() == [b"three"] * count
-    assert pair.reader._timer is None
-    pair.now += 2 * BUSY_S
-    pair.send(b"four")
-    assert pair.wake_up() == [b"four"]
 
 
 def test_a_handler_that_fails_does_not_end_the_reading(pair: Pair) -> None:

@@ -10,7 +10,7 @@ from time import monotonic
 import pytest
 
 from tests.endpoints.clients import frame, large_frame, recorder, write
-from tests.endpoints.stream_pair import CAPACITY, Pair, RationedChannel
+from tests.endpoints.stream_pair import CAPACITY, Pair
 from tests.waiting import until
 from uavlinkd.endpoints.stream_endpoint import READ_BYTES, STALLED_S, Connection
 from uavlinkd.system.clock import monotonic as boot_time
@@ -36,17 +36,6 @@ def read_all(sock: socket.socket) -> bytes:
     return got
 
 
-async def test_one_wake_up_delivers_one_batch(pair: Pair) -> None:
-    """All bytes of one wake-up are one batch, however they were cut."""
-    stream = b"".join(map(frame, range(20)))
-    for at in range(0, len(stream), 61):
-        pair.other.send(stream[at : at + 61])
-    pair.connection.on_readable(now=3.0)
-    assert recorder(pair).batches == [[frame(number) for number in range(20)]]
-    assert pair.connection.received_at == 3.0
-    assert pair.bytes_received == len(stream)
-
-
 async def test_one_connection_reads_no_more_than_its_turn(pair: Pair) -> None:
     """A flood in one connection does not keep the others from their turn."""
     pair.channel.sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 18)
@@ -55,20 +44,6 @@ async def test_one_connection_reads_no_more_than_its_turn(pair: Pair) -> None:
     assert sent > 2 * READ_BYTES
     pair.connection.on_readable(now=0.0)
     assert pair.bytes_received == READ_BYTES
-
-
-async def test_write_to_a_closed_connection_reports_later(pair: Pair) -> None:
-    """The daemon may be in the middle of a batch. The port is reported as closed in the loop's next turn."""
-    pair.other.close()
-    write(pair.connection, [frame(1)], now=0.0)
-    write(pair.connection, [frame(2)], now=0.0)
-    assert recorder(pair).closed == []
-    await pair.connection.lost.wait()
-    write(pair.connection, [frame(3)], now=0.0)
-    assert recorder(pair).closed == [pair.connection]
-    assert pair.failures == {"EPIPE": 1, "unsent": 3}
-    assert pair.channel.aborted is True
-    assert list(pair.ports) == []
 
 
 @pytest.mark.parametrize("reads", [False, True])
@@ -86,18 +61,6 @@ async def test_client_that_never_reads_is_closed(pair: Pair, reads: bool) -> Non
         await pair.connection.lost.wait()
         assert pair.channel.aborted is True
         assert pair.channel.sock.fileno() == -1
-
-
-async def test_kernel_gets_no_more_than_the_channel_has_room_for(pair: Pair) -> None:
-    """Frames wait in the endpoint, where they can become stale, and are sent as soon as there is room."""
-    size = len(large_frame(0))
-    pair.channel.left = 2 * size
-    write(pair.connection, [large_frame(number) for number in range(5)], monotonic())
-    assert read_all(pair.other) == large_frame(0) + large_frame(1)
-    assert len(pair.connection.outgoing) == 3
-    pair.channel.left = size
-    await until(lambda: pair.frames_sent == 3)
-    assert read_all(pair.other) == large_frame(2)
 
 
 async def test_channel_that_never_gets_room_has_stalled(pair: Pair) -> None:
@@ -187,20 +150,6 @@ async def test_connection_that_was_being_opened_during_a_pause_is_stale(pair: Pa
     pair.other.send(frame(1))
     connection.on_readable(now=0.0)
     assert recorder(pair).epochs == [STALE]
-
-
-async def test_device_that_is_opened_again_has_the_same_stream(pair: Pair) -> None:
-    """The parser behind it may have kept its state."""
-    before = pair.connection.delivered
-    pair.connection.lose("unplugged")
-    await pair.connection.lost.wait()
-    ours, other = socket.socketpair()
-    pair.channel = RationedChannel(ours)
-    with other:
-        again = pair.open_now()
-        assert again.delivered is before
-        again.lose("unplugged")
-        await again.lost.wait()
 
 
 async def test_frame_behind_a_false_start_from_before_a_pause_is_stale(pair: Pair) -> None:

@@ -100,27 +100,6 @@ async def test_waits_grow_where_a_server_only_accepts_and_closes(monkeypatch: py
         assert least_s <= wait_s <= 1.25 * least_s
 
 
-async def test_name_is_looked_up_at_each_attempt(server: TcpServer, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The client reaches an autopilot that has a new address."""
-    server.start()
-    asked: list[tuple[str, int]] = []
-    elsewhere = unused_address()
-
-    def look_up(host: str, port: int, **_: object) -> list[tuple[object, ...]]:
-        asked.append((host, port))
-        if len(asked) == 1:
-            raise socket.gaierror(socket.EAI_NONAME, "unknown")
-        sockaddr = (elsewhere.host, elsewhere.port) if len(asked) == 2 else address_of(server)
-        return [(socket.AF_INET, socket.SOCK_STREAM, 6, "", sockaddr)]
-
-    monkeypatch.setattr(socket, "getaddrinfo", look_up)
-    with client_of(Address("autopilot.test", 5760)) as tcp_client:
-        await until(lambda: len(tcp_client.ports) == 1)
-        assert asked == [("autopilot.test", 5760)] * 3
-        assert tcp_client.failures == {"not_resolved": 1, "ECONNREFUSED": 1}
-        assert tcp_client.ports[0].name == "autopilot.test:5760"
-
-
 async def test_silent_name_server_of_the_peers_delays_no_endpoint(
     server: TcpServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -68,22 +68,6 @@ def read(server: UdpServer, now: float = 1.0) -> None:
     reader_of(server, now).read(monotonic())
 
 
-async def test_all_datagrams_are_delivered_in_one_batch(server: UdpServer, client: Make) -> None:
-    """One call per client, with all its frames in order."""
-    one, other = client(), client()
-    one.send(frame(1))
-    other.send(frame(2))
-    one.send(frame(3) + frame(4))
-    read(server)
-    assert recorder(server).by_client == [
-        (name_of(one), [frame(1), frame(3), frame(4)]),
-        (name_of(other), [frame(2)]),
-    ]
-    assert names(recorder(server).open) == [name_of(one), name_of(other)]
-    assert server.counters.frames == 4
-    assert server.bytes_received == len(frame(1) + frame(2) + frame(3) + frame(4))
-
-
 @pytest.mark.parametrize("datagram", [b"", b"hello", bytes(60000), heartbeat()[:-1], heartbeat()[:-1] + b"\x00"])
 async def test_garbage_does_not_make_its_sender_a_client(server: UdpServer, client: Make, datagram: bytes) -> None:
     """Only a genuine frame does."""
@@ -147,13 +131,6 @@ async def test_a_lost_datagram_costs_only_the_frames_in_it(server: UdpServer, si
         server.do_housekeeping(10.0 * lost + 2 * MAX_GAP_S)
         touched = range(lost * size // len(sent[0]), -(-min((lost + 1) * size, 10 * len(sent[0])) // len(sent[0])))
         assert recorder(server).received == [raw for number, raw in enumerate(sent) if number not in touched]
-
-
-async def test_whole_frame_behind_an_unfinished_one_is_not_lost(server: UdpServer) -> None:
-    """The rest of the first frame does not arrive, or arrives too late."""
-    for now, datagram in ((1.0, large_frame(1)[:20]), (1.1, heartbeat()), (5.0, frame(1)[:9]), (8.0, frame(1)[9:])):
-        server.take([(datagram, BRIDGE)], now, 0)
-    assert recorder(server).received == [heartbeat()]
 
 
 async def test_unfinished_frames_of_strangers_are_bounded_and_displace_no_client(server: UdpServer) -> None:

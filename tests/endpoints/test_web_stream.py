@@ -186,14 +186,6 @@ async def test_window_closes_without_pongs(plain: Loopback, monkeypatch: pytest.
     loop.remove_reader(sock)
 
 
-async def test_room_is_reported(plain: Loopback) -> None:
-    """When what was sent has left, so that frames which wait for it lose no time."""
-    member, relay = await plain.pair()
-    cast(Any, member).on_room = lambda: member.fill(DATAGRAM)
-    member.fill(DATAGRAM)
-    await until(lambda: len(relay.datagrams) > 1000)
-
-
 OPENED = [
     (frame(1, b"text"), "text"),
     (frame(2, b"part", fin=False), "fragment"),
@@ -314,19 +306,6 @@ async def test_hostile_responses(plain: Loopback, data: bytes, reason: str) -> N
     assert member.opened == 0
 
 
-async def test_only_the_newest_ping_is_answered(plain: Loopback) -> None:
-    """Its count includes those before, and the answers of an end that does not read do not pile up."""
-    sock = await plain.raw()
-    relay = plain.relay(await plain.accepted())
-    loop = asyncio.get_running_loop()
-    await loop.sock_sendall(sock, REQUEST)
-    await until(lambda: relay.opened == 1)
-    await loop.sock_recv(sock, 4096)
-    await loop.sock_sendall(sock, b"".join(frame(9, bytes([number])) for number in range(20)))
-    assert await loop.sock_recv(sock, 4096) == frame(10, bytes([19]), masked=False)
-    assert relay.reasons == []
-
-
 async def test_garbage_in_place_of_tls(secure: Loopback) -> None:
     """At a relay and at a member; and a member whose TLS is refused."""
     sock = await secure.raw()
@@ -365,19 +344,6 @@ async def test_reset(loopback: Loopback) -> None:
     raw.close()
     relay = loopback.relay(await loopback.accepted())
     await until(lambda: relay.reasons == ["ECONNRESET"])
-
-
-async def test_tls_1_2_passes(secure: Loopback) -> None:
-    """Some firewalls that inspect TLS know no newer one."""
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    context.check_hostname = False
-    context.verify_mode = ssl.CERT_NONE
-    context.maximum_version = ssl.TLSVersion.TLSv1_2
-    member = secure.member(await secure.raw(), context.wrap_bio)
-    relay = secure.relay(await secure.accepted())
-    await until(lambda: bool(member.opened and relay.opened))
-    member.stream.send(b"by 1.2")
-    await until(lambda: relay.datagrams == [b"by 1.2"])
 
 
 async def test_datagrams_from_before_a_pause_are_dropped(plain: Loopback) -> None:

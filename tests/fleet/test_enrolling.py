@@ -63,15 +63,6 @@ def test_address_in_the_line_is_listened_on(place: Path, say: Say) -> None:
     assert list(map(str, load_config(place / "other.toml", {}).listen)) == ["127.0.0.1:6000"]
 
 
-def test_keys_of_a_service_are_in_their_folder(place: Path, say: Say) -> None:
-    """As `check --keys`."""
-    (place / "keys").mkdir()
-    line = say("fleet sign", say("enroll v7 --keys keys"))
-    assert "v7.toml" in say("enroll --finish --keys keys", line)
-    assert (place / "keys" / "v7.key").exists()
-    assert 'control_socket = "/run/uavlinkd/v7/control.sock"' in (place / "v7.toml").read_text()
-
-
 def test_existing_configuration_keeps_its_values(place: Path, say: Say) -> None:
     """It becomes a member's with its own key; its pinned peers stay."""
     text = """\
@@ -157,18 +148,6 @@ def test_former_key_that_cannot_be_deleted_is_an_error(
     assert say("enroll --finish", line) == "refused: v7.key: Operation not permitted\n"
     assert {path: path.read_bytes() for path in place.glob("v7*")} == before
     assert not list(place.glob(".*"))
-
-
-def test_member_with_other_ids_sends_with_them(place: Path, say: Say) -> None:
-    """Its autopilot's endpoint has the ids of the certificate, and others keep theirs."""
-    enrolled(say, "v7", "--id 7")
-    file = place / "v7.toml"
-    other = '\n[[endpoint]]\nname = "camera"\nurl = "udpin:127.0.0.1:14560"\nsystem_ids = [9]\n'
-    file.write_text(file.read_text() + other)
-    line = say("fleet sign --replace v7 --ids 17-18", say("enroll v7"))
-    say("enroll --finish", line)
-    endpoints = tomllib.loads(file.read_text())["endpoint"]
-    assert [endpoint["system_ids"] for endpoint in endpoints] == [[17, 18], [9]]
 
 
 def test_url_of_an_existing_file_is_not_changed(place: Path, say: Say) -> None:

@@ -17,14 +17,14 @@ import pytest
 
 from tests.fleet.vehicles import NAMES, create, loaded, unasked
 from tests.waiting import PATIENCE_S
-from uavlinkd.authority.enrolment import FleetError, Request, parse_reply
+from uavlinkd.authority.enrolment import FleetError, Request
 from uavlinkd.config import keys
 from uavlinkd.config.model import ConfigError
 from uavlinkd.core.certificates import MemberRole
 from uavlinkd.fleet import operations, transaction
 from uavlinkd.fleet.authority_key import AUTHORITY_FILE, SUCCESSOR_FILE
 from uavlinkd.fleet.files import reply_for
-from uavlinkd.fleet.manifest import Fleet, FleetSettings, fill, parse_addresses, read_manifest, toml_text
+from uavlinkd.fleet.manifest import Fleet, FleetSettings, parse_addresses, read_manifest, toml_text
 from uavlinkd.fleet.signing import Identity
 from uavlinkd.fleet.transaction import lock
 from uavlinkd.lab.child_processes import end_with_parent
@@ -198,19 +198,6 @@ def test_added_member_changes_no_other_file(folder: Path) -> None:
     assert {path for path in after if after[path] != before.get(path)} == {
         *("fleet.toml", "scout/scout.toml", "scout/scout.key")
     }
-
-
-def test_new_contact_is_written_into_the_files_that_are_here(folder: Path, tmp_path: Path) -> None:
-    """The command names the members whose files are elsewhere."""
-    (folder / "drone1").rename(tmp_path / "drone1")
-    result = operations.add(folder, "other", RELAY, unasked)
-    check_fleet(folder)
-    assert [contact.name for contact in read_manifest(folder).contacts_of("drone2")] == ["relay", "other"]
-    assert {"other", "relay", "drone2", "drone3", "ground-station", "observer"} == set(result.changed)
-    assert result.elsewhere == ("drone1",)
-    assert not (folder / "drone1").exists()
-    line = operations.line_of(folder, "drone1")
-    assert [contact.addresses for contact in parse_reply(line).contacts][1] == ("198.51.100.9:5790",)
 
 
 def test_signed_request_is_in_the_manifest_before_its_line_is_printed(folder: Path) -> None:
@@ -395,17 +382,6 @@ def test_failed_write_changes_nothing(
     assert not (folder / "scout").exists()
 
 
-@pytest.mark.parametrize("action", ACTIONS.values(), ids=ACTIONS)
-def test_file_system_without_hard_links(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, action: Callable[[Path], object]
-) -> None:
-    """Each command works there, and leaves nothing beside its files."""
-    monkeypatch.setattr(Path, "hardlink_to", refuse_link)
-    action(folder)
-    check_fleet(folder)
-    assert not list(folder.rglob(".*"))
-
-
 def refuse_link(*_: object) -> None:
     """As such a file system does."""
     raise PermissionError(1, "Operation not permitted")
@@ -444,11 +420,6 @@ def test_rotated_key_is_removed_everywhere(folder: Path) -> None:
     for path, content in snapshot(folder).items():
         assert content != secret
         assert path == "fleet.toml" or to_base64(old.public_key).encode() not in content
-
-
-def test_number_and_name_are_put_in() -> None:
-    """``{n}`` and ``{name}`` are replaced. Other braces are kept: no attribute of an object is read."""
-    assert fill("{name}.local:{n}{n}, {name.__class__} {0}", 7, "scout") == "scout.local:77, {name.__class__} {0}"
 
 
 @pytest.mark.long

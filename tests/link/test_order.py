@@ -126,7 +126,7 @@ def check_overtaken(network: Network, autopilot: Autopilot, most: float) -> None
     assert overtaken == 0 or network.alpha.peer.traffic.out_of_order > 0
 
 
-@pytest.mark.parametrize("seed", [*range(4), *(pytest.param(seed, marks=pytest.mark.long) for seed in range(4, 60))])
+@pytest.mark.parametrize("seed", [*range(2), *(pytest.param(seed, marks=pytest.mark.long) for seed in range(2, 40))])
 def test_random_histories_keep_the_order(seed: int) -> None:
     """Paths of any delay become metered or are so no longer, copies go along others, keys change. Nothing is lost but
     states that newer ones overtook."""

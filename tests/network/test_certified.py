@@ -102,7 +102,7 @@ def are_linked(one: CertifiedDrone, other: CertifiedDrone) -> bool:
     return all(node is not None and name in node.peers and node.peers[name].is_up for node, name in nodes)
 
 
-@pytest.mark.parametrize("seed", range(SEEDS))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in range(1, SEEDS))])
 def test_bulletins_reach_all_and_links_return_after_any_history(seed: int) -> None:
     """No frame of a revoked member is delivered where its bulletin is known, during the history and after it."""
     with CertifiedNetwork(f"certified {seed}", USABLE) as network:

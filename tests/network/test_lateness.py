@@ -23,7 +23,7 @@ EVER_S = VOUCHED_S + c.LATE_AFTER_S
 """and in any combination: confirmed, then overtaken for the longest time."""
 VERIFIED_S = c.LATE_AFTER_S + c.HOLD_S
 """How long after its request an answer verifies the frames that follow in order."""
-SEEDS = int(os.environ.get("UAVLINKD_CHAOS_SEEDS", "4"))
+SEEDS = int(os.environ.get("UAVLINKD_CHAOS_SEEDS", "2"))
 """Number of random histories of delays."""
 REKEYS = Link(timers=Timers(rekey_after_s=1.0, reject_after_s=20.0))
 PLAIN = Link()
@@ -34,7 +34,7 @@ def ages(flow: Flow) -> list[float]:
 
 
 @pytest.mark.parametrize("link", [PLAIN, REKEYS], ids=["one session", "rekeys"])
-@pytest.mark.parametrize("hold_s", [1.0, 3.0, 30.0])
+@pytest.mark.parametrize("hold_s", [1.0, 30.0])
 def test_overtaken_envelopes_are_delivered_in_time_or_never(hold_s: float, link: Link) -> None:
     """A fifth of all is held: up to two seconds late it is delivered, later it is refused as delayed."""
     with Network(f"hold some {hold_s}", RadioSettings(delay_s=0.02)) as network:

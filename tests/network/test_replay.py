@@ -50,10 +50,9 @@ def _triangle(network: Network) -> tuple[Drone, Drone, Drone]:
     return drones
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.long)])
-def test_replay_storm_delivers_nothing_twice_and_leaves_the_links_as_they_are(seed: int) -> None:
+def test_replay_storm_delivers_nothing_twice_and_leaves_the_links_as_they_are() -> None:
     """500 replays a second against three linked drones: every frame once and in time, nothing lost."""
-    with Network(f"storm {seed}", RadioSettings(delay_s=0.02)) as network:
+    with Network("storm 0", RadioSettings(delay_s=0.02)) as network:
         a, b, c = _triangle(network)
         recorder = Recorder(network)
         network.run(8)

@@ -11,7 +11,7 @@ from uavlinkd.core.outputs import PeerLost
 from uavlinkd.lab.mitm.radio import RadioSettings
 
 BACK_WITHIN_S = 2.0
-CLOCKS = {"zero": 0.0, "1970": 1.0, "2106": 2.0**32 + 0.25}
+CLOCKS = {"zero": 0.0, "2106": 2.0**32 + 0.25}
 
 
 def _assert_both_hear_within(network: Network, a: Drone, b: Drone, bound_s: float) -> None:
@@ -27,7 +27,7 @@ def _assert_both_hear_within(network: Network, a: Drone, b: Drone, bound_s: floa
 
 
 @pytest.mark.parametrize("clock", CLOCKS.values(), ids=CLOCKS)
-@pytest.mark.parametrize("delay_s", [0.0, 0.02, 0.1])
+@pytest.mark.parametrize("delay_s", [0.0, 0.1])
 @pytest.mark.parametrize("who_knows", ["both", "restarted", "other"])
 def test_link_is_back_after_a_restart_without_state(who_knows: str, delay_s: float, clock: float) -> None:
     """One end restarts with only its key and another clock: frames cross again within two seconds."""

@@ -23,7 +23,7 @@ FAST, SLOW = RadioSettings(delay_s=0.02), RadioSettings(delay_s=0.1)
 
 
 @pytest.mark.parametrize("stalled", [0, 1], ids=["best path", "other path"])
-@pytest.mark.parametrize("rekey_after_s", [120.0, 2.0])
+@pytest.mark.parametrize("rekey_after_s", [pytest.param(120.0, marks=pytest.mark.long), 2.0])
 def test_path_that_stalls_for_ten_seconds_delivers_nothing_stale(stalled: int, rekey_after_s: float) -> None:
     """Everything on one path comes 10 s late: no frame is old or comes twice, no critical frame is lost."""
     with Network(f"stall {stalled} {rekey_after_s}") as network:

@@ -53,12 +53,6 @@ def names(monkeypatch: pytest.MonkeyPatch) -> Names:
     return known
 
 
-async def test_order_is_kept_and_duplicates_are_removed(names: Names) -> None:
-    """The result has all addresses of the name, in the order of the name service, each once."""
-    names["drone1.test"] = ["10.0.0.9", "::1", "10.0.0.9"]
-    assert await resolve(Address("drone1.test", 5790)) == [(V4, ("10.0.0.9", 5790)), (V6, ("::1", 5790, 0, 0))]
-
-
 async def test_link_local_address_keeps_its_zone() -> None:
     """Sending to it needs the interface."""
     interface = next((name for number, name in socket.if_nameindex() if number == 1), None)

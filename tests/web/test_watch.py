@@ -15,12 +15,11 @@ import pytest
 from tests.daemon.conftest import stage
 from tests.daemon.harness import Stage
 from tests.waiting import PATIENCE_S, Stopwatch
-from tests.web.served import is_answered, page_of, served
+from tests.web.served import is_answered, served
 from tests.web.statuses import Status, few_facts, overview
 from uavlinkd.ops import STATUS_SCHEMA
-from uavlinkd.ops.control import Answer, ControlError
+from uavlinkd.ops.control import ControlError
 from uavlinkd.web import watch
-from uavlinkd.web.view import view
 from uavlinkd.web.watch import LONGEST_S, Watcher
 from uavlinkd.web.watch import PATIENCE_S as ANSWER_S
 
@@ -175,17 +174,6 @@ async def test_a_daemon_of_another_version_is_lost_with_a_remedy(schema: int | N
         await message(watcher, "", is_answered)
 
 
-async def test_an_older_daemon_does_not_know_the_request() -> None:
-    """It has no overview yet."""
-
-    def answer(request: str) -> Answer:
-        return overview() if request == "status" else None
-
-    async with page_of(answer) as page, page.events() as events:
-        lost = await events.until(lambda facts: "does not know" in facts.get("lost", ""))
-        assert "'overview'" in lost["lost"]
-
-
 @pytest.mark.parametrize("missing", sorted(overview().keys() - {"public_key", "monotonic_s", "unrouted", "faults"}))
 async def test_a_status_without_a_key_stops_nothing(missing: str) -> None:
     """Nor one with another type in its place."""
@@ -237,12 +225,3 @@ async def test_hostile_text_stays_in_its_event(text: str) -> None:
 
 
 # What the daemon is asked.
-
-
-def test_a_status_of_a_peer_that_was_never_up_is_shown() -> None:
-    """It has no figures yet."""
-    never = few_facts(state="waiting", path=None, last_received_s=None, round_trip_s=None, paths=[])
-    status = overview()
-    status["peers"] = {"drone1": never}
-    (card,) = view(status, [], "")["cards"]
-    assert (card["word"], card["figures"][:2], card["paths"]) == ("waiting", [None, None], [])
