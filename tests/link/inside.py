@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence, Sized
+from typing import cast
 
+from uavlinkd.link.daemon import Daemon
 from uavlinkd.link.direct_search import OwnSocket
 from uavlinkd.link.relay_link import RelayHandles
 from uavlinkd.link.relays import Relays
@@ -24,3 +26,8 @@ def set_own_sockets(relays: Relays, own: Sequence[OwnSocket]) -> None:
 def most_flows(switch: Switch) -> int:
     """The number of flows that are remembered of the port with the most."""
     return max((len(known.flows) for known in switch.ports.values()), default=0)
+
+
+async def apply_file(parts: object) -> None:
+    """Read the file again, as a daemon that has only these parts."""
+    await Daemon._apply_file(cast(Daemon, parts))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
-from typing import cast
 
 import pytest
 import structlog
@@ -11,6 +10,7 @@ from structlog import get_logger
 from structlog.testing import capture_logs
 
 from tests.core.harness import Named
+from tests.link.inside import apply_file
 from uavlinkd.config.model import ConfigError, Problem
 from uavlinkd.core.outputs import PathStateChanged, PeerLost, PeerUp
 from uavlinkd.core.path import Path
@@ -298,7 +298,7 @@ async def test_problems_of_a_refused_configuration_control_no_terminal(monkeypat
     parts = SimpleNamespace(config=SimpleNamespace(path="a.toml"), local=None, journal=DaemonJournal())
     stub = SimpleNamespace(parts=parts, log=structlog.get_logger())
     with capture_logs() as lines, pytest.raises(ConfigError):
-        await daemon.Daemon._apply_file(cast(daemon.Daemon, stub))
+        await apply_file(stub)
     ((problems, event),) = [(line["problems"], line["event"]) for line in lines]
     assert event == "configuration_refused"
     assert parts.journal.refused_file == problems
