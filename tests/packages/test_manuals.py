@@ -40,7 +40,7 @@ LINES = pytest.mark.parametrize(
         ("uavlinkd status --so", "--socket"),
         ("uavlinkd peer li", "list"),
         ("uavlinkd fleet ro", "rotate"),
-        ("uavlinkd evaluate re", "report"),
+        ("uavlinkd evaluate ti", "timing"),
         ("uavlinkd check --config LIC", "LICENSE"),
         ("uavlink-mitm relay --li", "--list"),
     ],

@@ -15,10 +15,12 @@ from uavlinkd.lab.evaluation.tampering_plan import (
     LINE_PLANS,
     PATH_PLANS,
     RELAYED_PLANS,
+    WEB_PLANS,
     TrialPlan,
 )
 from uavlinkd.lab.evaluation.tampering_records import NOT_IN_TIME, OURS, PAPER, RECOVERY_LIMIT_S, RELAY, Verdict
 from uavlinkd.lab.evaluation.tampering_run import TAMPERING
+from uavlinkd.lab.hostile import web_proxy
 from uavlinkd.lab.hostile.relay_attacks import RELAY_ATTACKS
 from uavlinkd.lab.mitm.attack import AttackContext
 from uavlinkd.lab.mitm.attacks import ATTACKS, parse_attack
@@ -57,6 +59,14 @@ def test_every_attack_on_the_line_is_tried_also_in_a_quick_run() -> None:
         assert plan.names == tuple(parse_line_attack(text).name for text in plan.phases)
 
 
+def test_every_attack_of_a_proxy_is_tried_also_in_a_quick_run() -> None:
+    """A new one needs a plan too, and the proxy accepts each line."""
+    texts = [plans.with_target(text, 9) for plan in WEB_PLANS for text in plan.phases]
+    attacks = [parse_attack(text, web_proxy.ALL_ATTACKS) for text in texts]
+    assert {attack.name for attack in attacks} >= set(web_proxy.WEB_ATTACKS)
+    assert not [plan for plan in WEB_PLANS if plan.is_variant and set(plan.names) & set(web_proxy.WEB_ATTACKS)]
+
+
 ON_RELAY = [plan for plan in RELAYED_PLANS if not set(plan.names) & set(RELAY_ATTACKS)]
 
 
@@ -89,7 +99,7 @@ async def test_quick_run(tmp_path: Path) -> None:
 
     run = TAMPERING.read(tmp_path)
     ours, paper = run.on(OURS), run.on(PAPER)
-    stages = *ALL_PLANS, *LINE_PLANS, *RELAYED_PLANS
+    stages = *ALL_PLANS, *LINE_PLANS, *RELAYED_PLANS, *WEB_PLANS
     chosen = [plan for plan in stages if not plan.is_variant]
     assert {trial.attack for trial in ours} >= {plan.attack for plan in chosen}
     assert len({trial.attack for trial in ours if trial.group == "keys"}) == 6
@@ -139,6 +149,8 @@ async def test_quick_run(tmp_path: Path) -> None:
         ("relay misdelivers envelopes", "unknown_index"),
         ("relay invents handles", "relay_unknown_handle"),
         ("relay sends frames of its own", "frames_not_allowed"),
+        ("proxy joins messages", "bad_tag"),
+        ("proxy answers for the relay", "unknown_index"),
     ):
         assert by_name[name].noticed[reason] > 0
     report = (tmp_path / "tampering.md").read_text()

@@ -14,7 +14,7 @@ from uavlinkd.lab.evaluation.frame import EvaluationSettings
 from uavlinkd.lab.evaluation.tampering_records import PAPER
 
 HANDSHAKE, DATA, FLOOD, TRAFFIC, KEYS = "handshake", "data", "flood", "traffic", "keys"
-PATHS, LINE, RELAYED, FLEET = "paths", "line", "relay", "fleet"
+PATHS, LINE, RELAYED, WEB, FLEET = "paths", "line", "relay", "web", "fleet"
 _SHORT_GROUPS: Final = (HANDSHAKE, KEYS, FLEET)
 LOAD: Final = "flood-initiations,rate_per_s=600"
 """The load at which daemons require cookies."""
@@ -340,6 +340,31 @@ relay binds the wrong members | relay-bind-wrong,rate_per_s=100 | least_s=5 need
 )
 """On three daemons that reach each other only along a hostile relay. The last one leaves gaps in the counters, which
 the daemons report later."""
+
+WEB_PLANS: Final = plan_rows(
+    WEB,
+    """
+proxy alters messages | bit-flip,beside=true | needs=bad_tag
+proxy cuts messages | truncate,beside=true | needs=malformed
+proxy joins messages | splice,beside=true | needs=bad_tag
+proxy forges messages | forge-data,rate_per_s=1000 | needs=bad_tag
+proxy replays | replay-data,copies=2 | needs=duplicate
+proxy replays later | replay-data,when=later,delay_s=3 | least_s=4 is_variant needs=late_copy
+proxy delays by 3 s | hold,hold_s=3,share=0.5,limit={target} | after_s=3.2 needs=delayed
+proxy reorders | reorder,limit={more} | after_s=3 needs=envelopes_out_of_order
+proxy answers for the relay | reflect,kinds=any | needs=unknown_index
+proxy drops half | drop,kinds=any,share=0.5 | needs=envelopes_missing
+proxy keeps the connection and drops everything | blackout,seconds=60
+    | least_s=25 -targeted is_variant needs=relay_disconnected
+proxy puts garbage between messages | web-garbage,rate_per_s=1 | least_s=3 -targeted needs=relay_connected
+proxy splits messages | web-fragment,rate_per_s=1 | least_s=3 -targeted needs=relay_connected
+proxy floods with pings | web-pings,rate_per_s=1 | least_s=3 -targeted needs=relay_connected
+proxy resets connections | web-reset,rate_per_s=1 | least_s=3 -targeted needs=envelopes_missing
+""",
+    takes_away=True,
+)
+"""On two daemons that reach each other only along an honest relay, by TLS. A hostile proxy ends the TLS of the first
+one. What only a stream has costs the connection, and the member connects again."""
 
 _UNANSWERED: Final = "drop-message,message=response"
 """A daemon that starts shows its certificate until it is answered."""

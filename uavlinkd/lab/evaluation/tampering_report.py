@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from uavlinkd.lab.evaluation.frame import NOTHING, ReportSection, Table, duration
-from uavlinkd.lab.evaluation.tampering_plan import DATA, FLEET, HANDSHAKE, KEYS, LINE, PATHS, RELAYED
+from uavlinkd.lab.evaluation.tampering_plan import DATA, FLEET, HANDSHAKE, KEYS, LINE, PATHS, RELAYED, WEB
 from uavlinkd.lab.evaluation.tampering_records import OURS, PAPER, TamperingFindings, Trial, Verdict
 
 _EFFECT = ["attack", "duration", "attempts", "false frames accepted", "genuine frames lost", "recovery", "noticed by"]
@@ -17,6 +17,7 @@ def sections(run: TamperingFindings) -> list[ReportSection]:
         ReportSection("Two paths", [_paths(run)]),
         ReportSection("On a serial line", [_effects(run, LINE)]),
         ReportSection("A hostile relay", [_effects(run, RELAYED)]),
+        ReportSection("A hostile proxy", [_effects(run, WEB)]),
         ReportSection("A fleet with an authority", [_effects(run, FLEET)]),
     ]
     return [part for part in parts if part.tables[0].rows]
@@ -38,7 +39,7 @@ def _table(run: TamperingFindings) -> Table:
     order = {HANDSHAKE: 0, KEYS: 1, DATA: 2}
     rows = []
     for trial in sorted(run.on(OURS), key=lambda trial: (order.get(trial.group, 3), trial.attack)):
-        if trial.group in (PATHS, LINE, RELAYED, FLEET):
+        if trial.group in (PATHS, LINE, RELAYED, WEB, FLEET):
             continue
         other = paper.get(trial.attack)
         rows.append(

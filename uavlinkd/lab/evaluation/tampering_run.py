@@ -33,6 +33,7 @@ from uavlinkd.lab.evaluation.tampering_stages import (
     RelayStage,
     TwoPathStage,
 )
+from uavlinkd.lab.evaluation.web_stage import MiddleWeb, WebStage
 
 PAIR: Final = ("drone0", "drone1")
 TRIO: Final = ("drone0", "drone1", "drone2")
@@ -85,6 +86,7 @@ _LANES: Final = {
     # The radio carries more than ten frames per second, so a lost frame was lost by the attack.
     "line": _Lane(PAIR, _rekeying(10.0, 60.0), 10.0, plans.LINE_PLANS, LineStage, MiddleLine),
     "relay": _Lane(TRIO, _rekeying(2.0, 10.0), 0.25, plans.RELAYED_PLANS, RelayStage, MiddleRelay),
+    "web": _Lane(PAIR, _rekeying(2.0, 10.0), 1.0, plans.WEB_PLANS, WebStage, MiddleWeb),
     "fleet": _Lane(PAIR, _FLEET_LINK, 50.0, plans.FLEET_PLANS, FleetStage),
 }
 

@@ -34,6 +34,8 @@ class DroneProcess:
         endpoint_port: the port for its autopilot, on loopback.
     """
 
+    command = "run"
+
     def __init__(self, name: str, folder: Path, port: int, endpoint_port: int) -> None:
         self.name = name
         self.folder = folder
@@ -110,7 +112,7 @@ class DroneProcess:
         with self.log.open("ab") as log:
             self._process = await asyncio.create_subprocess_exec(
                 *end_with_parent(
-                    *_interpreter(), "-m", "uavlinkd", "run", "--config", str(self.folder / "drone.toml")
+                    *_interpreter(), "-m", "uavlinkd", self.command, "--config", str(self.folder / "drone.toml")
                 ),
                 stdin=asyncio.subprocess.DEVNULL,
                 stdout=log,
