@@ -26,7 +26,7 @@ EVALUATIONS = {
     "tampering": "attack the paper's protocol and real daemons",
     "flight": "let two aircraft exchange positions in flight under attack",
 }
-STAGES = ("handshake", "data", "keys", "paper", "paths", "line", "relay", "fleet")
+STAGES = ("handshake", "data", "keys", "paper", "paths", "line", "relay", "web", "fleet")
 
 _Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
