@@ -274,7 +274,7 @@ def _check(options: argparse.Namespace) -> int:
     from uavlinkd.config.keys import CREDENTIALS
     from uavlinkd.config.load import load_config
     from uavlinkd.config.model import ConfigError
-    from uavlinkd.ops.surroundings import look_around
+    from uavlinkd.ops.surroundings import broadcasts, look_around
     from uavlinkd.ops.topology import print_topology
 
     if options.keys is not None and not (options.keys.is_dir() and os.access(options.keys, os.R_OK | os.X_OK)):
@@ -288,11 +288,14 @@ def _check(options: argparse.Namespace) -> int:
         print(json.dumps({"errors": list(map(str, error.problems))}))
         return WRONG
     lacks = [] if options.elsewhere else look_around(config)
+    errors = [] if options.elsewhere else broadcasts(config)
     if options.json:
-        print(json.dumps({"errors": [], "warnings": config.warnings, "this_machine": lacks}))
+        print(json.dumps({"errors": errors, "warnings": config.warnings, "this_machine": lacks}))
     else:
+        for line in errors:
+            print(f"error: {line}")
         print_topology(config, lacks)
-    return OK
+    return FAILED if errors else OK
 
 
 def _keygen(options: argparse.Namespace) -> int:

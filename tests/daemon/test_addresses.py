@@ -65,7 +65,7 @@ async def test_broadcast_address_is_named_as_the_cause(stage: Stage) -> None:
 
     status = await b.until(send, timeout_s=10.0)
     (found,) = [finding for finding in status["findings"] if finding["name"] == "ground"]
-    assert "cannot be reached (EACCES)" in found["text"]
+    assert "cannot be reached: it fails (EACCES)" in found["text"]
     assert "this is a broadcast address" in found["remedy"]
 
 

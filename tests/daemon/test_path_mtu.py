@@ -73,7 +73,10 @@ class Path:
     async def until_limited(self, size: int) -> None:
         """Wait until the vehicle says that frames share envelopes of this length at most."""
         await self.vehicle.until(
-            lambda status: [one["envelope_bytes"] for one in status["peers"]["drone1"]["paths"]] == [size]
+            lambda status: (
+                [one["envelope_bytes"] for one in status["peers"]["drone1"]["paths"]] == [size]
+                and [one["cause"] for one in status["findings"]] == ["long_datagrams_dropped"]
+            )
         )
 
     async def send(self, bursts: int, frames: int = BURST, each_s: float = 0.02) -> int:

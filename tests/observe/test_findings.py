@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import replace
 from types import SimpleNamespace
@@ -34,6 +35,7 @@ from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.mavlink.egress.lanes import EgressDrop
 from uavlinkd.mavlink.egress.peer_egress import PeerEgress
 from uavlinkd.mavlink.frames import SplitCounters, split_payload
+from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.mavlink.routing import Router
 from uavlinkd.observe.facts import ICMP_S
@@ -535,3 +537,17 @@ def test_frames_that_were_dropped_here_are_named() -> None:
     daemon.cross(sent=[heartbeat()])
     assert "1,748 frames to it waited here" in daemon.findings()["frames_unsent"].text
     assert "frames_unsent" not in daemon.findings(daemon.now + 11)
+
+
+@pytest.mark.parametrize("url", ["udpin:0.0.0.0:14550", "udpout:192.0.2.1:14550"])
+def test_send_error_that_lasts_is_named_while_the_client_sends(daemon: Daemon, url: str) -> None:
+    """Whichever error it is: nothing else shows that one direction is blocked."""
+    endpoint: Any = SimpleNamespace(name="ground", ports=[SimpleNamespace(name="192.0.2.1:1")], frames_sent=0)
+    endpoint.counters, endpoint.failures = SplitCounters(), Counter[str]()
+    daemon.local.append(endpoint)
+    daemon.parts.config.endpoints.append(SimpleNamespace(name="ground", url=parse_url(url), policy={}))
+    for now in range(8):
+        endpoint.counters.frames += 1
+        endpoint.failures["EMSGSIZE"] += 1
+        daemon.history.sample([], [(endpoint, Policy({}, is_local=True))], float(now))
+        assert ("send_fails" in daemon.findings(float(now))) == (now >= 5)

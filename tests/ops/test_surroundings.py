@@ -58,6 +58,18 @@ def test_check_prints_it_unless_the_file_is_for_another_machine(
         assert ("/dev/no-such-tty is not there" in " ".join(capsys.readouterr().out.split())) == is_shown
 
 
+def test_check_refuses_broadcast_addresses_of_this_machine(
+    lacks: Lacks, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A peer and a client are one machine each."""
+    need(sys.platform == "linux", "Linux")
+    lacks(url="udpout:127.255.255.255:14550", address="127.255.255.255:5790")
+    assert main(["check", "--config", str(tmp_path / "drone0.toml")]) == 1
+    says = " ".join(capsys.readouterr().out.split())
+    for place in ('endpoint "autopilot": 127.255.255.255:14550', 'peer "drone1": 127.255.255.255:5790'):
+        assert f"error: {place} is a broadcast address: write the address of one machine" in says
+
+
 def test_a_network_that_is_absent(tmp_path: Path) -> None:
     """Its interface may be plugged in later."""
     need(sys.platform == "linux", "Linux")

@@ -326,6 +326,8 @@ class UdpClient(UdpEndpoint):
 
     def __init__(self, name: str, remote: Address, handler: PortHandler) -> None:
         super().__init__(name, udp_socket(_ANY.get(remote.family, _ANY[socket.AF_INET])), handler)
+        self.other_port = ""
+        """The latest address with another port of the client's host that sent a datagram."""
         self._remote = remote
         self._addresses: Sequence[SocketAddress] = ()
         """The first one is used."""
@@ -398,6 +400,7 @@ class UdpClient(UdpEndpoint):
             return True
         if any(address[0] == used[0] for used in self._ports):
             self.failures["other_port"] += 1
+            self.other_port = str(Address.of(address))
         else:
             self.failures["stranger"] += 1
         return False

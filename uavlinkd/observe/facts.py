@@ -35,8 +35,8 @@ UNROUTED: Final = ("ENETUNREACH", "EHOSTUNREACH", "ENETDOWN", "EADDRNOTAVAIL", "
 SILENT_S: Final = 5.0
 """An endpoint without frames for this time is reported: MAVLink clients send a heartbeat every second. Its errors
 count for the same time. It is opened again more often."""
-_NOT_LISTENING: Final = "ECONNREFUSED"
-_KERNEL_ERRORS: Final = frozenset(errno.errorcode.values())
+NOT_LISTENING: Final = "ECONNREFUSED"
+KERNEL_ERRORS: Final = frozenset(errno.errorcode.values())
 
 
 class Moment:
@@ -186,7 +186,7 @@ class EndpointFacts(PartFacts):
             return "", {}
         url, ports = self.config.url, self.endpoint.ports
         failures = self.history.failures.within(SILENT_S, self.now)
-        error = next((name for name in failures if name in _KERNEL_ERRORS or name == "connect_timeout"), "")
+        error = next((name for name in failures if name in KERNEL_ERRORS or name == "connect_timeout"), "")
         # A client of `udpin` has sent MAVLink: the bytes are another sender's.
         is_known = url.kind is EndpointKind.UDPIN and bool(ports)
         if not is_known and self.history.garbage.within(SILENT_S, self.now):
@@ -201,7 +201,7 @@ class EndpointFacts(PartFacts):
             return "no_client", {"silent_s": silent_s}
         if "not_resolved" in failures or (url.kind is EndpointKind.UDPOUT and not ports):
             why, meaning = "its host has no address now", "write an IP address, or see `getent hosts NAME`"
-        elif error in ("", _NOT_LISTENING, "connect_timeout"):
+        elif error in ("", NOT_LISTENING, "connect_timeout"):
             why, meaning = "no process listens there", "start the client there, or correct the port"
         else:
             why, meaning = "it fails", meaning_of(error)

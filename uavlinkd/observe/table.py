@@ -254,6 +254,11 @@ OF_PEER_UP: Final = (
         "look for a bad radio, a full network or a rate limit in this direction",
     ),
     Row(
+        *("long_datagrams_dropped", WARNING, CERTAIN, traffic_signs.long_datagrams_dropped),
+        "the path to {path} drops datagrams of {dropped:,} bytes: frames share shorter ones, up to {limit:,} bytes",
+        "nothing is lost by that; if the path should carry more, look for a tunnel with a small MTU",
+    ),
+    Row(
         *("frames_unsent", WARNING, CERTAIN, traffic_signs.frames_unsent),
         "{count:,} frames to it waited here for room on its network, and were dropped: clients here send more than"
         " the network, the connection by TLS or budget_bits_s carries",
@@ -394,6 +399,15 @@ OF_ENDPOINT: Final = (
         *("{url} cannot be reached: {why}", "{meaning}"),
         Exit.EVERYWHERE,
         code=3,
+    ),
+    Row(
+        *("send_fails", WARNING, CERTAIN, traffic_signs.send_fails),
+        *("datagrams to clients of {url} are lost ({error})", "{meaning}"),
+    ),
+    Row(
+        *("other_port", WARNING, CERTAIN, traffic_signs.other_port),
+        "datagrams from {other} are dropped: the client is {url}, at another port",
+        "let the client send from that port; or write udpin:HOST:PORT here, and let the client send there",
     ),
 )
 

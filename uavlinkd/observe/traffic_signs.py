@@ -11,12 +11,16 @@ from typing import Final
 from uavlinkd.core import constants as c
 from uavlinkd.core.peer import Peer
 from uavlinkd.core.refusals import Claim
+from uavlinkd.endpoints.udp import UdpClient
+from uavlinkd.endpoints.url import EndpointKind
 from uavlinkd.mavlink.dialect import command_name, name_of
 from uavlinkd.mavlink.egress.lanes import EgressDrop
 from uavlinkd.mavlink.policy.gate import ANY_OTHER, REFUSALS, Refusal
-from uavlinkd.observe.facts import EndpointFacts, PartFacts, PeerFacts, listed
+from uavlinkd.observe.facts import KERNEL_ERRORS, NOT_LISTENING, SILENT_S, EndpointFacts, PartFacts, PeerFacts, listed
 from uavlinkd.observe.history import GateHistory
 from uavlinkd.observe.signs import SECURITY_S, Signs
+from uavlinkd.ops.log import shown
+from uavlinkd.system.error_meanings import meaning_of
 
 COMMANDS_S: Final = 300.0
 """A refused command stays in the findings for this time: a person looks some time after the press of a button."""
@@ -57,6 +61,14 @@ def high_loss(peer: PeerFacts) -> Signs:
     ]
     if shares:
         yield {"losses": " and ".join(shares)}
+
+
+def long_datagrams_dropped(peer: PeerFacts) -> Signs:
+    """Along one path after the other: frames share shorter envelopes there."""
+    for state in peer.link.peer.paths.states:
+        limit = state.envelope_limit
+        if state.works and limit.dropped:
+            yield {"path": shown(state.path.address), "dropped": limit.dropped, "limit": limit.limit}
 
 
 def frames_unsent(peer: PeerFacts) -> Signs:
@@ -212,3 +224,19 @@ def is_silent_by(cause: str) -> Callable[[EndpointFacts], Signs]:
             yield fields
 
     return signs
+
+
+def send_fails(endpoint: EndpointFacts) -> Signs:
+    """An error of the kernel that lasts: nothing else shows that one direction is blocked."""
+    url, failures = endpoint.config.url, endpoint.history.failures
+    errors = [name for name in failures.lasting(endpoint.now) if name in KERNEL_ERRORS - {NOT_LISTENING}]
+    is_shown_otherwise = url.kind is EndpointKind.UDPOUT and bool(endpoint.silence[0])
+    if errors and url.kind in (EndpointKind.UDPIN, EndpointKind.UDPOUT) and not is_shown_otherwise:
+        yield {"error": errors[0], "meaning": meaning_of(errors[0])}
+
+
+def other_port(endpoint: EndpointFacts) -> Signs:
+    """The client's host answers, from a port that anybody on it may have."""
+    client = endpoint.endpoint
+    if isinstance(client, UdpClient) and "other_port" in endpoint.history.failures.within(SILENT_S, endpoint.now):
+        yield {"other": client.other_port}

@@ -6,13 +6,16 @@ resolves no name and sends nothing.
 
 from __future__ import annotations
 
+import errno
 import os
+import socket
 import stat
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 from uavlinkd.config.model import Config
-from uavlinkd.endpoints.sockets import look
+from uavlinkd.endpoints.sockets import family_of, look
 from uavlinkd.endpoints.url import NetworkUrl, SerialUrl
 
 _MAX_SOCKET_PATH = 107
@@ -22,6 +25,25 @@ _SERIAL_DEVICES = ("serial/by-id/*", "ttyACM*", "ttyUSB*", "serial0")
 def look_around(config: Config) -> list[str]:
     """Sentences for a person. The daemon may run in spite of them, now or later."""
     return [*_serial(config), *_listening(config), *_control_socket(config), *_networks(config)]
+
+
+def broadcasts(config: Config) -> list[str]:
+    """Errors: addresses that are not those of one machine. The kernel knows the broadcast addresses of the interfaces
+    that are up, and refuses to connect.
+    """
+    named = [(f'peer "{peer.name}"', one.address) for peer in config.peers for one in peer.addresses]
+    named += [(f'relay "{relay.name}"', one.address) for relay in config.relays for one in relay.addresses]
+    named += [
+        (f'endpoint "{one.name}"', one.url.address) for one in config.endpoints if isinstance(one.url, NetworkUrl)
+    ]
+    errors: list[str] = []
+    for section, address in named:
+        if address.ip is None:
+            continue
+        with socket.socket(family_of(address.host), socket.SOCK_DGRAM) as probe, suppress(OSError):
+            if probe.connect_ex((address.host, address.port)) == errno.EACCES:
+                errors.append(f"{section}: {address} is a broadcast address: write the address of one machine")
+    return errors
 
 
 def _listening(config: Config) -> Iterator[str]:
