@@ -216,8 +216,12 @@ class Line:
                 if isinstance(port, PeerLink) and not (
                     port.peer.paths.is_multiple or port.output.egress is not None or port.output.repair.is_on
                 ):
+                    peer = port.peer
                     port.frames_sent += len(batch)
-                    self.perform(send_frames(port.peer, list(map(RAW, batch)), now, STREAM))
+                    out = send_frames(peer, list(map(RAW, batch)), now, STREAM)
+                    if peer.timers.next_at < peer.timers.scheduled_at:  # as Node.send() does, without a call
+                        self._schedule.update(peer)
+                    self.perform(out)
                 else:
                     port.send(batch, known.source, now, waited_s)
             except Exception as error:
