@@ -21,7 +21,7 @@ from uavlinkd.system.terminal import FAILED, OK, WRONG, CommandError, UsageError
 
 _LINE_LIMIT = 4096
 OF_THE_LABORATORY = {
-    "sim": "fly a simulated autopilot, or play a recorded flight",
+    "sim": "fly a simulated autopilot",
     "demo": "run two daemons on this machine that exchange frames",
     "evaluate": "measure uavlinkd: beside the paper's method, under attack, and in flight",
 }

@@ -31,7 +31,7 @@ local TYPES = {
 }
 local AEAD_TAG_BYTES, COOKIE_BYTES, CERTIFICATE_BYTES = 16, 52, 100
 local TAG_LENGTHS = { 16, 8, 12 } -- 16 is the default, so it comes first
-local IS_TAG_LENGTH = { [8] = true, [12] = true, [16] = true, [32] = true }
+local IS_TAG_LENGTH = { [8] = true, [12] = true, [16] = true }
 
 -- Control records: first byte of the payload, name, bytes. Payloads of frames start at 0xF0 or above.
 local RECORDS = {

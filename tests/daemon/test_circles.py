@@ -13,6 +13,7 @@ from tests.daemon.fleet import drone_and_ground
 from tests.daemon.frames import command_long, heartbeat
 from tests.daemon.harness import Stage
 from tests.daemon.udp import Sockaddr, open_socket
+from uavlinkd.lab.sim.loopback_ports import free_port
 
 ARM = command_long(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 255, param1=1.0)
 
@@ -31,6 +32,22 @@ def bridge(one: Sockaddr, two: Sockaddr) -> Iterator[tuple[socket.socket, socket
     for sock in sockets:
         loop.remove_reader(sock)
         sock.close()
+
+
+async def test_a_script_that_is_run_again_sends_its_command_again(stage: Stage) -> None:
+    """Equal bytes from a new socket each time, by UDP and by TCP: all arrive."""
+    drone, ground = drone_and_ground(stage)
+    into, autopilot = drone.add_endpoint("autopilot"), await stage.client()
+    by_udp, by_tcp = ground.add_endpoint("udp"), ground.add_endpoint("tcp", f"tcpin:127.0.0.1:{free_port()}")
+    await stage.start(drone, ground)
+    autopilot.send(heartbeat(1), into)
+    await ground.until(lambda status: status["peers"]["drone1"]["frames_received"] == 1)
+    for number in range(12):
+        with socket.socket(type=socket.SOCK_STREAM if number % 2 else socket.SOCK_DGRAM) as client:
+            client.connect(by_tcp if number % 2 else by_udp)
+            client.send(ARM)
+            await autopilot.until(lambda number=number: autopilot.frames.count(ARM) == number + 1)  # type: ignore[misc]
+    assert "duplicate" not in (await ground.status())["unrouted"]
 
 
 async def test_bridge_between_two_endpoints_makes_no_copies(stage: Stage) -> None:

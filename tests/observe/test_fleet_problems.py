@@ -167,7 +167,8 @@ async def test_bulletins_that_contradict_each_other(tmp_path: Path) -> None:
     assert member.record(BulletinRecord(b64decode(bulletin(3, 8)))) is None
     findings = member.findings()
     assert {cause: finding.severity for cause, finding in findings.items()} == {
-        "bulletin_conflict": Severity.SECURITY
+        "bulletin_conflict": Severity.SECURITY,
+        "bulletin_rolled_back": Severity.WARNING,
     }
     assert all(finding.text.startswith("drone1 ") for finding in findings.values())
     assert member.findings(NOW + EVENT_S) == {}

@@ -12,6 +12,7 @@ import pytest
 from tests.config.files import ADDRESSES, ENDPOINT, PEER, TOP, URL, load
 from tests.needs import need
 from uavlinkd.cli import main
+from uavlinkd.endpoints.sockets import Presence
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.ops import surroundings
 
@@ -37,6 +38,17 @@ def test_complete_machine_has_no_line(lacks: Lacks) -> None:
     """Free ports, existing folders, numeric addresses."""
     assert lacks() == []
     assert lacks(listen=f"0.0.0.0:{free_port()}", url=f"tcpin:0.0.0.0:{free_port()}") == []
+
+
+def test_an_address_of_this_daemon_is_no_peers(lacks: Lacks, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It listens on every address. Another port is another software."""
+    port = free_port()
+    assert lacks(f"0.0.0.0:{port}", address=f"192.0.2.7:{port}") == []
+    monkeypatch.setattr(surroundings, "look", lambda _, host: Presence(hosts=(host,)))
+    assert lacks(f"0.0.0.0:{port}", address=f"192.0.2.7:{port}") == [
+        f'peer "drone1": 192.0.2.7:{port} is an address of this daemon itself: write that of the other machine'
+    ]
+    assert lacks(f"0.0.0.0:{port}", address="192.0.2.7:9") == []
 
 
 def test_control_socket(lacks: Lacks, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -181,6 +181,15 @@ def bulletin_conflict(moment: Moment) -> Signs:
             return
 
 
+def bulletin_rolled_back(moment: Moment) -> Signs:
+    """Who stated an older bulletin than before."""
+    if (fleet := moment.daemon.fleet) is not None:
+        from uavlinkd.authority.exchange import ROLLED_BACK  # noqa: PLC0415  only if configured
+
+        if ROLLED_BACK in (noticed := fleet.noticed(moment.now)):
+            yield {"by": noticed[ROLLED_BACK][1]}
+
+
 MEMBER_REFUSALS: Final = (
     *(DropReason.BAD_CERTIFICATE, DropReason.CERTIFICATE_REVOKED),
     *(DropReason.MEMBER_CONFLICT, DropReason.ROLE_NOT_ACCEPTED),

@@ -144,6 +144,11 @@ OF_DAEMON: Final = (
         "compare both folders of the authority; publish one with a higher number that revokes what both do",
     ),
     Row(
+        *("bulletin_rolled_back", WARNING, CLAIM, signs.bulletin_rolled_back),
+        "{by} has an older bulletin than it had: its disk was restored, or a second machine has its key",
+        "it gets the newest one now: compare the machine, and replace its key if two have it",
+    ),
+    Row(
         *("bad_certificate", WARNING, HINT, signs.member_refused(DropReason.BAD_CERTIFICATE)),
         "the authority of this fleet did not sign the certificate of {senders}",
         "if the sender is yours, run `uavlinkd enroll` there again, for this fleet; else it is an attacker",

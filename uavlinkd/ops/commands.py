@@ -42,7 +42,7 @@ def add_parsers(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
         "--count", metavar="N", type=int, default=5, help="questions, one a second (default: %(default)s)"
     )
     add_json(ping)
-    text = "show whether UDP gets out, how relays see this machine, and its NAT"
+    text = "show whether UDP and TLS reach each relay, and the public address of this machine"
     add_json(for_daemon(commands, "netcheck", _netcheck, text))
     text = "record the frames that a daemon sends to a local client, until Ctrl-C"
     record = commands.add_parser("record", help=text, description=f"{text[0].upper()}{text[1:]}.")

@@ -17,6 +17,7 @@ from pathlib import Path
 from uavlinkd.config.model import Config
 from uavlinkd.endpoints.sockets import family_of, look
 from uavlinkd.endpoints.url import NetworkUrl, SerialUrl
+from uavlinkd.system.addresses import Address
 
 _MAX_SOCKET_PATH = 107
 _SERIAL_DEVICES = ("serial/by-id/*", "ttyACM*", "ttyUSB*", "serial0")
@@ -24,26 +25,40 @@ _SERIAL_DEVICES = ("serial/by-id/*", "ttyACM*", "ttyUSB*", "serial0")
 
 def look_around(config: Config) -> list[str]:
     """Sentences for a person. The daemon may run in spite of them, now or later."""
-    return [*_serial(config), *_listening(config), *_control_socket(config), *_networks(config)]
+    lacks = _serial, _listening, _own_addresses, _control_socket, _networks
+    return [line for look_for in lacks for line in look_for(config)]
 
 
 def broadcasts(config: Config) -> list[str]:
     """Errors: addresses that are not those of one machine. The kernel knows the broadcast addresses of the interfaces
     that are up, and refuses to connect.
     """
-    named = [(f'peer "{peer.name}"', one.address) for peer in config.peers for one in peer.addresses]
-    named += [(f'relay "{relay.name}"', one.address) for relay in config.relays for one in relay.addresses]
-    named += [
-        (f'endpoint "{one.name}"', one.url.address) for one in config.endpoints if isinstance(one.url, NetworkUrl)
-    ]
     errors: list[str] = []
-    for section, address in named:
-        if address.ip is None:
-            continue
+    for section, address in _numeric(config):
         with socket.socket(family_of(address.host), socket.SOCK_DGRAM) as probe, suppress(OSError):
             if probe.connect_ex((address.host, address.port)) == errno.EACCES:
                 errors.append(f"{section}: {address} is a broadcast address: write the address of one machine")
     return errors
+
+
+def _numeric(config: Config) -> list[tuple[str, Address]]:
+    """The numeric addresses that the daemon sends to, each with its section."""
+    named = [(f'peer "{peer.name}"', one.address) for peer in config.peers for one in peer.addresses]
+    named += [
+        (f'relay "{one.name}"', to.address) for one in config.relays if one.peer is None for to in one.addresses
+    ]
+    named += [
+        (f'endpoint "{one.name}"', one.url.address) for one in config.endpoints if isinstance(one.url, NetworkUrl)
+    ]
+    return [(section, address) for section, address in named if address.ip is not None]
+
+
+def _own_addresses(config: Config) -> Iterator[str]:
+    """Peers, relays and clients whose address is this daemon's."""
+    ports = {address.port for address in config.listen}
+    for section, address in _numeric(config):
+        if address.port in ports and look(None, address.host).hosts:
+            yield f"{section}: {address} is an address of this daemon itself: write that of the other machine"
 
 
 def _listening(config: Config) -> Iterator[str]:

@@ -1,1 +1,1 @@
-"""A simulated autopilot and the replay of recorded flights: MAVLink endpoints to try a link with, without a drone."""
+"""A simulated autopilot: a MAVLink endpoint to try a link with, without a drone."""
