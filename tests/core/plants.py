@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from uavlinkd.core import constants as c
-from uavlinkd.core import establish, freshness, receive, send
+from uavlinkd.core import freshness, receive, send
 from uavlinkd.core.counters import ReplayWindow
 from uavlinkd.core.drops import Drop, DropReason
 from uavlinkd.core.initiator import Initiator
@@ -101,7 +101,7 @@ FAULTS: dict[str, Fault] = {
     "a removed peer keeps its keys": (Node, "remove_peer", _keeps_a_removed_peer),
     "indices leak": (Initiator, "_forget", _keeps_the_index),
     "one initiation is all": (Initiator, "begin_try", _initiates_once),
-    "an exception": (establish, "receive_hint", _raises),
+    "an exception": (receive, "receive_hint", _raises),
     "no copies": (PathSet, "_set_routes", _copies_nothing),
     "handshakes along one path": (PathSet, "handshake_paths", _tries_one_path),
     "no order": (Session, "order_of", _returns_zero),

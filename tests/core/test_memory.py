@@ -42,7 +42,7 @@ def test_three_days_of_a_member_take_no_more_memory_than_an_hour(has_paths: bool
     finally:
         tracemalloc.stop()
     hour, days = sizes
-    assert days - hour < 24 * 1024
+    assert days - hour < 32 * 1024  # caches of the interpreter fill during the first hours
     assert days < 2 * BYTES_PER_MEMBER, "both ends are here"
     assert len(pair.b.peer.remembered) == c.REMEMBERED_LEAST
     assert c.REMEMBERED_LEAST <= c.REMEMBERED_INITIATIONS // MEMBERS

@@ -13,10 +13,9 @@ from uavlinkd.authority import enrolment, trust
 from uavlinkd.config import checks as config_checks
 from uavlinkd.config import keys
 from uavlinkd.config import load as config_load
-from uavlinkd.core import certificates, counters, handshake, path_state, probe, receive, refusals, session, wire
-from uavlinkd.core import node as core_node
+from uavlinkd.core import certificates, counters, handshake, path_state, receive, refusals, session, wire
 from uavlinkd.core.drops import Drop, DropReason
-from uavlinkd.core.outputs import Transmit
+from uavlinkd.core.outputs import Deliver, Transmit
 from uavlinkd.endpoints import line_framing, web_stream
 from uavlinkd.lab.mitm import anatomy
 from uavlinkd.lab.mitm import proxy_settings as mitm_settings
@@ -91,9 +90,10 @@ def _marks_first(right: Any) -> Any:
 
 
 def _delivers_control(right: Any) -> Any:
-    def receive_control(arrived: Any, payload: bytes) -> Any:
-        out, frames_behind = right(arrived, payload)
-        return out, payload if payload[0] == probe.PROBE and not frames_behind else frames_behind
+    def receive_control(arrived: Any, payload: bytes, out: Any) -> None:
+        right(arrived, payload, out)
+        if isinstance(control := wire.parse_control(payload), wire.ProbeAndFrames) and not control.frames:
+            out.append(Deliver(arrived.peer, payload))
 
     return receive_control
 
@@ -173,9 +173,9 @@ def _always(result: object) -> Callable[[Any], Any]:
 
 
 PLANTS: Final = {
-    "a bare MAVLink frame is answered": Plant("idle", core_node.Node, "receive", _answers_strangers),
-    "an exception at one length": Plant("session", core_node.Node, "receive", _index_error_at(43)),
-    "a drop is counted twice": Plant("initiator", core_node.Node, "receive", _counts_twice),
+    "a bare MAVLink frame is answered": Plant("idle", receive.DatagramReceiver, "receive", _answers_strangers),
+    "an exception at one length": Plant("session", receive.DatagramReceiver, "receive", _index_error_at(43)),
+    "a drop is counted twice": Plant("initiator", receive.DatagramReceiver, "receive", _counts_twice),
     "any tag is accepted": Plant("session", session, "equal", _always(True)),
     "any tag confirms": Plant("responder", session, "equal", _always(True)),
     "forgeries use up counters": Plant("session", session.Session, "open", _marks_first),
