@@ -14,6 +14,7 @@ from tests.mavlink.inside import remembered_frames
 from tests.mavlink.policy.smuggling import SET_MODE, v1, v2
 from uavlinkd.core.peer import Peer as CorePeer
 from uavlinkd.endpoints.ports import Endpoint, LocalPort, PortHandler
+from uavlinkd.link import line as line_module
 from uavlinkd.link import switch as switch_module
 from uavlinkd.link.journal import DaemonJournal, ShellReason
 from uavlinkd.link.peer_link import PeerLink
@@ -256,7 +257,7 @@ def test_frames_from_before_a_pause_are_dropped_and_counted(stage: Stage, monkey
     """Also if the process pauses after it has read them. Those that come later pass."""
     read_in = stage.stall.turn(monotonic())
     paused = monotonic() + 2 * STALL_S
-    monkeypatch.setattr(switch_module, "monotonic", lambda: paused)
+    monkeypatch.setattr(line_module, "monotonic", lambda: paused)
     stage.line.forward(stage.a.port, [attitude(1), attitude(2)], paused, read_in)
     assert (stage.delivered(), stage.stale, stage.stall.dropped) == ((0, 0, 0), 2, {"a": 2})
     stage.line.forward(stage.a.port, [attitude(3)], paused, read_in + 1)
