@@ -147,7 +147,7 @@ PLACES: Final[Sequence[Place]] = (
     Place("link/line.py", "Line.forward", who=CALLED, times=MOST_FAULTS),
     Place("core/receive.py", "_receive_other", who=CALLED, times=MOST_FAULTS),
     Place("link/peers.py", "Peers.follow", trigger="reload"),
-    Place("link/carrier.py", "FrameCarrier._on_timer", stops=True),
+    Place("link/carrier.py", "FrameCarrier._on_timer"),
     Place("link/daemon.py", "Daemon._do_housekeeping", stops=True),
 )
 
