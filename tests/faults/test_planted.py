@@ -22,7 +22,7 @@ SAMPLE = list({(place.file, place.stops, place.times > 1): place for place in PL
 
 @pytest.mark.parametrize("floods", [False, True], ids=["quiet", "flood"])
 async def test_fault_costs_only_its_own(floods: bool) -> None:
-    """The other links lose no frame, and the failing one is back within 5 s; or the process ends.
+    """A fault in one link: the others lose no frame, and it is back within 5 s; or the process ends.
 
     ``python -m tests.faults.planted`` has all places.
     """

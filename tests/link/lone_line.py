@@ -17,6 +17,6 @@ if TYPE_CHECKING:
 
 
 def lone_line(switch: Switch, stall: StallWatch, drops: DaemonJournal) -> Line:
-    """It forwards between clients."""
+    """A line that forwards between clients."""
     node = cast("Node", SimpleNamespace(schedule=Schedule()))
     return Line(switch, stall, drops, node, {}, cast("PeerSockets", None))

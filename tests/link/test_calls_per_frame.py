@@ -19,14 +19,11 @@ from types import FrameType
 from typing import Any
 
 import pytest
-from pymavlink.dialects.v20 import all as mavlink
 
 from tests.daemon.udp import Client, open_client
+from tests.daemon_pair import ANY_PORT, are_linked, attitude, config
 from tests.endpoints.clients import address_of
 from tests.waiting import until
-from uavlinkd.config.model import Config, EndpointConfig, Log, PeerAddress, PeerConfig
-from uavlinkd.core.crypto import KeyPair, Secret
-from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.endpoints.udp import UdpEndpoint
 from uavlinkd.endpoints.url import EndpointKind, NetworkUrl
 from uavlinkd.link.daemon import Daemon
@@ -37,11 +34,6 @@ MOST_FILES = 6
 FRAMES = 60
 APART_S = 0.003
 """Longer than a socket counts as busy: each frame is read alone."""
-
-ANY_PORT = Address("127.0.0.1", 0)
-PRIVATE = {"left": bytes([1]) * 32, "right": bytes([2]) * 32}
-PUBLIC = {name: KeyPair(private).public for name, private in PRIVATE.items()}
-VEHICLE, OPERATOR = {"role": "vehicle", "system_ids": [1]}, {"role": "operator", "system_ids": [255]}
 
 
 class CallCounter:
@@ -66,25 +58,6 @@ class CallCounter:
         return self.paths[port].most_common(1)[0][0]
 
 
-def config(name: str, url: NetworkUrl, peer: str, addresses: tuple[Address, ...], rules: dict[str, Any]) -> Config:
-    """A daemon with one endpoint and one peer, all on ports that the kernel chooses."""
-    return Config(
-        path=Path(name),
-        name=name,
-        private_key=Secret(PRIVATE[name]),
-        public_key=PUBLIC[name],
-        listen=(ANY_PORT,),
-        endpoints=(EndpointConfig("client", url),),
-        peers=(
-            PeerConfig(PeerSettings(peer, PUBLIC[peer], None, Link()), tuple(map(PeerAddress, addresses)), rules),
-        ),
-        relays_frames=False,
-        control_socket=None,
-        log=Log("info", "json"),
-        warnings=(),
-    )
-
-
 class Scene:
     """A client at ``udpin`` of the left daemon, and a client that the right daemon sends to by ``udpout``."""
 
@@ -97,14 +70,12 @@ class Scene:
         """Start everything; returns when the daemons are linked."""
         self.client, self.ground = await open_client(), await open_client()
         ground = NetworkUrl(EndpointKind.UDPOUT, Address(*self.ground.address))
-        self.right = Daemon(config("right", ground, "left", (), VEHICLE))
+        self.right = Daemon(config("right", ground))
         await self.right.start()
         called = tuple(self.right.parts.peer_sockets.addresses)
-        self.left = Daemon(config("left", NetworkUrl(EndpointKind.UDPIN, ANY_PORT), "right", called, OPERATOR))
+        self.left = Daemon(config("left", NetworkUrl(EndpointKind.UDPIN, ANY_PORT), called))
         await self.left.start()
-        await until(
-            lambda: all(link.peer.is_up for link in (self.left.parts.links["right"], self.right.parts.links["left"]))
-        )
+        await until(lambda: are_linked(self.left, self.right))
 
     async def stop(self) -> None:
         """Stop everything."""
@@ -122,13 +93,6 @@ class Scene:
             self.client.send(raw, address_of(endpoint))
             await self.ground.until_received(raw)
             await asyncio.sleep(APART_S)
-
-
-def attitude(number: int) -> bytes:
-    """A frame that differs from that of every other number."""
-    codec = mavlink.MAVLink(None, 1, 1)
-    codec.seq = number % 256
-    return bytes(mavlink.MAVLink_attitude_message(number, 1.5, 0.5, 0.25, 0.1, 0.1, 0.1).pack(codec))
 
 
 def endpoint_of(daemon: Daemon) -> UdpEndpoint:

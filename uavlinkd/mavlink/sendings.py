@@ -70,7 +70,7 @@ class Sendings:
         """By the bytes of a frame: source, time, ports and number, or a `_Sending` if it arrived again. The path of a
         frame adds what is not here, without a call of :meth:`is_new`."""
         self.seen_before: dict[bytes, Any] = {}
-        """The same for the previous half."""
+        """Frames of the previous half, as in :attr:`seen`."""
         self.half_ends_at = float("-inf")
         """When a half of the memory is over."""
         self.count = 0

@@ -18,9 +18,9 @@ FINDING_DELAY_S = 2.0
 """A finding is logged if it lasts for so long; one about an attack at once. Three lost answers in a row make a moment
 of unverified freshness, which 1 % of loss causes about once a day."""
 ENDPOINT_DELAY_S = 15.0
-"""The same for an endpoint: its client may restart."""
+"""A finding about an endpoint is logged if it lasts for so long: its client may restart."""
 ENDED_PROBLEMS = 100
-"""So many findings that ended are kept for a page that shows them."""
+"""Findings that ended, at most, that are kept for a page that shows them."""
 FINDING_QUIET_S = 10.0
 """A finding has ended when it was absent for so long, see :data:`uavlinkd.observe.conditions.QUIET_S`."""
 

@@ -125,14 +125,17 @@ class PeerFacts(PartFacts):
         self.link = link
         self.is_certified = link.config.settings.is_certified
         self.addresses = listed(map(str, link.config.addresses))
-        """Those of the file."""
+        """Addresses of the peer in the file, as a text."""
 
     def seen(self, kind: str) -> Sighting | None:
         """Evidence since the link went down."""
         return self.moment.current(self.daemon.evidence.seen(kind, self.link, self.now), kind, self.link)
 
     def handshake_seen(self, reason: DropReason) -> Sighting | None:
-        """The same; of a peer without addresses, from any sender while it is the only such peer that is not up."""
+        """Evidence of a handshake since the link went down.
+
+        Of a peer without addresses: from any sender, while it is the only such peer that is not up.
+        """
         if self.link.config.addresses or self.link.relayed:
             return self.seen(reason)
         if not self.moment.has_sole_waiting:

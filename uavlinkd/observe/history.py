@@ -18,7 +18,7 @@ LASTING_S: Final = 5.0
 HIDDEN_SHARE: Final = 0.02
 """Fewer frames hide others by accident: of random bytes, at most 0.2 % do."""
 HIDDEN_LEAST: Final = 10
-"""So many more than this share are a sign of an attack."""
+"""Hiding frames beyond :data:`HIDDEN_SHARE` that are a sign of an attack."""
 
 BLOCKED_S: Final = 10.0
 """How far back refusals count for whether frames pass."""

@@ -48,7 +48,7 @@ def count(folder: Path, *, python: str = sys.executable) -> dict[str, Cost]:
     subprocess.run(["gcc", "-O2", "-shared", "-fPIC", "-o", library, SOURCE, "-ldl"], check=True)
     command = [*VALGRIND, f"--callgrind-out-file={out}", python, "-m", "tests.bench.cost.pair"]
     environment = {**os.environ, "LD_PRELOAD": str(library), "PYTHONPATH": str(ROOT)}
-    arguments = [str(library), str(FRAMES), "1"]
+    arguments = [str(library), str(FRAMES)]
     done = subprocess.run(
         [*command, *arguments], env=environment, cwd=folder, capture_output=True, text=True, check=False
     )

@@ -1,4 +1,4 @@
-"""Two linked daemons in one process, and a frame that goes from a client of the one to a client of the other.
+"""Two linked daemons in one process, and frames that go from a client of the one to a client of the other.
 
 Started by :mod:`.count` under callgrind. The callbacks that the daemons gave to the loop are called here, one after
 the other, so that exactly the work of one end is counted.
@@ -9,36 +9,24 @@ from __future__ import annotations
 import asyncio
 import ctypes
 import gc
-import json
 import socket
 import sys
 from collections.abc import Callable
-from pathlib import Path
+from contextlib import suppress
 from typing import Any, Final
 
-from pymavlink.dialects.v20 import all as mavlink
-
+from tests.daemon_pair import ANY_PORT, are_linked, attitude, config
 from tests.waiting import until
-from uavlinkd.config.model import Config, EndpointConfig, Log, PeerAddress, PeerConfig
-from uavlinkd.core.crypto import KeyPair, Secret
-from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.endpoints.url import EndpointKind, NetworkUrl
 from uavlinkd.link.daemon import Daemon
 from uavlinkd.system.addresses import Address
 
-ANY_PORT: Final = Address("127.0.0.1", 0)
-KEYS: Final = {"left": KeyPair(bytes([1]) * 32), "right": KeyPair(bytes([2]) * 32)}
-PRIVATE: Final = {"left": bytes([1]) * 32, "right": bytes([2]) * 32}
-RULES: Final[dict[str, dict[str, Any]]] = {
-    "left": {"role": "vehicle", "system_ids": [1]},
-    "right": {"role": "operator", "system_ids": [255]},
-}
 SIDES: Final = ("sending", "receiving")
 WARM_UP: Final = 60
 
 
 class Loop(asyncio.SelectorEventLoop):
-    """An event loop that knows the callback of each socket."""
+    """An event loop that knows the callback of each UDP socket, by its port."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -46,7 +34,8 @@ class Loop(asyncio.SelectorEventLoop):
 
     def add_reader(self, fd: Any, callback: Callable[..., Any], *args: Any) -> None:  # type: ignore[override]
         super().add_reader(fd, callback, *args)
-        self.callbacks[fd if isinstance(fd, int) else fd.fileno()] = lambda: callback(*args)
+        if isinstance(fd, socket.socket) and fd.type == socket.SOCK_DGRAM and fd.family == socket.AF_INET:
+            self.callbacks[fd.getsockname()[1]] = lambda: callback(*args)
 
 
 class Counting:
@@ -60,35 +49,8 @@ class Counting:
         self._library.dump(name.encode())
 
 
-def config(
-    name: str, peer: str, listen: tuple[Address, ...], url: NetworkUrl, addresses: tuple[Address, ...]
-) -> Config:
-    """A daemon with one client and one peer."""
-    settings = PeerSettings(peer, KEYS[peer].public, None, Link())
-    return Config(
-        path=Path(name),
-        name=name,
-        private_key=Secret(PRIVATE[name]),
-        public_key=KEYS[name].public,
-        listen=listen,
-        endpoints=(EndpointConfig("client", url),),
-        peers=(PeerConfig(settings, tuple(map(PeerAddress, addresses)), RULES[peer]),),
-        relays_frames=False,
-        control_socket=None,
-        log=Log("error", "json"),
-        warnings=(),
-    )
-
-
-def attitude(number: int) -> bytes:
-    """A frame of 40 bytes that differs from that of every other number."""
-    codec = mavlink.MAVLink(None, 1, 1)
-    codec.seq = number % 256
-    return bytes(mavlink.MAVLink_attitude_message(number, 1.5, 0.5, 0.25, 0.1, 0.1, 0.1).pack(codec))
-
-
 def open_client() -> socket.socket:
-    """A client's socket."""
+    """The socket of a client."""
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     sock.bind(("127.0.0.1", 0))
     sock.setblocking(False)
@@ -103,56 +65,34 @@ class Pair:
         self._client, self._ground = open_client(), open_client()
         self._number = 0
 
-    async def start(self, paths: int) -> None:
-        """Link the daemons. ``paths``: at so many ports of the right one."""
+    async def start(self) -> None:
+        """Link the daemons."""
+        callbacks = self._loop.callbacks
         ground = NetworkUrl(EndpointKind.UDPOUT, Address(*self._ground.getsockname()))
-        before = set(self._loop.callbacks)
-        self._right = Daemon(config("right", "left", (ANY_PORT,) * paths, ground, ()))
-        await self._right.start()
-        called = tuple(self._right.parts.peer_sockets.addresses)
-        self._at_right = self._new_callbacks(before, {address.port for address in called})
-        before = set(self._loop.callbacks)
-        self._left = Daemon(config("left", "right", (ANY_PORT,), NetworkUrl(EndpointKind.UDPIN, ANY_PORT), called))
-        await self._left.start()
-        links = self._left.parts.links["right"], self._right.parts.links["left"]
-        await until(lambda: all(link.peer.is_up for link in links))
-        own = {address.port for address in self._left.parts.peer_sockets.addresses}
-        self._at_left = self._new_callbacks(before, None, own)
+        right = Daemon(config("right", ground))
+        await right.start()
+        (called,) = right.parts.peer_sockets.addresses
+        before = set(callbacks)
+        left = Daemon(config("left", NetworkUrl(EndpointKind.UDPIN, ANY_PORT), (called,)))
+        await left.start()
+        await until(lambda: are_linked(left, right))
+        own = {address.port for address in left.parts.peer_sockets.addresses}
+        (self._client_port,) = set(callbacks) - before - own
+        self._receive = {"sending": callbacks[self._client_port], "receiving": callbacks[called.port]}
 
-    def _new_callbacks(
-        self, before: set[int], ports: set[int] | None, others: set[int] | None = None
-    ) -> list[tuple[int, Callable[[], object]]]:
-        found = []
-        for fd, callback in self._loop.callbacks.items():
-            if fd in before:
-                continue
-            port = port_of(fd)
-            if port and (ports is None or port in ports) and (others is None or port not in others):
-                found.append((port, callback))
-        return found
-
-    async def carry(self, frames: int, side: str | None) -> int:
-        """Carry frames, and count what one side does. Returns how many arrived."""
-        arrived = 0
-        ((client_port, at_left),) = self._at_left
+    async def carry(self, frames: int, counted: str) -> None:
+        """Carry frames, and count what one side does; none if it is empty."""
         for _ in range(frames):
             self._number += 1
-            raw = attitude(self._number)
-            self._client.sendto(raw, ("127.0.0.1", client_port))
-            self._call(at_left, side == "sending")
-            for _, at_right in self._at_right:
-                self._call(at_right, side == "receiving" and len(self._at_right) == 1)
-            with_frame = b""
-            try:
-                while with_frame != raw:
-                    with_frame = self._ground.recv(2048)
-                arrived += 1
-            except BlockingIOError:
-                pass
+            self._client.sendto(attitude(self._number), ("127.0.0.1", self._client_port))
+            for side in SIDES:
+                self._call(self._receive[side], is_counted=side == counted)
+            with suppress(BlockingIOError):
+                while True:
+                    self._ground.recv(2048)
             await asyncio.sleep(0.001)
-        return arrived
 
-    def _call(self, callback: Callable[[], object], is_counted: bool) -> None:
+    def _call(self, callback: Callable[[], object], *, is_counted: bool) -> None:
         if not is_counted:
             callback()
             return
@@ -163,36 +103,24 @@ class Pair:
         self._counting.dump("frame")
 
 
-def port_of(fd: int) -> int:
-    """The local port of a UDP socket; 0 for anything else."""
-    try:
-        with socket.socket(fileno=socket.dup(fd)) as sock:
-            return int(sock.getsockname()[1]) if sock.type == socket.SOCK_DGRAM else 0
-    except OSError:
-        return 0
-
-
-async def run(loop: Loop, counting: Counting, frames: int, paths: int) -> dict[str, int]:
+async def run(loop: Loop, counting: Counting, frames: int) -> None:
     """Count each side."""
     pair = Pair(loop, counting)
-    await pair.start(paths)
+    await pair.start()
     await asyncio.sleep(0.2)
     gc.collect()
     counting.begin()
-    await pair.carry(WARM_UP, None)
-    arrived = {}
+    await pair.carry(WARM_UP, "")
     for side in SIDES:
-        arrived[side] = await pair.carry(frames, side)
-    return arrived
+        await pair.carry(frames, side)
 
 
 def main() -> None:
-    """``pair LIBRARY FRAMES PATHS``: prints how many frames arrived."""
+    """``pair LIBRARY FRAMES``."""
     loop = Loop()
-    library, frames, paths = sys.argv[1:]
+    library, frames = sys.argv[1:]
     gc.disable()
-    arrived = loop.run_until_complete(run(loop, Counting(library), int(frames), int(paths)))
-    print(json.dumps(arrived), flush=True)
+    loop.run_until_complete(run(loop, Counting(library), int(frames)))
 
 
 if __name__ == "__main__":
