@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from uavlinkd.core.drops import Drop
-from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import CertificateShown, Output, PeerAdmitted
-from uavlinkd.core.path import Path
-from uavlinkd.core.peer import Peer
-from uavlinkd.core.settings import PeerSettings
+from uavlinkd.protocol.drops import Drop
+from uavlinkd.protocol.node import Node
+from uavlinkd.protocol.outputs import CertificateShown, Output, PeerAdmitted
+from uavlinkd.protocol.path import Path
+from uavlinkd.protocol.peer import Peer
+from uavlinkd.protocol.settings import PeerSettings
 
 Admit = Callable[[bytes, bytes, float], PeerSettings]
 """Returns the settings of the peer with this key that shows this certificate now, or raises Drop. Changes nothing."""

@@ -27,15 +27,15 @@ SLOWEST = (
     "bench",
     "fleet",
     "pressure",
-    "daemon",
+    "processes",
     "network",
 )
 """Folders, the slowest tests first."""
-ALONE = ("pressure", "faults", "daemon", "link")
+ALONE = ("pressure", "faults", "processes", "daemon", "tls")
 """Folders whose tests measure delays, losses and processor time of real daemons: marked ``alone``."""
 LONG_ALL = ("natlab", "faults", "modem", "compose", "bench", "pressure", "walkthroughs", "wireshark")
 """Folders of machines, routers, containers, other software: all is ``long``, and imported only if selected."""
-LONG = (*LONG_ALL, "daemon")
+LONG = (*LONG_ALL, "processes")
 """Folders whose tests are marked ``long``, except those with the marker ``short``."""
 
 EXAMPLES = int(os.environ.get("UAVLINKD_EXAMPLES", "25"))

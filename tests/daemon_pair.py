@@ -8,10 +8,10 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import all as mavlink
 
 from uavlinkd.config.model import Config, EndpointConfig, Log, PeerAddress, PeerConfig
-from uavlinkd.core.crypto import KeyPair, Secret
-from uavlinkd.core.settings import Link, PeerSettings
-from uavlinkd.endpoints.url import NetworkUrl
-from uavlinkd.link.daemon import Daemon
+from uavlinkd.daemon.daemon import Daemon
+from uavlinkd.io.url import NetworkUrl
+from uavlinkd.protocol.crypto import KeyPair, Secret
+from uavlinkd.protocol.settings import Link, PeerSettings
 from uavlinkd.system.addresses import Address
 
 ANY_PORT: Final = Address("127.0.0.1", 0)

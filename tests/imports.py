@@ -78,7 +78,7 @@ def circle(edges: Mapping[str, frozenset[str]]) -> list[str]:
 
 
 def _module(name: str) -> str:
-    """``core/node.py`` is ``uavlinkd.core.node``, ``core/__init__.py`` is ``uavlinkd.core``."""
+    """``protocol/node.py`` is ``uavlinkd.protocol.node``, ``protocol/__init__.py`` is ``uavlinkd.protocol``."""
     return f"uavlinkd/{name}".removesuffix(".py").removesuffix("/__init__").replace("/", ".")
 
 

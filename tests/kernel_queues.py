@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from tests.daemon.udp import open_socket
-from uavlinkd.endpoints.sockets import BUFFER_BYTES, udp_socket
+from tests.processes.udp import open_socket
+from uavlinkd.io.sockets import BUFFER_BYTES, udp_socket
 from uavlinkd.system.addresses import Address
 
 _TABLES = ("/proc/net/udp", "/proc/net/udp6")

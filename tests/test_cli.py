@@ -15,7 +15,7 @@ from tests.needs import need
 from uavlinkd import __version__
 from uavlinkd.cli import main, mitm
 from uavlinkd.config import keys
-from uavlinkd.core.constants import PROTOCOL_NAME
+from uavlinkd.protocol.constants import PROTOCOL_NAME
 from uavlinkd.system.terminal import FAILED, OK, WRONG
 
 pytestmark = pytest.mark.usefixtures("undone_settings")

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from uavlinkd.core.drops import DropReason
 from uavlinkd.mavlink.policy.gate import Refusal
+from uavlinkd.protocol.drops import DropReason
 
 ROOT = Path(__file__).parents[1]
 PAGES = [

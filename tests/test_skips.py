@@ -63,7 +63,7 @@ def test_ci_runs_all_tests_without_retries() -> None:
     assert commands == [
         "-q -m '(long or sitl or recorded) and not alone' || status=1",
         "-q -m '(long or sitl or recorded) and alone' -n 0 || status=1",
-        "-q -m '' tests/core --cov=uavlinkd/core --cov-branch --cov-fail-under=100 || status=1",
+        "-q -m '' tests/protocol --cov=uavlinkd/protocol --cov-branch --cov-fail-under=100 || status=1",
     ]
     assert text.rstrip().endswith('exit "$status"')
 

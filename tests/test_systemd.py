@@ -13,7 +13,7 @@ import pytest
 
 from tests.namespaces import Namespace, NamespaceError, need_namespaces
 from tests.needs import need
-from uavlinkd.link.daemon import HOUSEKEEPING_S
+from uavlinkd.daemon.daemon import HOUSEKEEPING_S
 
 UNITS = Path(__file__).parents[1] / "systemd"
 NAMES = sorted(path.name for path in UNITS.glob("*.service"))

@@ -28,8 +28,8 @@ import structlog
 import uvloop
 
 from tests.waiting import note_pauses
-from uavlinkd.core.crypto import x25519_public_key
 from uavlinkd.lab.sim.loopback_ports import free_port
+from uavlinkd.protocol.crypto import x25519_public_key
 
 State = Mapping[str, Mapping[Any, Any]]
 """By kind and name."""

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from uavlinkd import __version__
-from uavlinkd.core.constants import PROTOCOL_NAME
+from uavlinkd.protocol.constants import PROTOCOL_NAME
 from uavlinkd.system.terminal import FAILED, OK, WRONG, CommandError, UsageError, add_json, printable
 
 _LINE_LIMIT = 4096
@@ -239,7 +239,7 @@ def _run_daemon(options: argparse.Namespace) -> int:
         # If rich is installed, structlog imports it for tracebacks on a terminal: 4 MB that JSON does not need.
         sys.modules.setdefault("rich", None)  # type: ignore[arg-type]
     from uavlinkd.config.load import load_config
-    from uavlinkd.link.daemon import Daemon
+    from uavlinkd.daemon.daemon import Daemon
     from uavlinkd.ops.log import set_up_logging
 
     config = load_config(options.config, os.environ)

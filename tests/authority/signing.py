@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from uavlinkd.core.certificates import Bulletin, Certificate, MemberRole, fleet_id_of
-from uavlinkd.core.crypto import AuthorityKey
+from uavlinkd.authority.certificates import Bulletin, Certificate, MemberRole, fleet_id_of
+from uavlinkd.protocol.crypto import AuthorityKey
 
 SIGNER = Ed25519PrivateKey.from_private_bytes(bytes(32))
 AUTHORITY = AuthorityKey(SIGNER.public_key().public_bytes_raw())

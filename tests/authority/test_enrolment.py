@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from uavlinkd.authority.certificates import MOST_REVOKED, Bulletin, Certificate, MemberRole, fleet_id_of
 from uavlinkd.authority.enrolment import (
     LONGEST_LINE,
     Contact,
@@ -19,9 +20,8 @@ from uavlinkd.authority.enrolment import (
     parse_request,
     verify_reply,
 )
-from uavlinkd.core.certificates import MOST_REVOKED, Bulletin, Certificate, MemberRole, fleet_id_of
-from uavlinkd.core.crypto import Secret, SigningKey, sha256, x25519_public_key
-from uavlinkd.core.suites import SUITES, X25519
+from uavlinkd.protocol.crypto import Secret, SigningKey, sha256, x25519_public_key
+from uavlinkd.protocol.suites import SUITES, X25519
 
 SIGNER = SigningKey(Secret(bytes(32)))
 FLEET = fleet_id_of(SIGNER.public)

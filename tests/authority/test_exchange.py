@@ -8,11 +8,11 @@ import pytest
 
 from tests.authority.signing import AUTHORITY, bulletin, published, signed, vehicle
 from uavlinkd.authority import constants as c
+from uavlinkd.authority.certificates import Bulletin, digest_of
 from uavlinkd.authority.exchange import ROLLED_BACK, BulletinExchange, Reaction
 from uavlinkd.authority.trust import BulletinVerdict, Trust
-from uavlinkd.core.certificates import Bulletin, digest_of
-from uavlinkd.core.drops import Drop, DropReason
-from uavlinkd.core.relay_records import BulletinRecord, CertificateRecord, FleetRecord, Have, Who
+from uavlinkd.protocol.drops import Drop, DropReason
+from uavlinkd.protocol.relay_records import BulletinRecord, CertificateRecord, FleetRecord, Have, Who
 
 OWN, PEER, OTHER = (bytes((number,)) * 32 for number in (1, 2, 3))
 CERTIFICATES = {PEER: signed(vehicle(2, 20), PEER), OTHER: signed(vehicle(3), OTHER)}

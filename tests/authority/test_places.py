@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from tests.core.harness import seeded
+from tests.protocol.harness import seeded
 from uavlinkd.authority.trust import longest_down
-from uavlinkd.core.crypto import Secret
-from uavlinkd.core.node import Node
-from uavlinkd.core.settings import PeerSettings
+from uavlinkd.protocol.crypto import Secret
+from uavlinkd.protocol.node import Node
+from uavlinkd.protocol.settings import PeerSettings
 
 
 def test_peer_that_is_down_for_longest_gives_way() -> None:

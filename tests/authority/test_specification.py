@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from uavlinkd.authority import constants
-from uavlinkd.core.constants import Rate
+from uavlinkd.protocol.constants import Rate
 
 TEXT = (Path(constants.__file__).parent / "README.md").read_text()
 DOCUMENTED = {

@@ -13,8 +13,8 @@ import pytest
 from tests.authority.signing import AUTHORITY, bulletin, signed, vehicle
 from uavlinkd.authority.exchange import BulletinExchange, Reaction
 from uavlinkd.authority.trust import Trust
-from uavlinkd.core.relay_records import FleetRecord, parse_record
-from uavlinkd.core.wire import LONG_HEADER_BYTES
+from uavlinkd.protocol.relay_records import FleetRecord, parse_record
+from uavlinkd.protocol.wire import LONG_HEADER_BYTES
 
 ONE_WAY_S = 0.02
 WRITE_S = 0.005

@@ -12,9 +12,9 @@ import pytest
 
 from tests.authority.signing import AUTHORITY, bulletin, published, signed, vehicle
 from uavlinkd.authority import state_file
+from uavlinkd.authority.certificates import MOST_REVOKED, Bulletin
 from uavlinkd.authority.state_file import FleetState
 from uavlinkd.authority.trust import Trust
-from uavlinkd.core.certificates import MOST_REVOKED, Bulletin
 
 OWN = bytes((1,)) * 32
 BEFORE = FleetState(bulletin(2), signed(vehicle(1, 5), OWN))

@@ -9,9 +9,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.authority.signing import AUTHORITY, CERTIFICATE, FLEET, bulletin, published, signed, vehicle
+from uavlinkd.authority.certificates import (
+    GENERATION,
+    MOST_REVOKED,
+    Bulletin,
+    Certificate,
+    MemberRole,
+    parse_bulletin,
+)
 from uavlinkd.authority.trust import BulletinVerdict, Pinned, Trust
-from uavlinkd.core.certificates import GENERATION, MOST_REVOKED, Bulletin, Certificate, MemberRole, parse_bulletin
-from uavlinkd.core.drops import Drop, DropReason
+from uavlinkd.protocol.drops import Drop, DropReason
 
 OWN, KEY, OTHER = (bytes((number,)) * 32 for number in (1, 2, 3))
 OWN_DATA = signed(vehicle(1), OWN)

@@ -20,8 +20,8 @@ from typing import Final, NamedTuple
 
 from tests.bench.daemons import configuration, peer, rules
 from tests.bench.measure import resident_bytes
-from tests.daemon import frames
 from tests.limited_cpu import limited_cpu
+from tests.processes import frames
 from tests.waiting import PATIENCE_S
 from uavlinkd.config import keys
 from uavlinkd.lab.sim.loopback_ports import free_ports

@@ -22,11 +22,11 @@ from typing import Any, Final
 
 from tests.bench.frames import PROBE_EVERY, is_probe, read_frames, said_by, stamp
 from tests.bench.generator import BUFFER_BYTES, PR_SET_TIMERSLACK, Pace, Sent
-from uavlinkd.core.crypto import Secret
-from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import Output, Transmit
-from uavlinkd.core.path import Path as PeerPath
-from uavlinkd.core.settings import PeerSettings
+from uavlinkd.protocol.crypto import Secret
+from uavlinkd.protocol.node import Node
+from uavlinkd.protocol.outputs import Output, Transmit
+from uavlinkd.protocol.path import Path as PeerPath
+from uavlinkd.protocol.settings import PeerSettings
 
 DAEMON: Final = "daemon"
 FRAMES_EACH: Final = 20 * PROBE_EVERY

@@ -13,7 +13,7 @@ import pytest_asyncio
 from tests.compose import images
 from tests.compose.cluster import run, until
 from tests.compose.containers import USER, health
-from tests.daemon.toml import to_toml
+from tests.processes.toml import to_toml
 from tests.relay.core_member import CoreMember
 from uavlinkd.config import keys
 from uavlinkd.lab.sim.loopback_ports import free_port

@@ -9,10 +9,10 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from tests.authority.signing import SIGNER
 from tests.config.files import ENDPOINT, HEAD, KEY
+from uavlinkd.authority.certificates import Bulletin, Certificate, MemberRole, fleet_id_of
 from uavlinkd.config import keys
 from uavlinkd.config.load import load_config
 from uavlinkd.config.model import Config
-from uavlinkd.core.certificates import Bulletin, Certificate, MemberRole, fleet_id_of
 from uavlinkd.system.base64_text import to_base64
 
 OTHER_SIGNER = Ed25519PrivateKey.from_private_bytes(bytes(range(32)))

@@ -35,12 +35,12 @@ from uavlinkd.config import keys
 from uavlinkd.config.load import load_config
 from uavlinkd.config.model import ConfigError, NetworkConfig, PeerAddress
 from uavlinkd.config.network_rules import used_networks
-from uavlinkd.core import constants as c
-from uavlinkd.core.settings import Link, Redundancy, Timers
-from uavlinkd.core.suites import SUITES_BY_NAME
-from uavlinkd.endpoints.url import SerialUrl
+from uavlinkd.io.url import SerialUrl
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.mavlink.policy.gate import Refusal
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol.settings import Link, Redundancy, Timers
+from uavlinkd.protocol.suites import SUITES_BY_NAME
 from uavlinkd.relay.forwarding import RelayLimits
 from uavlinkd.system.addresses import Address
 

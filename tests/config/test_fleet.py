@@ -20,12 +20,12 @@ from tests.config.fleets import (
     load_member,
     member_file,
 )
+from uavlinkd.authority.certificates import Certificate, MemberRole
 from uavlinkd.config.changes import compare
 from uavlinkd.config.members import relay_member
 from uavlinkd.config.model import ConfigError, FleetConfig, PeerAddress
-from uavlinkd.core import constants as c
-from uavlinkd.core.certificates import Certificate, MemberRole
-from uavlinkd.core.settings import Link
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol.settings import Link
 from uavlinkd.relay.forwarding import RelayLimits
 from uavlinkd.system.addresses import parse_address
 from uavlinkd.system.base64_text import to_base64

@@ -11,7 +11,7 @@ from pathlib import Path
 from time import monotonic
 from typing import Final
 
-from tests.daemon.process import DaemonProcess
+from tests.processes.process import DaemonProcess
 
 WATCHDOG_S: Final = 6.0
 """As in the units."""

@@ -8,10 +8,10 @@ from collections.abc import Mapping
 from time import monotonic
 from typing import NamedTuple
 
-from tests.daemon.harness import Stage
-from tests.daemon.process import DaemonProcess
-from tests.daemon.two_hosts import ONLY, PORT, TwoHosts, address_of, interface_of
 from tests.faults.talk import Log, Outcome, grew, reported
+from tests.processes.harness import Stage
+from tests.processes.process import DaemonProcess
+from tests.processes.two_hosts import ONLY, PORT, TwoHosts, address_of, interface_of
 from tests.waiting import PATIENCE_S
 from uavlinkd.observe.drop_log import EVERYDAY_ERRORS
 

@@ -19,15 +19,15 @@ from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from tests.daemon.frames import frames_in
-from tests.daemon.harness import Stage
-from tests.daemon.losses import kernel_drops
-from tests.daemon.members import CertifiedFleet, is_up
-from tests.daemon.udp import Client, Sockaddr
 from tests.faults.manager import ServiceManager
+from tests.processes.frames import frames_in
+from tests.processes.harness import Stage
+from tests.processes.losses import kernel_drops
+from tests.processes.members import CertifiedFleet, is_up
+from tests.processes.udp import Client, Sockaddr
 from tests.samples import pack
 from tests.waiting import PATIENCE_S, until
-from uavlinkd.core.certificates import MemberRole
+from uavlinkd.authority.certificates import MemberRole
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.system.guard import EXIT_STATUS, MOST_FAULTS
 
@@ -72,83 +72,83 @@ def _of(who: str, file: str, *functions: str, event: str = "call", trigger: str 
 
 PLACES: Final[Sequence[Place]] = (
     # A datagram in: read, unwrapped, opened, answered.
-    Place("endpoints/reader.py", "Reader._on_readable"),
-    Place("endpoints/reader.py", "Reader._on_several"),
-    Place("link/line.py", "Line.receive", together=len(VEHICLES)),
-    Place("core/receive.py", "DatagramReceiver.receive"),
-    *_of(CALLED, "core/receive.py", "_receive_other", "_receive_echo", "_reply"),
-    *_of(CALLED, "core/receive.py", "DatagramReceiver.receive", event="return"),
-    *_of(CALLED, "core/receive.py", "_receive_record", trigger="bulletin"),
-    Place("core/session.py", "Session.open", "return"),
-    Place("core/receive_handshake.py", "HandshakeReceiver.receive"),
-    Place("core/receive_handshake.py", "HandshakeReceiver.receive", "return"),
-    *_of(CALLER, "core/establish.py", "answer", "adopt"),
-    *_of(CALLER, "core/establish.py", "answer", "adopt", event="return"),
-    *_of(CALLED, "core/establish.py", "receive_response", "adopt"),
-    *_of(CALLED, "core/establish.py", "receive_response", "adopt", event="return"),
-    *_of(CALLED, "core/establish.py", "receive_close", trigger="restart"),
+    Place("io/reader.py", "Reader._on_readable"),
+    Place("io/reader.py", "Reader._on_several"),
+    Place("daemon/line.py", "Line.receive", together=len(VEHICLES)),
+    Place("protocol/receive.py", "DatagramReceiver.receive"),
+    *_of(CALLED, "protocol/receive.py", "_receive_other", "_receive_echo", "_reply"),
+    *_of(CALLED, "protocol/receive.py", "DatagramReceiver.receive", event="return"),
+    *_of(CALLED, "protocol/receive.py", "_receive_record", trigger="bulletin"),
+    Place("protocol/session.py", "Session.open", "return"),
+    Place("protocol/receive_handshake.py", "HandshakeReceiver.receive"),
+    Place("protocol/receive_handshake.py", "HandshakeReceiver.receive", "return"),
+    *_of(CALLER, "protocol/establish.py", "answer", "adopt"),
+    *_of(CALLER, "protocol/establish.py", "answer", "adopt", event="return"),
+    *_of(CALLED, "protocol/establish.py", "receive_response", "adopt"),
+    *_of(CALLED, "protocol/establish.py", "receive_response", "adopt", event="return"),
+    *_of(CALLED, "protocol/establish.py", "receive_close", trigger="restart"),
     # Outputs.
-    Place("link/line.py", "Line.perform"),
-    Place("link/carrier.py", "FrameCarrier._on_record", trigger="bulletin"),
-    *_of(CALLED, "link/carrier.py", "FrameCarrier._on_event", trigger="restart"),
-    *_of(CALLED, "link/fleet_members.py", "FleetMembers.on_event", trigger="restart"),
+    Place("daemon/line.py", "Line.perform"),
+    Place("daemon/carrier.py", "FrameCarrier._on_record", trigger="bulletin"),
+    *_of(CALLED, "daemon/carrier.py", "FrameCarrier._on_event", trigger="restart"),
+    *_of(CALLED, "fleet/members.py", "FleetMembers.on_event", trigger="restart"),
     *_of(CALLED, "relay/service.py", "RelayService.on_event", trigger="restart"),
-    *_of(CALLED, "link/relays.py", "Relays.on_event", trigger="restart"),
+    *_of(CALLED, "relay/clients.py", "Relays.on_event", trigger="restart"),
     *_of(CALLED, "observe/event_log.py", "EventLog.write", trigger="restart"),
-    *_of(CALLED, "link/peer_link.py", "PeerLink.on_down", trigger="restart"),
-    *_of(CALLED, "link/peer_link.py", "PeerLink.follow_paths"),
+    *_of(CALLED, "daemon/peer_link.py", "PeerLink.on_down", trigger="restart"),
+    *_of(CALLED, "daemon/peer_link.py", "PeerLink.follow_paths"),
     Place("mavlink/frames.py", "parse_frames"),
     # Frames: policy, routes, clients.
-    Place("link/line.py", "Line.forward"),
-    Place("link/switch.py", "Switch.route", trigger="udp"),
-    *_of(CALLED, "core/send.py", "send_payloads"),
-    *_of(CALLED, "core/send.py", "send_frames", event="return"),
-    Place("core/session.py", "Session.seal"),
-    Place("core/session.py", "Session.seal", "return"),
-    Place("endpoints/udp.py", "UdpEndpoint.take"),
-    Place("endpoints/udp.py", "UdpPort.send"),
-    Place("endpoints/udp.py", "UdpServer._admit", trigger="udp"),
-    Place("link/local_endpoints.py", "LocalEndpoints.on_port_opened", trigger="tcp"),
-    Place("link/local_endpoints.py", "LocalEndpoints.on_port_opened", "return", trigger="tcp"),
-    Place("link/local_endpoints.py", "LocalEndpoints.on_port_closed", trigger="tcp"),
-    Place("endpoints/tcp.py", "TcpServer.on_acceptable", trigger="tcp"),
-    Place("endpoints/stream_endpoint.py", "Connection.on_readable", trigger="tcp"),
-    Place("endpoints/stream_endpoint.py", "Connection.send", trigger="tcp"),
-    Place("endpoints/stream_endpoint.py", "Connection._write_committed", "return", trigger="tcp"),
-    Place("endpoints/stream_endpoint.py", "StreamEndpoint.forget", trigger="tcp"),
+    Place("daemon/line.py", "Line.forward"),
+    Place("daemon/switch.py", "Switch.route", trigger="udp"),
+    *_of(CALLED, "protocol/send.py", "send_payloads"),
+    *_of(CALLED, "protocol/send.py", "send_frames", event="return"),
+    Place("protocol/session.py", "Session.seal"),
+    Place("protocol/session.py", "Session.seal", "return"),
+    Place("io/udp.py", "UdpEndpoint.take"),
+    Place("io/udp.py", "UdpPort.send"),
+    Place("io/udp.py", "UdpServer._admit", trigger="udp"),
+    Place("daemon/local_endpoints.py", "LocalEndpoints.on_port_opened", trigger="tcp"),
+    Place("daemon/local_endpoints.py", "LocalEndpoints.on_port_opened", "return", trigger="tcp"),
+    Place("daemon/local_endpoints.py", "LocalEndpoints.on_port_closed", trigger="tcp"),
+    Place("io/tcp.py", "TcpServer.on_acceptable", trigger="tcp"),
+    Place("io/stream_endpoint.py", "Connection.on_readable", trigger="tcp"),
+    Place("io/stream_endpoint.py", "Connection.send", trigger="tcp"),
+    Place("io/stream_endpoint.py", "Connection._write_committed", "return", trigger="tcp"),
+    Place("io/stream_endpoint.py", "StreamEndpoint.forget", trigger="tcp"),
     # Timers.
-    Place("core/node.py", "Node.handle_next"),
-    *_of(CALLED, "core/timeouts.py", "handle_timeout", "_initiate"),
-    *_of(CALLED, "core/timeouts.py", "handle_timeout", "_initiate", event="return"),
-    *_of(CALLED, "core/establish.py", "initiate", event="return"),
-    *_of(CALLED, "core/freshness.py", "handle_timeout"),
-    *_of(CALLED, "core/probing.py", "update"),
-    *_of(CALLED, "core/probing.py", "update", event="return"),
-    Place("link/fleet_members.py", "FleetMembers.do_due", trigger="bulletin"),
+    Place("protocol/node.py", "Node.handle_next"),
+    *_of(CALLED, "protocol/timeouts.py", "handle_timeout", "_initiate"),
+    *_of(CALLED, "protocol/timeouts.py", "handle_timeout", "_initiate", event="return"),
+    *_of(CALLED, "protocol/establish.py", "initiate", event="return"),
+    *_of(CALLED, "protocol/freshness.py", "handle_timeout"),
+    *_of(CALLED, "protocol/probing.py", "update"),
+    *_of(CALLED, "protocol/probing.py", "update", event="return"),
+    Place("fleet/members.py", "FleetMembers.do_due", trigger="bulletin"),
     # Once a second.
-    *_of(CALLED, "link/peer_link.py", "PeerLink.measure", "PeerLink.report_refusals", "PeerLink.report_problems"),
-    Place("link/daemon.py", "Daemon._report"),
-    Place("link/peer_sockets.py", "PeerSockets.do_housekeeping"),
-    Place("link/local_endpoints.py", "LocalEndpoints.do_housekeeping"),
-    Place("endpoints/udp.py", "UdpServer.do_housekeeping"),
+    *_of(CALLED, "daemon/peer_link.py", "PeerLink.measure", "PeerLink.report_refusals", "PeerLink.report_problems"),
+    Place("daemon/daemon.py", "Daemon._report"),
+    Place("daemon/peer_sockets.py", "PeerSockets.do_housekeeping"),
+    Place("daemon/local_endpoints.py", "LocalEndpoints.do_housekeeping"),
+    Place("io/udp.py", "UdpServer.do_housekeeping"),
     Place("relay/service.py", "RelayService.do_housekeeping"),
     Place("relay/service.py", "RelayService.settle"),
     Place("observe/findings.py", "find"),
     Place("observe/drop_log.py", "DropLog.check"),
     # The relay, the disk, and requests.
-    Place("link/carrier.py", "FrameCarrier._unwrap"),
+    Place("daemon/carrier.py", "FrameCarrier._unwrap"),
     Place("relay/forwarding.py", "Forwarding.take"),
     Place("authority/state_file.py", "write", trigger="bulletin"),
     Place("authority/state_file.py", "write", "return", trigger="bulletin"),
-    Place("link/fleet_members.py", "FleetMembers._on_written", trigger="bulletin"),
+    Place("fleet/members.py", "FleetMembers._on_written", trigger="bulletin"),
     Place("observe/status.py", "daemon_status", trigger="status"),
     # Again and again, in the middle of a reload, and before a timer could set itself again.
-    Place("core/node.py", "Node.handle_next", times=MOST_FAULTS),
-    Place("link/line.py", "Line.forward", who=CALLED, times=MOST_FAULTS),
-    Place("core/receive.py", "_receive_other", who=CALLED, times=MOST_FAULTS),
-    Place("link/peers.py", "Peers.follow", trigger="reload"),
-    Place("link/carrier.py", "FrameCarrier._on_timer"),
-    Place("link/daemon.py", "Daemon._do_housekeeping", stops=True),
+    Place("protocol/node.py", "Node.handle_next", times=MOST_FAULTS),
+    Place("daemon/line.py", "Line.forward", who=CALLED, times=MOST_FAULTS),
+    Place("protocol/receive.py", "_receive_other", who=CALLED, times=MOST_FAULTS),
+    Place("daemon/peers.py", "Peers.follow", trigger="reload"),
+    Place("daemon/carrier.py", "FrameCarrier._on_timer"),
+    Place("daemon/daemon.py", "Daemon._do_housekeeping", stops=True),
 )
 
 

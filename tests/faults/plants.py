@@ -18,7 +18,7 @@ from time import monotonic
 from types import FrameType
 
 from uavlinkd.cli import main
-from uavlinkd.link.daemon import Daemon
+from uavlinkd.daemon.daemon import Daemon
 from uavlinkd.system import guard
 
 

@@ -12,11 +12,11 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from tests.daemon.frames import frame
-from tests.daemon.losses import lost_to_waiting
-from tests.daemon.process import DaemonProcess, Status
-from tests.daemon.udp import Sockaddr, open_socket
 from tests.namespaces import udp_socket_in
+from tests.processes.frames import frame
+from tests.processes.losses import lost_to_waiting
+from tests.processes.process import DaemonProcess, Status
+from tests.processes.udp import Sockaddr, open_socket
 from tests.samples import pack
 from tests.waiting import PATIENCE_S, Stopwatch, until
 

@@ -15,16 +15,16 @@ from time import monotonic
 
 import pytest
 
-from tests.daemon.fleet import Rogue
-from tests.daemon.frames import frame
-from tests.daemon.harness import Stage
-from tests.daemon.process import DaemonProcess
 from tests.faults import network
 from tests.faults.clocks import faked_clock
 from tests.faults.network import FAULT_S
 from tests.faults.talk import Log, Outcome, Talk, grew, prepare, reported
 from tests.namespaces import why_not as why_no_namespaces
 from tests.needs import need
+from tests.processes.fleet import Rogue
+from tests.processes.frames import frame
+from tests.processes.harness import Stage
+from tests.processes.process import DaemonProcess
 from tests.waiting import until
 from uavlinkd.ops.line_limits import LINES_BURST, LINES_PER_S
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tests.daemon.harness import Stage
-from tests.daemon.members import CertifiedFleet
 from tests.faults.clocks import faked_clock
+from tests.processes.harness import Stage
+from tests.processes.members import CertifiedFleet
 from uavlinkd.authority import state_file
+from uavlinkd.authority.certificates import MemberRole
 from uavlinkd.authority.state_file import FleetState
-from uavlinkd.core.certificates import MemberRole
 
 
 async def test_clocks_have_no_effect(tmp_path: Path) -> None:

@@ -9,11 +9,11 @@ from itertools import count
 
 import pytest
 
-from tests.daemon.frames import frame
-from tests.daemon.harness import Stage
-from tests.daemon.udp import Client, Sockaddr
 from tests.faults.manager import WATCHDOG_S, ServiceManager
 from tests.faults.planted import PLACES, RUN, measure
+from tests.processes.frames import frame
+from tests.processes.harness import Stage
+from tests.processes.udp import Client, Sockaddr
 from tests.waiting import until
 
 SAMPLE = list({(place.file, place.stops, place.times > 1): place for place in PLACES}.values())

@@ -17,7 +17,6 @@ from tests.waiting import PATIENCE_S
 from uavlinkd.authority.enrolment import FleetError
 from uavlinkd.cli import main
 from uavlinkd.config.keys import KeyFileError
-from uavlinkd.core.crypto import Secret
 from uavlinkd.fleet import operations
 from uavlinkd.fleet.authority_key import (
     AUTHORITY_FILE,
@@ -29,6 +28,7 @@ from uavlinkd.fleet.authority_key import (
 )
 from uavlinkd.fleet.manifest import read_manifest
 from uavlinkd.fleet.signing import Identity
+from uavlinkd.protocol.crypto import Secret
 from uavlinkd.system.addresses import Address
 
 PASSPHRASE = "correct horse battery staple"

@@ -11,10 +11,10 @@ import pytest
 
 from tests.fleet.conftest import Say
 from tests.fleet.vehicles import create
+from uavlinkd.authority.certificates import MemberRole
 from uavlinkd.authority.enrolment import fingerprint_of
 from uavlinkd.cli import main
 from uavlinkd.config.load import load_config
-from uavlinkd.core.certificates import MemberRole
 from uavlinkd.fleet.manifest import read_manifest
 from uavlinkd.system.addresses import Address
 

@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 
 from tests.fleet.vehicles import create
+from uavlinkd.authority.certificates import parse_certificate
 from uavlinkd.cli import main
-from uavlinkd.core.certificates import parse_certificate
 from uavlinkd.fleet.authority_key import load_key, paper_copy
 from uavlinkd.fleet.manifest import read_manifest
 from uavlinkd.system.addresses import Address

@@ -17,10 +17,10 @@ import pytest
 
 from tests.fleet.vehicles import NAMES, create, loaded, unasked
 from tests.waiting import PATIENCE_S
+from uavlinkd.authority.certificates import MemberRole
 from uavlinkd.authority.enrolment import FleetError, Request
 from uavlinkd.config import keys
 from uavlinkd.config.model import ConfigError
-from uavlinkd.core.certificates import MemberRole
 from uavlinkd.fleet import operations, transaction
 from uavlinkd.fleet.authority_key import AUTHORITY_FILE, SUCCESSOR_FILE
 from uavlinkd.fleet.files import reply_for

@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 
 from tests.fleet.vehicles import create, loaded, unasked
+from uavlinkd.authority.certificates import parse_bulletin
 from uavlinkd.authority.enrolment import FleetError
 from uavlinkd.authority.trust import Trust
 from uavlinkd.cli import main
-from uavlinkd.core.certificates import parse_bulletin
 from uavlinkd.fleet import operations
 from uavlinkd.fleet.manifest import read_manifest
 from uavlinkd.ops import commands

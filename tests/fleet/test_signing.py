@@ -8,8 +8,7 @@ from typing import Any
 
 import pytest
 
-from uavlinkd.authority.enrolment import FleetError
-from uavlinkd.core.certificates import (
+from uavlinkd.authority.certificates import (
     GENERATION,
     LARGEST_OFFSET,
     LAST_SERIAL,
@@ -19,9 +18,10 @@ from uavlinkd.core.certificates import (
     is_certified,
     is_published,
 )
-from uavlinkd.core.crypto import Secret, SigningKey, x25519_public_key
+from uavlinkd.authority.enrolment import FleetError
 from uavlinkd.fleet.manifest import Fleet, FleetSettings
 from uavlinkd.fleet.signing import Identity, certify, merge, new_fleet, revoke
+from uavlinkd.protocol.crypto import Secret, SigningKey, x25519_public_key
 from uavlinkd.system.addresses import Address
 
 SIGNER = SigningKey(Secret(bytes(32)))

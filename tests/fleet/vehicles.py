@@ -13,15 +13,15 @@ from pathlib import Path
 from typing import Any
 
 from tests.waiting import until
+from uavlinkd.authority.certificates import MemberRole
 from uavlinkd.config.load import load_config
 from uavlinkd.config.model import Config
-from uavlinkd.core.certificates import MemberRole
-from uavlinkd.core.crypto import Secret
 from uavlinkd.fleet import operations
 from uavlinkd.fleet.manifest import FleetSettings, read_manifest
 from uavlinkd.lab.child_processes import end_with_parent
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.ops.control import ControlError, ask
+from uavlinkd.protocol.crypto import Secret
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.base64_text import to_base64
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from tests.formal import models
-from uavlinkd.core import noise
-from uavlinkd.core.suites import SUITES_BY_NAME, Suite
+from uavlinkd.protocol import noise
+from uavlinkd.protocol.suites import SUITES_BY_NAME, Suite
 
 _LIMIT_S = float(os.environ.get("PROVERIF_LIMIT_S", models.LIMIT_S))
 

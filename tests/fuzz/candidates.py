@@ -9,17 +9,17 @@ from __future__ import annotations
 from ipaddress import ip_address, ip_network
 from typing import Final
 
-from tests.core import inside
-from tests.core.harness import AT_A, ELSEWHERE, Pair, quiet
 from tests.fuzz.engine import Run, Script, play
 from tests.fuzz.insiders import Insider
 from tests.fuzz.stages import NOW, copier, pair_of
-from uavlinkd.core import constants as c
-from uavlinkd.core.outputs import Event, Output, RecordReceived, Transmit
-from uavlinkd.core.path import Path, relayed
-from uavlinkd.core.relay_records import Bind, Bound, Candidates
-from uavlinkd.core.settings import Link, Timers
-from uavlinkd.link.direct_search import DirectSearch, OwnSocket, Place
+from tests.protocol import inside
+from tests.protocol.harness import AT_A, ELSEWHERE, Pair, quiet
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol.outputs import Event, Output, RecordReceived, Transmit
+from uavlinkd.protocol.path import Path, relayed
+from uavlinkd.protocol.relay_records import Bind, Bound, Candidates
+from uavlinkd.protocol.settings import Link, Timers
+from uavlinkd.relay.direct_search import DirectSearch, OwnSocket, Place
 
 RELAYED: Final = relayed(0, "vps", 7)
 RELAY: Final = ("192.0.2.77", 5790)

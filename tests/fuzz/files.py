@@ -16,12 +16,12 @@ from uavlinkd.authority.enrolment import FleetError
 from uavlinkd.config.keys import KeyFileError, decode_key, encode_key, read_secret_file
 from uavlinkd.config.load import load_config
 from uavlinkd.config.model import Config, ConfigError
-from uavlinkd.core import wire
-from uavlinkd.core.crypto import sha256
-from uavlinkd.core.suites import SUITES
 from uavlinkd.fleet.manifest import FILE_NAME, read_manifest, write_manifest
 from uavlinkd.lab.mitm import anatomy
 from uavlinkd.lab.mitm.proxy_settings import ProxySettings, SettingsError, load_proxy_settings
+from uavlinkd.protocol import wire
+from uavlinkd.protocol.crypto import sha256
+from uavlinkd.protocol.suites import SUITES
 
 SECRET: Final = encode_key(bytes(range(7, 39)))
 """A private key, which a person may paste into the wrong place."""

@@ -16,12 +16,12 @@ from tests.authority.signing import AUTHORITY, bulletin, published, signed, vehi
 from tests.fuzz.engine import Run, Script, play
 from tests.fuzz.stages import NOW, SeededEntropy
 from uavlinkd.authority import state_file
+from uavlinkd.authority.certificates import Bulletin, MemberRole, digest_of, parse_bulletin, parse_certificate
 from uavlinkd.authority.exchange import BulletinExchange, Reaction
 from uavlinkd.authority.trust import Trust
-from uavlinkd.core.certificates import Bulletin, MemberRole, digest_of, parse_bulletin, parse_certificate
-from uavlinkd.core.crypto import AuthorityKey, sha256
-from uavlinkd.core.drops import Drop
-from uavlinkd.core.relay_records import BulletinRecord, CertificateRecord, FleetRecord, Have, Who, parse_record
+from uavlinkd.protocol.crypto import AuthorityKey, sha256
+from uavlinkd.protocol.drops import Drop
+from uavlinkd.protocol.relay_records import BulletinRecord, CertificateRecord, FleetRecord, Have, Who, parse_record
 
 OWN: Final = b"own." * 8
 KEYS: Final = tuple(bytes((number,)) * 32 for number in (1, 2, 3))

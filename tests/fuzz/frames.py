@@ -10,14 +10,14 @@ from typing import Final, cast
 
 from fastcrc.crc16 import mcrf4xx
 
+from tests.daemon.inside import most_flows
+from tests.daemon.lone_line import lone_line
+from tests.daemon.test_switch import Client, policy
 from tests.fuzz.engine import Run, Script
-from tests.link.inside import most_flows
-from tests.link.lone_line import lone_line
-from tests.link.test_switch import Client, policy
 from tests.mavlink.inside import gate_tables, most_addresses, remembered_frames
-from uavlinkd.link import switch as switching
-from uavlinkd.link.journal import DaemonJournal
-from uavlinkd.link.switch import Port, Switch
+from uavlinkd.daemon import switch as switching
+from uavlinkd.daemon.journal import DaemonJournal
+from uavlinkd.daemon.switch import Port, Switch
 from uavlinkd.mavlink import headers, routing, sendings
 from uavlinkd.mavlink.dialect import MESSAGES, SETUP_SIGNING
 from uavlinkd.mavlink.frames import (

@@ -8,19 +8,19 @@ from __future__ import annotations
 
 from typing import Final
 
-from tests.core.harness import AT_A, ELSEWHERE, KEY_A, KEY_C, quiet
+from tests.daemon.inside import handle_tables
 from tests.fuzz.engine import Run, Script, play
 from tests.fuzz.insiders import Insider
 from tests.fuzz.stages import NOW, copier, pair_of
-from tests.link.inside import handle_tables
+from tests.protocol.harness import AT_A, ELSEWHERE, KEY_A, KEY_C, quiet
 from uavlinkd.config.model import PeerAddress, RelayConfig
-from uavlinkd.core import constants as c
-from uavlinkd.core.drops import DropReason
-from uavlinkd.core.outputs import Event, Output, RecordReceived
-from uavlinkd.core.path import Path, relayed
-from uavlinkd.core.relay_records import Bound, wrap
-from uavlinkd.core.settings import Link, PeerSettings, Timers
-from uavlinkd.link.relay_link import RelayHandles, RelayLink
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol.drops import DropReason
+from uavlinkd.protocol.outputs import Event, Output, RecordReceived
+from uavlinkd.protocol.path import Path, relayed
+from uavlinkd.protocol.relay_records import Bound, wrap
+from uavlinkd.protocol.settings import Link, PeerSettings, Timers
+from uavlinkd.relay.client_link import RelayHandles, RelayLink
 from uavlinkd.system.addresses import Address
 
 WANTED: Final = (KEY_C.public, bytes([5]) * c.KEY_BYTES)

@@ -11,17 +11,17 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Final
 
-from tests.core import inside
-from tests.core.harness import AT_A, AT_B, ELSEWHERE, KEY_A, KEY_B, KEY_C, Pair, datagrams, of, only, with_macs
 from tests.fuzz.engine import Run, Script
 from tests.fuzz.stages import GROUPS, LINKS, NOW, SeededEntropy, copier, pair_of
-from uavlinkd.core import constants as c
-from uavlinkd.core import handshake, noise, wire
-from uavlinkd.core.crypto import KeyPair
-from uavlinkd.core.drops import DropReason
-from uavlinkd.core.limits import TokenBucket
-from uavlinkd.core.noise import HandshakeState
-from uavlinkd.core.outputs import Dropped, Output, SessionEstablished, Transmit
+from tests.protocol import inside
+from tests.protocol.harness import AT_A, AT_B, ELSEWHERE, KEY_A, KEY_B, KEY_C, Pair, datagrams, of, only, with_macs
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol import handshake, noise, wire
+from uavlinkd.protocol.crypto import KeyPair
+from uavlinkd.protocol.drops import DropReason
+from uavlinkd.protocol.limits import TokenBucket
+from uavlinkd.protocol.noise import HandshakeState
+from uavlinkd.protocol.outputs import Dropped, Output, SessionEstablished, Transmit
 
 LINK: Final = replace(LINKS[0], suites=GROUPS)
 KEY_D: Final = KeyPair(bytes((4,)) * 32)

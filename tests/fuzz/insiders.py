@@ -11,20 +11,20 @@ from __future__ import annotations
 from collections import Counter
 from typing import Final
 
-from tests.core import inside
-from tests.core.harness import AT_A, ELSEWHERE, FRAME, KEY_A, KEY_B, Pair, of, unsealed
 from tests.fuzz.engine import Run, Script, play
 from tests.fuzz.stages import LINKS, NOW, SeededEntropy, copier, pair_of
-from uavlinkd.core import constants as c
-from uavlinkd.core import handshake, wire
-from uavlinkd.core.cookie import MacKeys
-from uavlinkd.core.outputs import Deliver, Dropped, Output, Transmit
-from uavlinkd.core.path import Path
-from uavlinkd.core.probe import ANSWER_BYTES, PROBE, QUESTION_BYTES, Probe
-from uavlinkd.core.problem_reports import ProblemReport
-from uavlinkd.core.refusals import RefusalReport, Refused
-from uavlinkd.core.session import Session
-from uavlinkd.core.settings import Link, PeerSettings, Timers
+from tests.protocol import inside
+from tests.protocol.harness import AT_A, ELSEWHERE, FRAME, KEY_A, KEY_B, Pair, of, unsealed
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol import handshake, wire
+from uavlinkd.protocol.cookie import MacKeys
+from uavlinkd.protocol.outputs import Deliver, Dropped, Output, Transmit
+from uavlinkd.protocol.path import Path
+from uavlinkd.protocol.probe import ANSWER_BYTES, PROBE, QUESTION_BYTES, Probe
+from uavlinkd.protocol.problem_reports import ProblemReport
+from uavlinkd.protocol.refusals import RefusalReport, Refused
+from uavlinkd.protocol.session import Session
+from uavlinkd.protocol.settings import Link, PeerSettings, Timers
 
 PATHS: Final = (AT_A, AT_A, ELSEWHERE, Path(0, ("2001:db8::9", 5, 0, 0)))
 _PROBE_AND_FRAMES: Final = bytes((PROBE, 1))

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Final
 
-from tests.endpoints.test_line_framing import counts, report
 from tests.fuzz.engine import Run, Script
-from uavlinkd.endpoints.line_framing import DELIMITER, MAX_ENCODED, LineDecoder, encode
+from tests.serial.test_line_framing import counts, report
+from uavlinkd.serial.line_framing import DELIMITER, MAX_ENCODED, LineDecoder, encode
 
 LONGEST_REPORT: Final = 21
 

@@ -10,12 +10,12 @@ from typing import Final
 from websockets.uri import parse_uri
 from websockets.utils import accept_key
 
-from tests.endpoints.inside import held_bytes
-from tests.endpoints.web_streams import REQUEST, Owner, frame
 from tests.fuzz.engine import Run, Script
-from uavlinkd.endpoints.web_stream import MAX_MESSAGE, WebStream, client_protocol, server_protocol
+from tests.io.inside import held_bytes
+from tests.tls.web_streams import REQUEST, Owner, frame
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.stall import StallWatch
+from uavlinkd.tls.stream import MAX_MESSAGE, WebStream, client_protocol, server_protocol
 
 LOOP: Final = asyncio.new_event_loop()
 """Of all scripts; it is closed when the process ends."""

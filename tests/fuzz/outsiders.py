@@ -13,18 +13,18 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from tests.core import inside
-from tests.core.harness import ONLY_COUNTED, exchange, of, state_of
 from tests.fuzz.engine import Run, Script
 from tests.fuzz.stages import LINKS, PSK, Stage, copier, idle, initiator, responder, session, with_suite
-from uavlinkd.core import constants as c
-from uavlinkd.core import wire
-from uavlinkd.core.cookie import MacKeys, mac1_of
-from uavlinkd.core.drops import DropReason
-from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import Dropped, Output, SessionEstablished, Transmit
-from uavlinkd.core.path import Path
-from uavlinkd.core.suites import SUITES, SUITES_BY_NAME
+from tests.protocol import inside
+from tests.protocol.harness import ONLY_COUNTED, exchange, of, state_of
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol import wire
+from uavlinkd.protocol.cookie import MacKeys, mac1_of
+from uavlinkd.protocol.drops import DropReason
+from uavlinkd.protocol.node import Node
+from uavlinkd.protocol.outputs import Dropped, Output, SessionEstablished, Transmit
+from uavlinkd.protocol.path import Path
+from uavlinkd.protocol.suites import SUITES, SUITES_BY_NAME
 
 CHECKS_THE_SEQUEL: Final = 0xF0
 """Set in a script's first byte. Then the genuine datagram follows at the end, and the link must work."""

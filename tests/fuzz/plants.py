@@ -7,23 +7,24 @@ import tomllib
 from collections.abc import Callable
 from typing import Any, Final, NamedTuple
 
-from tests.core import inside
+from tests.protocol import inside
+from uavlinkd.authority import certificates, enrolment, trust
 from uavlinkd.authority import constants as fleet_constants
-from uavlinkd.authority import enrolment, trust
 from uavlinkd.config import checks as config_checks
 from uavlinkd.config import keys
 from uavlinkd.config import load as config_load
-from uavlinkd.core import certificates, counters, handshake, path_state, receive, refusals, session, wire
-from uavlinkd.core.drops import Drop, DropReason
-from uavlinkd.core.outputs import Deliver, Transmit
-from uavlinkd.endpoints import line_framing, web_stream
 from uavlinkd.lab.mitm import anatomy
 from uavlinkd.lab.mitm import proxy_settings as mitm_settings
-from uavlinkd.link import direct_search, relay_link
 from uavlinkd.mavlink import frames, routing
 from uavlinkd.mavlink.policy import gate
 from uavlinkd.ops import control
-from uavlinkd.relay import forwarding, service
+from uavlinkd.protocol import counters, handshake, path_state, receive, refusals, session, wire
+from uavlinkd.protocol.drops import Drop, DropReason
+from uavlinkd.protocol.outputs import Deliver, Transmit
+from uavlinkd.relay import client_link as relay_link
+from uavlinkd.relay import direct_search, forwarding, service
+from uavlinkd.serial import line_framing
+from uavlinkd.tls import stream as web_stream
 
 
 class Plant(NamedTuple):

@@ -13,15 +13,15 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import Final
 
-from tests.core.harness import KEY_C, of, quiet
 from tests.fuzz.engine import Run, Script, play
 from tests.fuzz.stages import NOW, SeededEntropy, copier
-from uavlinkd.core import constants as c
-from uavlinkd.core.crypto import KeyPair, Secret
-from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import Dropped, Event, Output, RecordReceived, Transmit
-from uavlinkd.core.path import Path
-from uavlinkd.core.relay_records import (
+from tests.protocol.harness import KEY_C, of, quiet
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol.crypto import KeyPair, Secret
+from uavlinkd.protocol.node import Node
+from uavlinkd.protocol.outputs import Dropped, Event, Output, RecordReceived, Transmit
+from uavlinkd.protocol.path import Path
+from uavlinkd.protocol.relay_records import (
     INNER_STARTS,
     RELAYED,
     Bind,
@@ -30,8 +30,8 @@ from uavlinkd.core.relay_records import (
     Record,
     wrap,
 )
-from uavlinkd.core.settings import PeerSettings
-from uavlinkd.core.suites import SUITES_BY_NAME
+from uavlinkd.protocol.settings import PeerSettings
+from uavlinkd.protocol.suites import SUITES_BY_NAME
 from uavlinkd.relay.bindings import QUARANTINED_PER_MEMBER, ConnectionEnd
 from uavlinkd.relay.forwarding import MemberSettings, RelayLimits
 from uavlinkd.relay.service import RelayService, RelayShell

@@ -10,14 +10,26 @@ from dataclasses import dataclass, replace
 from types import BuiltinFunctionType, FunctionType, ModuleType
 from typing import Any, Final, TypeVar
 
-from tests.core import inside
-from tests.core.harness import AT_A, AT_B, ELSEWHERE, KEY_C, PLAIN, UNUSED_INDEX, Pair, Side, datagrams, only, quiet
-from uavlinkd.core import wire
-from uavlinkd.core.cookie import MacKeys, mac1_of
-from uavlinkd.core.crypto import AeadKey, KeyPair, MacKey, Secret
-from uavlinkd.core.path import Path
-from uavlinkd.core.settings import Link, PeerSettings
-from uavlinkd.core.suites import SUITES_BY_NAME, Suite
+from tests.protocol import inside
+from tests.protocol.harness import (
+    AT_A,
+    AT_B,
+    ELSEWHERE,
+    KEY_C,
+    PLAIN,
+    UNUSED_INDEX,
+    Pair,
+    Side,
+    datagrams,
+    only,
+    quiet,
+)
+from uavlinkd.protocol import wire
+from uavlinkd.protocol.cookie import MacKeys, mac1_of
+from uavlinkd.protocol.crypto import AeadKey, KeyPair, MacKey, Secret
+from uavlinkd.protocol.path import Path
+from uavlinkd.protocol.settings import Link, PeerSettings
+from uavlinkd.protocol.suites import SUITES_BY_NAME, Suite
 
 T = TypeVar("T")
 

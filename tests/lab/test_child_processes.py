@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.daemon.test_demo import is_running
 from tests.imports import sources
+from tests.processes.test_demo import is_running
 from tests.waiting import until
 from uavlinkd.lab.child_processes import end_with_parent, private_folder
 

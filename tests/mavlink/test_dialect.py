@@ -9,9 +9,9 @@ import pytest
 
 from tests.mavlink import dialect_generate
 from tests.samples import ID
-from uavlinkd.core.settings import Class
 from uavlinkd.mavlink import dialect
 from uavlinkd.mavlink.dialect import GROUPS, INSTANCES, KINDS, name_of
+from uavlinkd.protocol.settings import Class
 
 
 @pytest.mark.long

@@ -6,9 +6,9 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from tests.samples import attitude, build, command, frame, frames_of, heartbeat, read_by_index, read_by_name, value
-from uavlinkd.core.settings import Class
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.mavlink.payloads import ANSWERED_S, MAX_REQUESTS, ParameterAnswers, screen
+from uavlinkd.protocol.settings import Class
 
 STATION = 255
 AT_S = 100.0

@@ -11,14 +11,14 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from tests.daemon.frames import command_long, ground_heartbeat, heartbeat, numbered
-from tests.daemon.members import CertifiedFleet
-from tests.daemon.process import DaemonProcess
 from tests.mistakes.scene import WITHOUT_RIGHTS, Frames, Scene, checked, said_by_process
 from tests.needs import need
+from tests.processes.frames import command_long, ground_heartbeat, heartbeat, numbered
+from tests.processes.members import CertifiedFleet
+from tests.processes.process import DaemonProcess
+from uavlinkd.authority.certificates import MemberRole
 from uavlinkd.config import keys
 from uavlinkd.config.key_rules import EXAMPLE_KEYS
-from uavlinkd.core.certificates import MemberRole
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.system.base64_text import to_base64
 

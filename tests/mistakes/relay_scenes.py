@@ -6,10 +6,10 @@ import os
 import socket
 from typing import Any
 
-from tests.daemon.fleet import make_relay, relay_for
-from tests.daemon.process import DaemonProcess
 from tests.mistakes.scene import Scene, checked, said_by_process
 from tests.needs import need
+from tests.processes.fleet import make_relay, relay_for
+from tests.processes.process import DaemonProcess
 from uavlinkd.config import keys
 
 

@@ -13,9 +13,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from tests.daemon.harness import Stage
-from tests.daemon.process import DaemonProcess
-from tests.daemon.udp import Sockaddr
+from tests.processes.harness import Stage
+from tests.processes.process import DaemonProcess
+from tests.processes.udp import Sockaddr
 from uavlinkd.cli import main
 from uavlinkd.config.keys import write_secret_file
 

@@ -7,13 +7,13 @@ from time import monotonic
 
 import pytest
 
-from tests.daemon.harness import Stage
-from tests.daemon.process import DaemonProcess, Status
 from tests.mistakes.file_rows import FILE_ROWS
 from tests.mistakes.link_rows import LINK_ROWS
 from tests.mistakes.relay_rows import RELAY_ROWS
 from tests.mistakes.row import Mistake, Result, Side, is_in
 from tests.mistakes.scene import Scene
+from tests.processes.harness import Stage
+from tests.processes.process import DaemonProcess, Status
 from tests.waiting import PATIENCE_S
 
 STARTS = 4

@@ -17,13 +17,13 @@ from itertools import pairwise
 from statistics import median
 from typing import Final, NamedTuple
 
-from tests.daemon.frames import ground_heartbeat, heartbeat, sender_of
-from tests.daemon.harness import Stage
-from tests.daemon.members import CertifiedFleet
-from tests.daemon.process import DaemonProcess
-from tests.daemon.udp import Client, Sockaddr
+from tests.processes.frames import ground_heartbeat, heartbeat, sender_of
+from tests.processes.harness import Stage
+from tests.processes.members import CertifiedFleet
+from tests.processes.process import DaemonProcess
+from tests.processes.udp import Client, Sockaddr
 from tests.waiting import until
-from uavlinkd.core.certificates import MOST_REVOKED, MemberRole
+from uavlinkd.authority.certificates import MOST_REVOKED, MemberRole
 from uavlinkd.lab.mitm.modem import ModemEnd, ModemSettings
 from uavlinkd.lab.mitm.modem_ports import ModemPorts, PortSettings
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from tests.daemon.harness import Stage
 from tests.modem.members import play
+from tests.processes.harness import Stage
 from tests.waiting import Stopwatch
 
 

@@ -16,13 +16,13 @@ from io import StringIO
 from statistics import median
 from time import monotonic
 
-from tests.daemon.harness import Stage
 from tests.namespaces import why_not
 from tests.natlab import daemons, faults, latency
 from tests.natlab.kinds import KINDS, PAIRED
 from tests.natlab.laboratory import Laboratory
 from tests.natlab.members import Fleet, Joined, Revocation, Scenario, Spread
 from tests.natlab.pairs import make_ipv6_pairs, make_pairs
+from tests.processes.harness import Stage
 from uavlinkd.lab.child_processes import interrupted_by_signals
 
 

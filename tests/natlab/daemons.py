@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from time import monotonic
 from typing import Final
 
-from tests.daemon.harness import Stage
-from tests.daemon.process import DaemonProcess, Status
-from tests.daemon.tls import listen_for_tls
 from tests.faults.talk import Talk, Voice, prepare
 from tests.natlab.laboratory import Place
 from tests.natlab.pairs import Pair
+from tests.processes.harness import Stage
+from tests.processes.process import DaemonProcess, Status
+from tests.processes.tls import listen_for_tls
 
 NEVER_S: Final = 10.0
 """From when both daemons reached the relay, or after which they will not."""

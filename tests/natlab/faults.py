@@ -10,11 +10,11 @@ from time import monotonic
 from types import MappingProxyType
 from typing import Final
 
-from tests.daemon.harness import Stage
-from tests.daemon.process import DaemonProcess, Status
 from tests.faults.talk import CriticalVoice, Talk, Voice
 from tests.natlab.daemons import PORT, RELAY, Ends, make_ends, make_relay, until_direct
 from tests.natlab.laboratory import SECOND, Laboratory, Place
+from tests.processes.harness import Stage
+from tests.processes.process import DaemonProcess, Status
 from tests.waiting import until
 
 DELAY_S: Final = 0.025

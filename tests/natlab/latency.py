@@ -9,13 +9,13 @@ from dataclasses import dataclass
 from time import monotonic
 from typing import Final, NamedTuple
 
-from tests.daemon.harness import Stage
-from tests.daemon.process import Status
-from tests.daemon.tls import listen_for_tls
 from tests.namespaces import udp_socket_in
 from tests.natlab.daemons import make_member, make_relay
 from tests.natlab.laboratory import Laboratory
 from tests.natlab.talkers import COMMAND, TELEMETRY, Ages, Rates, Talker, ages
+from tests.processes.harness import Stage
+from tests.processes.process import Status
+from tests.processes.tls import listen_for_tls
 from tests.waiting import until
 
 NAMES: Final = "vehicle", "station"
@@ -32,8 +32,10 @@ LATE_S: Final = 3.0
 ENDLESS: Final = """
 import sys
 from math import inf
-from uavlinkd.endpoints import send_window, tls_channel, web_stream
-from uavlinkd.link import web_relays
+from uavlinkd.io import send_window
+from uavlinkd.tls import channel as tls_channel
+from uavlinkd.tls import stream as web_stream
+from uavlinkd.tls import relays as web_relays
 web_stream.QUEUE_S, web_stream.QUEUE_BYTES, tls_channel.UNSENT_BYTES = inf, inf, inf
 tls_channel._OPTIONS = [one for one in tls_channel._OPTIONS if one[1] != "TCP_NOTSENT_LOWAT"]
 send_window.SendWindow.is_open = True

@@ -19,15 +19,15 @@ from pathlib import Path
 from time import monotonic
 from typing import Final, NamedTuple
 
-from tests.daemon.frames import numbered
-from tests.daemon.harness import Stage
-from tests.daemon.members import CertifiedFleet
-from tests.daemon.process import DaemonProcess
 from tests.namespaces import Namespace, udp_socket_in
 from tests.natlab.daemons import PORT, RELAY
 from tests.natlab.laboratory import Laboratory, Place
+from tests.processes.frames import numbered
+from tests.processes.harness import Stage
+from tests.processes.members import CertifiedFleet
+from tests.processes.process import DaemonProcess
 from tests.waiting import PATIENCE_S
-from uavlinkd.core.certificates import MemberRole
+from uavlinkd.authority.certificates import MemberRole
 from uavlinkd.lab.evaluation.records import cpu_seconds
 
 GROUND: Final = "ground"

@@ -13,8 +13,8 @@ from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from tests.daemon.frames import command_long, frames_in
-from tests.daemon.udp import Sockaddr
+from tests.processes.frames import command_long, frames_in
+from tests.processes.udp import Sockaddr
 from tests.samples import pack
 
 COMMAND, TELEMETRY = "command", "telemetry"

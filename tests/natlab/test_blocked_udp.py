@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 
-from tests.daemon.fleet import beat
-from tests.daemon.frames import heartbeat
-from tests.daemon.harness import Stage
-from tests.daemon.process import DaemonProcess, Status
 from tests.namespaces import need_namespaces, udp_socket_in
 from tests.natlab.daemons import PORT
 from tests.natlab.laboratory import Laboratory
+from tests.processes.fleet import beat
+from tests.processes.frames import heartbeat
+from tests.processes.harness import Stage
+from tests.processes.process import DaemonProcess, Status
 from uavlinkd.ops.netcheck import folded, report
 
 pytestmark = pytest.mark.long

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from tests.daemon.harness import Stage
 from tests.natlab.laboratory import Laboratory, need_laboratory
 from tests.natlab.members import Fleet, Scenario
+from tests.processes.harness import Stage
 from tests.waiting import Stopwatch
 
 pytestmark = pytest.mark.alone

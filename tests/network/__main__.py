@@ -17,8 +17,8 @@ from dataclasses import fields
 from itertools import count
 from multiprocessing import get_context
 
-from tests.core.bounds import LIMITS
 from tests.network.histories import Played, play
+from tests.protocol.bounds import LIMITS
 
 _REPORT_INTERVAL_S = 30.0
 _AT_ONCE = 4

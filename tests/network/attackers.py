@@ -6,13 +6,13 @@ from contextlib import suppress
 from random import Random
 
 from tests.network.network import Address, Drone, Network
-from uavlinkd.core import constants as c
-from uavlinkd.core import handshake, wire
-from uavlinkd.core.cookie import MacKeys, mac1_of
-from uavlinkd.core.crypto import KeyPair
-from uavlinkd.core.drops import Drop
-from uavlinkd.core.settings import PeerSettings
-from uavlinkd.core.suites import X25519
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol import handshake, wire
+from uavlinkd.protocol.cookie import MacKeys, mac1_of
+from uavlinkd.protocol.crypto import KeyPair
+from uavlinkd.protocol.drops import Drop
+from uavlinkd.protocol.settings import PeerSettings
+from uavlinkd.protocol.suites import X25519
 
 
 class Recorder:

@@ -13,16 +13,16 @@ from tests.authority.signing import AUTHORITY, FLEET, bulletin, signed
 from tests.network.air import Address
 from tests.network.drone import Drone
 from tests.network.network import Network
+from uavlinkd.authority.certificates import Certificate, MemberRole
 from uavlinkd.authority.exchange import BulletinExchange, Reaction
 from uavlinkd.authority.trust import Trust
-from uavlinkd.core import constants as c
-from uavlinkd.core import outputs as o
-from uavlinkd.core.certificates import Certificate, MemberRole
-from uavlinkd.core.drops import Drop
-from uavlinkd.core.path import Path
-from uavlinkd.core.peer import Peer
-from uavlinkd.core.relay_records import BulletinRecord, CertificateRecord, FleetRecord, Have
-from uavlinkd.core.settings import Link, PeerSettings
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol import outputs as o
+from uavlinkd.protocol.drops import Drop
+from uavlinkd.protocol.path import Path
+from uavlinkd.protocol.peer import Peer
+from uavlinkd.protocol.relay_records import BulletinRecord, CertificateRecord, FleetRecord, Have
+from uavlinkd.protocol.settings import Link, PeerSettings
 
 FIRST_BULLETIN: Final = bulletin(1)
 _WRITE_S: Final = 0.1

@@ -9,20 +9,20 @@ from random import Random
 from typing import TYPE_CHECKING
 
 from tests.admitting import Admit, AdmittingNode
-from tests.core.bounds import Sizes, check
 from tests.network.air import Address, Endpoint, Hop
 from tests.network.nat import Nat
 from tests.network.serial_line import BUDGET_BITS_S
-from uavlinkd.core.cookie import MacKeys
-from uavlinkd.core.crypto import Secret, x25519_public_key
-from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import Event, Output, RecordReceived, SessionEstablished
-from uavlinkd.core.path import Path
-from uavlinkd.core.path_measures import limit_at
-from uavlinkd.core.peer import Peer
-from uavlinkd.core.refusals import Refused
-from uavlinkd.core.session import Session
-from uavlinkd.core.settings import Link, PeerSettings
+from tests.protocol.bounds import Sizes, check
+from uavlinkd.protocol.cookie import MacKeys
+from uavlinkd.protocol.crypto import Secret, x25519_public_key
+from uavlinkd.protocol.node import Node
+from uavlinkd.protocol.outputs import Event, Output, RecordReceived, SessionEstablished
+from uavlinkd.protocol.path import Path
+from uavlinkd.protocol.path_measures import limit_at
+from uavlinkd.protocol.peer import Peer
+from uavlinkd.protocol.refusals import Refused
+from uavlinkd.protocol.session import Session
+from uavlinkd.protocol.settings import Link, PeerSettings
 
 if TYPE_CHECKING:
     from tests.network.network import Network

@@ -10,8 +10,8 @@ from tests.network.air import Address, Hop
 from tests.network.drone import Drone
 from tests.network.network import Network
 from tests.network.plans import Plan
-from uavlinkd.core.path import SERIAL_HOST, Path
-from uavlinkd.core.settings import Link, Timers
+from uavlinkd.protocol.path import SERIAL_HOST, Path
+from uavlinkd.protocol.settings import Link, Timers
 
 CLOCKS = {"zero": 0.0, "1970": 1.0, "2038": 2.0**31 - 1, "2106": 2.0**32 - 1, "after 2106": 2.0**32 + 0.25}
 

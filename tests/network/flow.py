@@ -7,7 +7,7 @@ from bisect import bisect_left
 from dataclasses import dataclass, field
 from itertools import pairwise
 
-from uavlinkd.core.settings import Class
+from uavlinkd.protocol.settings import Class
 
 FRAME_BYTES = 24
 _FRAME_START = b"\xfd"

@@ -22,7 +22,6 @@ from functools import partial
 from random import Random
 from typing import NamedTuple
 
-from tests.core.bounds import Sizes
 from tests.network.air import Endpoint, Hop
 from tests.network.drone import Drone, share_a_session
 from tests.network.fleet import Fleet, Pair, Route
@@ -33,10 +32,11 @@ from tests.network.network import Network
 from tests.network.path_misfortunes import random_modems, random_radio
 from tests.network.plans import PLANS, WEIGHTS, Plan
 from tests.network.relay_fleet import RelayFleet
-from uavlinkd.core import constants as c
-from uavlinkd.core.outputs import SessionEstablished
-from uavlinkd.core.settings import Class
+from tests.protocol.bounds import Sizes
 from uavlinkd.lab.mitm.radio import RadioSettings
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol.outputs import SessionEstablished
+from uavlinkd.protocol.settings import Class
 
 SETTLED_S = 10.0
 """A path that was down is asked each second, and is usable again after three answers and 2 s."""

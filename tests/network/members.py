@@ -15,26 +15,26 @@ from typing import Final
 import structlog
 
 from tests.authority.signing import AUTHORITY, bulletin
-from tests.link.inside import handle_tables, set_own_sockets
+from tests.daemon.inside import handle_tables, set_own_sockets
 from tests.network.air import Address
 from tests.network.drone import Drone
 from tests.network.network import Network
 from uavlinkd.authority.trust import Trust
 from uavlinkd.config.build import TIMERS
 from uavlinkd.config.model import PeerAddress, PeerConfig, RelayConfig
-from uavlinkd.core import constants as c
-from uavlinkd.core import outputs as o
-from uavlinkd.core.crypto import Entropy
-from uavlinkd.core.drops import DropReason
-from uavlinkd.core.path import RELAY_HOST, Path
-from uavlinkd.core.peer import Peer
-from uavlinkd.core.relay_records import Bind, CertificateRecord
-from uavlinkd.core.settings import Link, PeerSettings
-from uavlinkd.link.direct_search import OwnSocket
-from uavlinkd.link.peer_link import PeerLink
-from uavlinkd.link.relay_link import RELAYED_START, RelayHandles, RelayLink
-from uavlinkd.link.relays import Relays
+from uavlinkd.daemon.peer_link import PeerLink
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol import outputs as o
+from uavlinkd.protocol.crypto import Entropy
+from uavlinkd.protocol.drops import DropReason
+from uavlinkd.protocol.path import RELAY_HOST, Path
+from uavlinkd.protocol.peer import Peer
+from uavlinkd.protocol.relay_records import Bind, CertificateRecord
+from uavlinkd.protocol.settings import Link, PeerSettings
 from uavlinkd.relay.bindings import QUARANTINED_PER_MEMBER
+from uavlinkd.relay.client_link import RELAYED_START, RelayHandles, RelayLink
+from uavlinkd.relay.clients import Relays
+from uavlinkd.relay.direct_search import OwnSocket
 from uavlinkd.relay.forwarding import MemberSettings, RelayLimits
 from uavlinkd.relay.service import RelayService, RelayShell
 from uavlinkd.system import addresses

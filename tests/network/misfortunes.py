@@ -11,8 +11,8 @@ from tests.network.drone import Drone
 from tests.network.fleet import Fleet
 from tests.network.path_misfortunes import Befalling, PathMisfortunes, random_address, random_radio
 from tests.network.relay_fleet import RelayFleet
-from uavlinkd.core import constants as c
-from uavlinkd.core.relay_records import RELAYED
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol.relay_records import RELAYED
 
 _FORGED = 50
 

@@ -18,14 +18,14 @@ from tests.network.air import Address, Air, Crossing, Endpoint, Hop
 from tests.network.drone import Drone, session_name, share_a_session
 from tests.network.flow import FRAME_BYTES, Flow, FlowKey, Sequence, class_in, every_second_may_be_old, split_frames
 from tests.network.serial_line import SIK, SerialLine
-from uavlinkd.core import wire
-from uavlinkd.core.constants import PROBLEMS_PER_REPORT, REFUSALS_KEPT
-from uavlinkd.core.outputs import CertificateShown, Deliver, Dropped, Output, RecordReceived, Transmit
-from uavlinkd.core.path import SERIAL_HOST, Path
-from uavlinkd.core.refusals import Refused
-from uavlinkd.core.settings import Class, Link, Screen, hold_all
 from uavlinkd.lab.mitm.modem import ModemSettings
 from uavlinkd.lab.mitm.radio import RadioSettings
+from uavlinkd.protocol import wire
+from uavlinkd.protocol.constants import PROBLEMS_PER_REPORT, REFUSALS_KEPT
+from uavlinkd.protocol.outputs import CertificateShown, Deliver, Dropped, Output, RecordReceived, Transmit
+from uavlinkd.protocol.path import SERIAL_HOST, Path
+from uavlinkd.protocol.refusals import Refused
+from uavlinkd.protocol.settings import Class, Link, Screen, hold_all
 
 __all__ = [
     "FRAME_BYTES",

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from random import Random
 
 from tests.authority.signing import FLEET, signed
-from tests.link.inside import handle_tables
+from tests.daemon.inside import handle_tables
 from tests.network.air import Address, Hop
 from tests.network.drone import Drone
 from tests.network.fleet import Fleet, Pair, Route
@@ -17,8 +17,8 @@ from tests.network.members import FEATURES, LINK, Member, Relay
 from tests.network.nat import Nat
 from tests.network.network import Network
 from tests.network.plans import Plan
-from uavlinkd.core.certificates import Certificate, MemberRole
-from uavlinkd.core.settings import Link
+from uavlinkd.authority.certificates import Certificate, MemberRole
+from uavlinkd.protocol.settings import Link
 
 
 class RelayFleet(Fleet):

@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from random import Random
 
 from tests.network.air import Address, Endpoint
-from uavlinkd.endpoints.line_framing import LineDecoder, encode
 from uavlinkd.lab.mitm.modem import ModemEnd, ModemLink, ModemSettings
+from uavlinkd.serial.line_framing import LineDecoder, encode
 
 SIK = ModemSettings()
 BUDGET_BITS_S = 0.4 * SIK.air_bits_s

@@ -11,8 +11,8 @@ import pytest
 from tests.authority.signing import bulletin
 from tests.network.certified import FIRST_BULLETIN, CertifiedDrone, CertifiedNetwork, Liar
 from tests.network.network import share_a_session
-from uavlinkd.core.drops import DropReason
 from uavlinkd.lab.mitm.radio import RadioSettings
+from uavlinkd.protocol.drops import DropReason
 
 SEEDS = int(os.environ.get("UAVLINKD_CHAOS_SEEDS", "3"))
 USABLE = RadioSettings(delay_s=0.05)

@@ -9,9 +9,9 @@ import os
 
 import pytest
 
-from tests.core.plants import FAULTS
 from tests.network.histories import Played, play
 from tests.network.plans import BUSY, HOURS, LARGE, LINES, MANY_PATHS, PATHS, Plan
+from tests.protocol.plants import FAULTS
 
 pytestmark = pytest.mark.long
 

@@ -9,11 +9,11 @@ import pytest
 
 from tests.lab.mitm.middle import Middle
 from tests.network.network import Flow, Network, every_second_may_be_old, share_a_session
-from uavlinkd.core import constants as c
-from uavlinkd.core.settings import Link, Timers
 from uavlinkd.lab.mitm.attacks import parse_attack
 from uavlinkd.lab.mitm.attacks.withholding import Reorder
 from uavlinkd.lab.mitm.radio import RadioSettings
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol.settings import Link, Timers
 
 OVERTAKEN_S = c.LATE_AFTER_S + 2 * c.LATE_STEP_S
 """The maximum age of a delivered frame if later ones arrived all the time,"""

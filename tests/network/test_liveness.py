@@ -16,15 +16,15 @@ from random import Random
 
 import pytest
 
-from tests.core.plants import LIVENESS_FAULTS
 from tests.network.air import Hop
 from tests.network.attackers import Recorder
 from tests.network.drone import share_a_session
 from tests.network.network import Network, every_second_may_be_old
 from tests.network.vehicle import add_vehicle, hop
-from uavlinkd.core.path import Path
-from uavlinkd.core.settings import Class, Link, Redundancy, Timers
+from tests.protocol.plants import LIVENESS_FAULTS
 from uavlinkd.lab.mitm.radio import RadioSettings
+from uavlinkd.protocol.path import Path
+from uavlinkd.protocol.settings import Class, Link, Redundancy, Timers
 
 WITHIN_S = 0.5
 """A frame that is sent while one path is honest arrives within this time."""

@@ -27,13 +27,10 @@ from tests.network.vehicle import add_vehicle, hop
 from tests.observe.daemon_parts import parts_of
 from tests.policies import TRUSTED
 from uavlinkd.config.model import PeerConfig
-from uavlinkd.core.drops import Attention, DropReason
-from uavlinkd.core.outputs import CertificateShown, Deliver, Dropped, Output, RecordReceived, Transmit
-from uavlinkd.core.settings import Class
+from uavlinkd.daemon.evidence import Evidence
+from uavlinkd.daemon.journal import DaemonJournal
+from uavlinkd.daemon.peer_link import Carriage, PeerLink
 from uavlinkd.lab.mitm.radio import RadioSettings
-from uavlinkd.link.evidence import Evidence
-from uavlinkd.link.journal import DaemonJournal
-from uavlinkd.link.peer_link import Carriage, PeerLink
 from uavlinkd.mavlink.headers import Header
 from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.observe.conditions import HOUR_S
@@ -42,6 +39,9 @@ from uavlinkd.observe.event_log import EventLog
 from uavlinkd.observe.findings import find
 from uavlinkd.observe.history import History
 from uavlinkd.ops.line_limits import LineLimits
+from uavlinkd.protocol.drops import Attention, DropReason
+from uavlinkd.protocol.outputs import CertificateShown, Deliver, Dropped, Output, RecordReceived, Transmit
+from uavlinkd.protocol.settings import Class
 
 HEALTHY = RadioSettings(delay_s=0.02, jitter_s=0.005, loss=0.01, reordering=0.001)
 NAMES = ("station", "drone1", "drone2", "drone3")

@@ -21,13 +21,13 @@ from tests.network.members import LINK, Member, Relay
 from tests.network.nat import Nat
 from tests.network.network import Network
 from tests.network.plans import RELAYS
-from uavlinkd.core import constants as c
-from uavlinkd.core.outputs import PeerUp
-from uavlinkd.core.path import RELAY_HOST, Path
-from uavlinkd.core.settings import Class
 from uavlinkd.lab.mitm.radio import RadioSettings
-from uavlinkd.link.relay_link import RelayLink
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol.outputs import PeerUp
+from uavlinkd.protocol.path import RELAY_HOST, Path
+from uavlinkd.protocol.settings import Class
 from uavlinkd.relay.bindings import Bindings, Changes
+from uavlinkd.relay.client_link import RelayLink
 
 RADIO = RadioSettings(delay_s=0.0225, jitter_s=0.005)
 """From a member to a relay or back: with both hops, a round trip of 100 ms."""

@@ -13,10 +13,10 @@ from typing import Any, Final, NamedTuple
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from tests.link.two_radios import End, Network, Radio
+from tests.daemon.two_radios import End, Network, Radio
 from tests.samples import attitude, command, heartbeat, manual_control, parameter, read_by_index
-from uavlinkd.core.settings import Link, Redundancy
 from uavlinkd.mavlink.frames import Frame, SplitCounters, split_payload
+from uavlinkd.protocol.settings import Link, Redundancy
 
 DELAY_S: Final = 0.01
 ITEMS: Final = 100
@@ -266,7 +266,7 @@ SHORT: Final = (MISSION, 0.5)
 
 def promises() -> dict[tuple[str, float], tuple[float, float]]:
     """Of frames at a loss: the share that arrives, and within what age. From section 15 of the specification."""
-    page = (Path(__file__).parents[2] / "uavlinkd/core/README.md").read_text()
+    page = (Path(__file__).parents[2] / "uavlinkd/protocol/README.md").read_text()
     promised: dict[tuple[str, float], tuple[float, float]] = {}
     for what in (*KINDS, MISSION):
         (row,) = re.findall(rf"^\| {re.escape(what)} \|(.*)\|$", page, re.MULTILINE)

@@ -10,9 +10,9 @@ import pytest
 
 from tests.network.attackers import Recorder
 from tests.network.network import Drone, Network, share_a_session
-from uavlinkd.core.drops import DropReason
-from uavlinkd.core.settings import Link, Timers
 from uavlinkd.lab.mitm.radio import RadioSettings
+from uavlinkd.protocol.drops import DropReason
+from uavlinkd.protocol.settings import Link, Timers
 
 FAST_REKEY = Link(timers=Timers(rekey_after_s=1.0, reject_after_s=6.0))
 

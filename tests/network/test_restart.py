@@ -7,8 +7,8 @@ from functools import partial
 import pytest
 
 from tests.network.network import Address, Drone, Network, share_a_session
-from uavlinkd.core.outputs import PeerLost
 from uavlinkd.lab.mitm.radio import RadioSettings
+from uavlinkd.protocol.outputs import PeerLost
 
 BACK_WITHIN_S = 2.0
 CLOCKS = {"zero": 0.0, "2106": 2.0**32 + 0.25}

@@ -13,19 +13,19 @@ from random import Random
 
 import pytest
 
-from tests.link.two_radios import End, Network, Radio, path_of
+from tests.daemon.two_radios import End, Network, Radio, path_of
 from tests.samples import attitude, command, heartbeat
-from uavlinkd.core import constants as c
-from uavlinkd.core import wire
-from uavlinkd.core.constants import LINE_BYTES, NEVER
-from uavlinkd.core.path import SERIAL_HOST, Path
-from uavlinkd.core.path_measures import limit_at
-from uavlinkd.core.probe import PROBE
-from uavlinkd.endpoints.line_framing import LineDecoder, encode
+from uavlinkd.daemon.networks import COPIES_SHARE
 from uavlinkd.lab.mitm.modem import ModemEnd, ModemLink, ModemSettings
-from uavlinkd.link.networks import COPIES_SHARE
 from uavlinkd.mavlink.egress.bucket import Bucket
 from uavlinkd.mavlink.frames import Frame
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol import wire
+from uavlinkd.protocol.constants import LINE_BYTES, NEVER
+from uavlinkd.protocol.path import SERIAL_HOST, Path
+from uavlinkd.protocol.path_measures import limit_at
+from uavlinkd.protocol.probe import PROBE
+from uavlinkd.serial.line_framing import LineDecoder, encode
 
 AIR_BITS_S = 4_000
 SHARE = 0.4

@@ -9,8 +9,8 @@ from random import Random
 import pytest
 
 from tests.network.network import Address, Drone, Network, session_name, share_a_session
-from uavlinkd.core.settings import Link, Timers
 from uavlinkd.lab.mitm.radio import RadioSettings
+from uavlinkd.protocol.settings import Link, Timers
 
 STALE: tuple[Address, ...] = (("192.0.2.1", 5790), ("192.0.2.2", 14550))
 TRIES = int(os.environ.get("UAVLINKD_HANDSHAKE_TRIES", "50"))

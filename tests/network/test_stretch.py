@@ -10,10 +10,10 @@ import pytest
 
 from tests.lab.mitm.middle import Middle
 from tests.network.network import Drone, Flow, Network, every_second_may_be_old, share_a_session
-from uavlinkd.core import constants as c
-from uavlinkd.core.settings import Link
 from uavlinkd.lab.mitm.attacks import parse_attack
 from uavlinkd.lab.mitm.radio import Bursts, RadioSettings
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol.settings import Link
 
 pytestmark = pytest.mark.long
 

@@ -12,10 +12,10 @@ from tests.network.attackers import Recorder
 from tests.network.drone import Drone, share_a_session
 from tests.network.network import Network
 from tests.network.vehicle import hop, linked_vehicle
-from uavlinkd.core import constants as c
-from uavlinkd.core.drops import DropReason
-from uavlinkd.core.settings import Class, Link, Timers
 from uavlinkd.lab.mitm.radio import RadioSettings
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol.drops import DropReason
+from uavlinkd.protocol.settings import Class, Link, Timers
 
 OLDEST_S = c.LATE_AFTER_S + c.LATE_STEP_S + 0.5
 """The age of a delivered frame where two paths carry traffic: the longest gap between envelopes is 0.5 s."""

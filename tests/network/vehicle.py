@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from tests.network.air import Hop
 from tests.network.drone import Drone, share_a_session
 from tests.network.network import Network
-from uavlinkd.core.path import Path
-from uavlinkd.core.settings import Link
 from uavlinkd.lab.mitm.radio import RadioSettings
+from uavlinkd.protocol.path import Path
+from uavlinkd.protocol.settings import Link
 
 
 def add_vehicle(

@@ -7,16 +7,16 @@ from collections.abc import Mapping
 from types import SimpleNamespace
 from typing import Any
 
-from uavlinkd.core.node import Node
-from uavlinkd.link.evidence import Evidence
-from uavlinkd.link.journal import DaemonJournal
-from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.daemon.evidence import Evidence
+from uavlinkd.daemon.journal import DaemonJournal
+from uavlinkd.daemon.peer_link import PeerLink
 from uavlinkd.mavlink.routing import Router
+from uavlinkd.protocol.node import Node
 from uavlinkd.system.addresses import Address
 
 
 def parts_of(node: Node, links: Mapping[str, PeerLink], evidence: Evidence, router: Router[Any] | None = None) -> Any:
-    """As :class:`uavlinkd.link.parts.DaemonParts`; every network is well."""
+    """As :class:`uavlinkd.daemon.parts.DaemonParts`; every network is well."""
     sockets = SimpleNamespace(
         unresolved=lambda name: set[str](),
         without_socket=set(),

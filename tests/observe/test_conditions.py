@@ -9,18 +9,18 @@ import structlog
 from structlog import get_logger
 from structlog.testing import capture_logs
 
-from tests.core.harness import Named
-from tests.link.inside import apply_file
+from tests.daemon.inside import apply_file
+from tests.protocol.harness import Named
 from uavlinkd.config.model import ConfigError, Problem
-from uavlinkd.core.outputs import PathStateChanged, PeerLost, PeerUp
-from uavlinkd.core.path import Path
-from uavlinkd.link import daemon
-from uavlinkd.link.journal import DaemonJournal
+from uavlinkd.daemon import daemon
+from uavlinkd.daemon.journal import DaemonJournal
 from uavlinkd.observe.conditions import HOUR_S, QUIET_S, Conditions, OpenCondition, Phase
 from uavlinkd.observe.event_log import ENDED_PROBLEMS, ENDPOINT_DELAY_S, FINDING_DELAY_S, EventLog
 from uavlinkd.observe.finding import Finding, Severity, Subject
 from uavlinkd.ops import line_limits
 from uavlinkd.ops.line_limits import LINES_BURST, LINES_PER_S, TOTAL_BURST, TOTAL_LINES_PER_S, LineLimits
+from uavlinkd.protocol.outputs import PathStateChanged, PeerLost, PeerUp
+from uavlinkd.protocol.path import Path
 
 BEGAN, CONTINUED, ENDED = Phase
 

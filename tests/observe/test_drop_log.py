@@ -10,16 +10,16 @@ from typing import Any, cast
 
 import pytest
 
-from tests.core.harness import Named
-from uavlinkd.core.drops import DropReason
-from uavlinkd.core.outputs import Dropped
-from uavlinkd.core.path import Path
-from uavlinkd.link.journal import DaemonJournal, Fact, ShellReason
+from tests.protocol.harness import Named
+from uavlinkd.daemon.journal import DaemonJournal, Fact, ShellReason
 from uavlinkd.mavlink.headers import Header
 from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.observe import drop_log
 from uavlinkd.observe.conditions import HOUR_S
 from uavlinkd.observe.drop_log import PERSISTENT_S, DropLog
+from uavlinkd.protocol.drops import DropReason
+from uavlinkd.protocol.outputs import Dropped
+from uavlinkd.protocol.path import Path
 
 
 class Recorder:

@@ -12,25 +12,17 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from tests.core.harness import PLAIN
-from tests.daemon.frames import command_long, ground_heartbeat, heartbeat
-from tests.link.test_evidence import HOST, OWN_KEY, THERE, Scene
+from tests.daemon.test_evidence import HOST, OWN_KEY, THERE, Scene
 from tests.observe.daemon_parts import parts_of
+from tests.processes.frames import command_long, ground_heartbeat, heartbeat
+from tests.protocol.harness import PLAIN
 from tests.samples import blank
 from tests.test_readmes import ROOT
 from uavlinkd.config.keys import encode_key
 from uavlinkd.config.model import EndpointConfig, PeerConfig
-from uavlinkd.core import constants as c
-from uavlinkd.core.drops import DropReason
-from uavlinkd.core.outputs import Dropped
-from uavlinkd.core.path import Path
-from uavlinkd.core.problem_reports import ProblemClaim
-from uavlinkd.core.refusals import RefusalReport, Refused
-from uavlinkd.core.sessions import Twin
-from uavlinkd.core.settings import PeerSettings
-from uavlinkd.endpoints.url import parse_url
-from uavlinkd.link.evidence import EVIDENCE_S, REPORTED
-from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.daemon.evidence import EVIDENCE_S, REPORTED
+from uavlinkd.daemon.peer_link import PeerLink
+from uavlinkd.io.url import parse_url
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.mavlink.egress.lanes import EgressDrop
 from uavlinkd.mavlink.egress.peer_egress import PeerEgress
@@ -45,6 +37,14 @@ from uavlinkd.observe.history import HIDDEN_LEAST, History
 from uavlinkd.observe.signs import SECURITY_S, is_contested
 from uavlinkd.observe.table import ROWS, Exit
 from uavlinkd.observe.traffic_signs import PROBLEMS
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol.drops import DropReason
+from uavlinkd.protocol.outputs import Dropped
+from uavlinkd.protocol.path import Path
+from uavlinkd.protocol.problem_reports import ProblemClaim
+from uavlinkd.protocol.refusals import RefusalReport, Refused
+from uavlinkd.protocol.sessions import Twin
+from uavlinkd.protocol.settings import PeerSettings
 from uavlinkd.system.addresses import Address
 
 NOW = 1.0
@@ -519,7 +519,9 @@ def test_a_daemon_reports_its_own_problems_only(daemon: Daemon) -> None:
     daemon.set_up(role="all", system_ids="all").peer.problem_claim = ProblemClaim((1,), 6.0)
     found = find(daemon.parts, daemon.history, 6.0)
     assert own_codes(found, is_cut_off=has_no_client(found, 1)) == [2]
-    text = (ROOT / "uavlinkd/core/README.md").read_text().partition("### Problem reports")[2].partition("\n## ")[0]
+    text = (
+        (ROOT / "uavlinkd/protocol/README.md").read_text().partition("### Problem reports")[2].partition("\n## ")[0]
+    )
     assert {int(code): name for code, name in re.findall(r"\| (\d+) \| `(\w+)`", text)} == {
         code: name for code, (name, _) in PROBLEMS.items()
     }

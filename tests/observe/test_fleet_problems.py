@@ -14,20 +14,20 @@ import pytest
 
 from tests.config.files import KEY
 from tests.config.fleets import OTHER_SIGNER, bulletin, certificate, contact, fleet, load_member, member_file
-from tests.link.test_evidence import THERE
+from tests.daemon.test_evidence import THERE
 from tests.observe.test_findings import NOW, STRANGER, Daemon
 from uavlinkd.authority import state_file
+from uavlinkd.authority.certificates import MemberRole, digest_of
 from uavlinkd.authority.constants import CONTACTS_FIRST_S, HAVE_INTERVAL_S
 from uavlinkd.config.keys import encode_key
-from uavlinkd.core.certificates import MemberRole, digest_of
-from uavlinkd.core.drops import Drop, DropReason
-from uavlinkd.core.outputs import Dropped, RecordReceived
-from uavlinkd.core.path import SERIAL_HOST
-from uavlinkd.core.path import Path as NetPath
-from uavlinkd.core.relay_records import BulletinRecord, CertificateRecord, FleetRecord, Have
-from uavlinkd.link.fleet_members import EVENT_S, FleetMembers
-from uavlinkd.link.fleet_shell import FleetShell
+from uavlinkd.fleet.members import EVENT_S, FleetMembers
+from uavlinkd.fleet.shell import FleetShell
 from uavlinkd.observe.finding import Severity, Subject
+from uavlinkd.protocol.drops import Drop, DropReason
+from uavlinkd.protocol.outputs import Dropped, RecordReceived
+from uavlinkd.protocol.path import SERIAL_HOST
+from uavlinkd.protocol.path import Path as NetPath
+from uavlinkd.protocol.relay_records import BulletinRecord, CertificateRecord, FleetRecord, Have
 
 C, D = (b64decode(KEY[name]) for name in ("c", "d"))
 

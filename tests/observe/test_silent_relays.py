@@ -6,20 +6,20 @@ from dataclasses import replace
 
 import pytest
 
-from tests.core.harness import PLAIN
 from tests.observe.test_findings import NOW, Daemon
+from tests.protocol.harness import PLAIN
 from uavlinkd.config.model import PeerAddress, RelayConfig
-from uavlinkd.core.drops import DropReason
-from uavlinkd.core.outputs import Dropped, PeerClosed
-from uavlinkd.core.path import Path
-from uavlinkd.core.path_state import PathCondition
-from uavlinkd.core.settings import PeerSettings
-from uavlinkd.link.peer_link import LOSSES, NOT_ANSWERING_S, PeerLink
-from uavlinkd.link.relay_link import RelayHandles, RelayLink
+from uavlinkd.daemon.peer_link import LOSSES, NOT_ANSWERING_S, PeerLink
 from uavlinkd.observe.facts import Moment
 from uavlinkd.observe.finding import Finding, Severity
 from uavlinkd.observe.findings import find
 from uavlinkd.observe.traffic_signs import LOSS_LASTS_S
+from uavlinkd.protocol.drops import DropReason
+from uavlinkd.protocol.outputs import Dropped, PeerClosed
+from uavlinkd.protocol.path import Path
+from uavlinkd.protocol.path_state import PathCondition
+from uavlinkd.protocol.settings import PeerSettings
+from uavlinkd.relay.client_link import RelayHandles, RelayLink
 from uavlinkd.system.addresses import Address
 
 FIRST, SECOND = ("203.0.113.1", 5790), ("203.0.113.2", 5790)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from tests.daemon.conftest import stage
-from tests.daemon.frames import frame
-from tests.daemon.harness import Stage
+from tests.processes.conftest import stage
+from tests.processes.frames import frame
+from tests.processes.harness import Stage
 from tests.waiting import PATIENCE_S
 
 __all__ = ["stage"]

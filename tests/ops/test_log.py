@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 import structlog
 
-from uavlinkd.core.crypto import Secret
 from uavlinkd.ops.log import set_up_logging
+from uavlinkd.protocol.crypto import Secret
 
 
 class Terminal(io.StringIO):

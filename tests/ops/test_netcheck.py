@@ -95,7 +95,7 @@ def test_each_url_of_a_relay_is_tried(error: str, line: str) -> None:
 
 def test_reasons_by_tls_are_a_closed_list() -> None:
     """Each reason of a member has a meaning and a remedy, which ``status`` shows too, and a row in README.md."""
-    sources = [ROOT / "uavlinkd/endpoints" / f"{name}.py" for name in ("web_connect", "web_stream", "tls_channel")]
+    sources = [ROOT / "uavlinkd/tls" / f"{name}.py" for name in ("connect", "stream", "channel")]
     written = r'(?:lose\(|lose, |return |fault = |else |WebConnectError\()f?"([a-z0-9_]+)'
     reasons = {reason for path in sources for reason in re.findall(written, path.read_text())}
     of_relays, of_daemon = {"page", "wrong_path"}, {"finished"}

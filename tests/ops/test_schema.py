@@ -7,16 +7,16 @@ from typing import Any
 
 import pytest
 
-from tests.daemon.frames import frame
-from tests.daemon.harness import Stage
-from tests.daemon.members import CertifiedFleet
 from tests.ops.schema import golden
+from tests.processes.frames import frame
+from tests.processes.harness import Stage
+from tests.processes.members import CertifiedFleet
 from tests.test_readmes import ROOT, names_in_table
-from uavlinkd.core.certificates import MemberRole
-from uavlinkd.endpoints.line_framing import RADIO_FIGURES
+from uavlinkd.authority.certificates import MemberRole
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.observe.finding import Finding, Severity, Subject
 from uavlinkd.ops import STATUS_SCHEMA
+from uavlinkd.serial.line_framing import RADIO_FIGURES
 
 MAPS = (
     *(

@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 from rich.console import Console, RenderableType
 
-from uavlinkd.core.drops import LinkProblem
-from uavlinkd.core.path_state import PathCondition
 from uavlinkd.observe.finding import Finding, Severity, Subject
 from uavlinkd.ops.status_screen import render_status
+from uavlinkd.protocol.drops import LinkProblem
+from uavlinkd.protocol.path_state import PathCondition
 
 PATH: dict[str, Any] = {
     "number": 1,

@@ -12,7 +12,7 @@ import pytest
 from tests.config.files import ADDRESSES, ENDPOINT, PEER, TOP, URL, load
 from tests.needs import need
 from uavlinkd.cli import main
-from uavlinkd.endpoints.sockets import Presence
+from uavlinkd.io.sockets import Presence
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.ops import surroundings
 

@@ -11,9 +11,9 @@ import pytest
 
 from tests.config.files import load
 from tests.config.fleets import bulletin, certificate, contact, fleet, load_member, member_file
+from uavlinkd.authority.certificates import MemberRole
 from uavlinkd.config import keys
 from uavlinkd.config.model import Config
-from uavlinkd.core.certificates import MemberRole
 from uavlinkd.mavlink import dialect
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import Gate, Refusal

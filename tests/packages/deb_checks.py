@@ -19,10 +19,10 @@ import pytest
 
 from tests.compose import images
 from tests.compose.machine import Machine, build_clean
-from tests.daemon.frames import numbered
 from tests.needs import need
+from tests.processes.frames import numbered
 from uavlinkd import __version__
-from uavlinkd.core.constants import PROTOCOL_NAME
+from uavlinkd.protocol.constants import PROTOCOL_NAME
 
 __all__ = [
     "machine",

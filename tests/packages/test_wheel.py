@@ -19,10 +19,10 @@ from time import monotonic
 import pytest
 
 from uavlinkd import __version__
-from uavlinkd.core.constants import PROTOCOL_NAME
 from uavlinkd.lab.child_processes import end_with_parent
 from uavlinkd.lab.mitm.anatomy import mavlink_frame
 from uavlinkd.lab.sim.loopback_ports import free_ports
+from uavlinkd.protocol.constants import PROTOCOL_NAME
 
 ROOT = Path(__file__).parents[2]
 

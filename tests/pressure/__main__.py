@@ -7,9 +7,9 @@ import asyncio
 import sys
 from contextlib import nullcontext
 
-from tests.daemon.harness import Stage
 from tests.limited_cpu import limited_cpu
 from tests.pressure.scene import HEADER, PLANS, Plan, Seen, watch
+from tests.processes.harness import Stage
 
 
 def main() -> int:

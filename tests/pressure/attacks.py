@@ -19,18 +19,18 @@ from unittest.mock import patch
 
 from tests.authority.signing import CERTIFICATE, signed
 from tests.kernel_queues import memory_of, receive_queue
-from uavlinkd.core import constants as c
-from uavlinkd.core import handshake, wire
-from uavlinkd.core.cookie import MacKeys, mac1_of
-from uavlinkd.core.crypto import KeyPair, Secret
-from uavlinkd.core.drops import Drop
-from uavlinkd.core.kem import FfdheGroup
-from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import Transmit
-from uavlinkd.core.path import Path
-from uavlinkd.core.session import Session
-from uavlinkd.core.settings import Link, PeerSettings
-from uavlinkd.core.suites import SUITES_BY_NAME, X25519
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol import handshake, wire
+from uavlinkd.protocol.cookie import MacKeys, mac1_of
+from uavlinkd.protocol.crypto import KeyPair, Secret
+from uavlinkd.protocol.drops import Drop
+from uavlinkd.protocol.kem import FfdheGroup
+from uavlinkd.protocol.node import Node
+from uavlinkd.protocol.outputs import Transmit
+from uavlinkd.protocol.path import Path
+from uavlinkd.protocol.session import Session
+from uavlinkd.protocol.settings import Link, PeerSettings
+from uavlinkd.protocol.suites import SUITES_BY_NAME, X25519
 
 HOSTS = tuple(f"127.0.0.{number}" for number in range(2, 6))
 STRANGERS_HOSTS = tuple(f"127.2.{number}.9" for number in range(50))

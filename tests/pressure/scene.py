@@ -10,16 +10,16 @@ from dataclasses import dataclass, field
 from statistics import quantiles
 from time import monotonic
 
-from tests.daemon.frames import frame
-from tests.daemon.harness import Stage
-from tests.daemon.losses import lost_to_waiting
-from tests.daemon.members import CertifiedFleet
-from tests.daemon.process import DaemonProcess, Status
-from tests.daemon.udp import Client, Sockaddr
 from tests.kernel_queues import cpu_s
 from tests.pressure.attacks import Target
+from tests.processes.frames import frame
+from tests.processes.harness import Stage
+from tests.processes.losses import lost_to_waiting
+from tests.processes.members import CertifiedFleet
+from tests.processes.process import DaemonProcess, Status
+from tests.processes.udp import Client, Sockaddr
 from tests.waiting import PATIENCE_S
-from uavlinkd.core.certificates import MemberRole
+from uavlinkd.authority.certificates import MemberRole
 from uavlinkd.lab.child_processes import end_with_parent
 
 INTERVAL_S = 0.05

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import pytest
 
-from tests.daemon.harness import Stage
 from tests.kernel_queues import capacity
 from tests.pressure.scene import FAIR_SHARE, PLANS, watch
+from tests.processes.harness import Stage
 from tests.waiting import Stopwatch
 
 SECONDS = 2.0

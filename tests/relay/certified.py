@@ -7,19 +7,19 @@ from collections.abc import Iterable
 
 from tests.admitting import AdmittingNode
 from tests.authority.signing import AUTHORITY, FLEET, published, signed
-from tests.core.harness import of, quiet, seeded
+from tests.protocol.harness import of, quiet, seeded
+from uavlinkd.authority.certificates import Bulletin, Certificate, MemberRole
 from uavlinkd.authority.constants import INTRODUCED_AFTER_S
 from uavlinkd.authority.trust import Trust
-from uavlinkd.core import constants as c
-from uavlinkd.core.certificates import Bulletin, Certificate, MemberRole
-from uavlinkd.core.crypto import KeyPair, Secret
-from uavlinkd.core.drops import DropReason
-from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import Event, Output, PeerAdmitted, RecordReceived, Transmit
-from uavlinkd.core.path import Path
-from uavlinkd.core.peer import Peer
-from uavlinkd.core.relay_records import Bind, Bound, CertificateRecord, Record, Who
-from uavlinkd.core.settings import PeerSettings
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol.crypto import KeyPair, Secret
+from uavlinkd.protocol.drops import DropReason
+from uavlinkd.protocol.node import Node
+from uavlinkd.protocol.outputs import Event, Output, PeerAdmitted, RecordReceived, Transmit
+from uavlinkd.protocol.path import Path
+from uavlinkd.protocol.peer import Peer
+from uavlinkd.protocol.relay_records import Bind, Bound, CertificateRecord, Record, Who
+from uavlinkd.protocol.settings import PeerSettings
 from uavlinkd.relay.forwarding import MemberSettings, RelayLimits
 from uavlinkd.relay.service import RelayService, RelayShell
 

@@ -1,5 +1,5 @@
 """Fixtures of the tests with relays as processes."""
 
-from tests.daemon.conftest import stage
+from tests.processes.conftest import stage
 
 __all__ = ["stage"]

@@ -8,15 +8,15 @@ from collections.abc import Callable
 from time import monotonic
 
 from tests import waiting
-from tests.daemon.udp import Sockaddr, open_socket
+from tests.processes.udp import Sockaddr, open_socket
 from tests.waiting import PATIENCE_S
-from uavlinkd.core import constants as c
-from uavlinkd.core.crypto import KeyPair, Secret
-from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import Output, RecordReceived, Transmit
-from uavlinkd.core.path import Path
-from uavlinkd.core.relay_records import RELAYED, Bind, Bound, wrap
-from uavlinkd.core.settings import Link, PeerSettings
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol.crypto import KeyPair, Secret
+from uavlinkd.protocol.node import Node
+from uavlinkd.protocol.outputs import Output, RecordReceived, Transmit
+from uavlinkd.protocol.path import Path
+from uavlinkd.protocol.relay_records import RELAYED, Bind, Bound, wrap
+from uavlinkd.protocol.settings import Link, PeerSettings
 
 LINK = Link(features=c.FEATURE_RECORDS)
 

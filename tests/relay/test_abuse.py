@@ -6,17 +6,17 @@ import tracemalloc
 
 import pytest
 
-from tests.core.harness import Pair, of
 from tests.fuzz.relays import HOMES, KEYS, RELAY_AT, STRANGERS, FuzzedRelay
-from tests.link.test_direct_search import HOME_A, LINK, leads_to_mesh
-from uavlinkd.core import constants as c
-from uavlinkd.core.drops import DropReason
-from uavlinkd.core.outputs import RecordReceived, Transmit
-from uavlinkd.core.path import Path, relayed
-from uavlinkd.core.path_state import PathState
-from uavlinkd.core.relay_records import Bind, Bound, Candidates, Record, wrap
-from uavlinkd.link.direct_search import DirectSearch, OwnSocket
+from tests.protocol.harness import Pair, of
+from tests.relay.test_direct_search import HOME_A, LINK, leads_to_mesh
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol.drops import DropReason
+from uavlinkd.protocol.outputs import RecordReceived, Transmit
+from uavlinkd.protocol.path import Path, relayed
+from uavlinkd.protocol.path_state import PathState
+from uavlinkd.protocol.relay_records import Bind, Bound, Candidates, Record, wrap
 from uavlinkd.relay import service
+from uavlinkd.relay.direct_search import DirectSearch, OwnSocket
 from uavlinkd.relay.service import BINDS_BURST, LOOK_S
 
 FLEET = 50

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from uavlinkd.core import constants as c
-from uavlinkd.core.path import Path
-from uavlinkd.core.relay_records import wrap
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol.path import Path
+from uavlinkd.protocol.relay_records import wrap
 from uavlinkd.relay.bindings import (
     FEWEST_PEERS,
     QUARANTINED_PER_MEMBER,

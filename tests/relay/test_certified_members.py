@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.relay.certified import LINK, CertifiedRelay
+from uavlinkd.authority.certificates import MemberRole
 from uavlinkd.authority.constants import (
     CERTIFICATES,
     CERTIFICATES_PER_ANSWER,
@@ -13,12 +14,11 @@ from uavlinkd.authority.constants import (
     INTRODUCTIONS,
     WHO,
 )
-from uavlinkd.core import constants as c
-from uavlinkd.core.certificates import MemberRole
-from uavlinkd.core.drops import DropReason
-from uavlinkd.core.path import Path
-from uavlinkd.core.relay_records import Bind, Who, wrap
-from uavlinkd.core.settings import PeerSettings
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol.drops import DropReason
+from uavlinkd.protocol.path import Path
+from uavlinkd.protocol.relay_records import Bind, Who, wrap
+from uavlinkd.protocol.settings import PeerSettings
 
 VEHICLE, OPERATOR, OBSERVER = MemberRole.VEHICLE, MemberRole.OPERATOR, MemberRole.OBSERVER
 ELSEWHERE = Path(0, ("203.0.113.7", 4000))

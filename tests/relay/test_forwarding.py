@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uavlinkd.core.drops import DropReason
-from uavlinkd.core.path import Path
-from uavlinkd.core.relay_records import INNER_STARTS, wrap
+from uavlinkd.protocol.drops import DropReason
+from uavlinkd.protocol.path import Path
+from uavlinkd.protocol.relay_records import INNER_STARTS, wrap
 from uavlinkd.relay.bindings import ConnectionEnd, MemberConnection
 from uavlinkd.relay.forwarding import BURST_S, Forwarding, Meter, RelayLimits, RelayReason
 

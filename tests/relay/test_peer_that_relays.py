@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 
-from tests.daemon.fleet import AN_OPERATOR, a_member, a_vehicle
-from tests.daemon.frames import heartbeat
-from tests.daemon.harness import Stage
-from tests.daemon.process import DaemonProcess, Status
+from tests.processes.fleet import AN_OPERATOR, a_member, a_vehicle
+from tests.processes.frames import heartbeat
+from tests.processes.harness import Stage
+from tests.processes.process import DaemonProcess, Status
 
 
 class Fleet:

@@ -9,16 +9,16 @@ from typing import Any
 
 import pytest
 
-from tests.daemon.fleet import relay_for
-from tests.daemon.frames import heartbeat
-from tests.daemon.harness import Stage
-from tests.daemon.process import DaemonProcess, Status
-from tests.daemon.test_reload import reload
 from tests.needs import need
+from tests.processes.fleet import relay_for
+from tests.processes.frames import heartbeat
+from tests.processes.harness import Stage
+from tests.processes.process import DaemonProcess, Status
+from tests.processes.test_reload import reload
 from tests.relay.core_member import CoreMember
 from uavlinkd.config.keys import decode_key, encode_key
-from uavlinkd.core.crypto import KeyPair
 from uavlinkd.lab.sim.loopback_ports import free_port, has_ipv6
+from uavlinkd.protocol.crypto import KeyPair
 from uavlinkd.system.addresses import Address
 
 INNER = b"\x40datagram"

@@ -14,7 +14,7 @@ from typing import Any
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import all as mavlink
 
-from tests.daemon.frames import sender_of
+from tests.processes.frames import sender_of
 from tests.sitl.ledger import SETTLED_S, source_of
 from tests.sitl.pilots import Pilot
 from tests.sitl.station import AUTOPILOT, RequestError

@@ -8,8 +8,8 @@ from bisect import bisect_right
 from itertools import pairwise
 from time import monotonic
 
-from tests.daemon.frames import sender_of
-from tests.daemon.process import DaemonProcess
+from tests.processes.frames import sender_of
+from tests.processes.process import DaemonProcess
 from tests.sitl.ledger import Passing, name_of
 from tests.sitl.pilots import Mode, Pilot
 from tests.sitl.tables import download_parameters

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from uavlinkd.core.settings import Class
 from uavlinkd.mavlink.dialect import KINDS, UNKNOWN
+from uavlinkd.protocol.settings import Class
 
 STX = (0xFE, 0xFD)
 SETTLED_S = 1.5

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from tests.daemon.toml import to_toml
-from tests.daemon.udp import Sockaddr, shown
+from tests.processes.toml import to_toml
+from tests.processes.udp import Sockaddr, shown
 from tests.waiting import PATIENCE_S
 from uavlinkd.lab.child_processes import end_with_parent
 from uavlinkd.lab.sim.loopback_ports import free_port

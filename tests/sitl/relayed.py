@@ -8,14 +8,14 @@ from dataclasses import dataclass
 from itertools import pairwise
 from time import monotonic
 
-from tests.daemon.frames import sender_of
-from tests.daemon.process import DaemonProcess
+from tests.processes.frames import sender_of
+from tests.processes.process import DaemonProcess
 from tests.sitl.flights import BACK_WITHIN_S, LEG_M, flight, frames_pass_again, modes
 from tests.sitl.ledger import SETTLED_S, Comparison, Passing, compare, compare_by, number_of, of_class
 from tests.sitl.pilots import Mode, Pilot
 from tests.sitl.transfers import Figures, FlightError, parameters_and_mission
 from tests.sitl.world import GROUND, World
-from uavlinkd.core.settings import Class
+from uavlinkd.protocol.settings import Class
 
 KILLS = 3
 CALM_S = 3.0

@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
-from tests.daemon.udp import Sockaddr, shown
+from tests.processes.udp import Sockaddr, shown
 from tests.sitl.real_autopilot import Firmware, RealAutopilot, RealAutopilotSettings, binary_of
 from uavlinkd.lab.child_processes import end_with_parent
 from uavlinkd.lab.sim.autopilot import HOME

@@ -15,8 +15,8 @@ from typing import Any, Self
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from tests.daemon.frames import sender_of
-from tests.daemon.udp import Sockaddr, open_socket
+from tests.processes.frames import sender_of
+from tests.processes.udp import Sockaddr, open_socket
 from tests.sitl.ledger import Passing, name_of, split
 
 SYSTEM = 255

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from tests.daemon.frames import frame, heartbeat
+from tests.processes.frames import frame, heartbeat
 from tests.sitl.downloads import judged
 from tests.sitl.ledger import Passing, compare, compare_by, number_of, source_of, split
 from tests.sitl.pilots import Place

@@ -21,14 +21,14 @@ from dataclasses import dataclass, field
 from time import monotonic
 from typing import Any
 
-from tests.daemon.fleet import AN_OPERATOR, a_member, a_vehicle, make_relay
-from tests.daemon.frames import sender_of
-from tests.daemon.harness import Stage
-from tests.daemon.process import DaemonProcess, Status
-from tests.daemon.tls import listen_for_tls
-from tests.daemon.udp import Sockaddr, open_socket, shown
 from tests.kernel_queues import cpu_s
 from tests.namespaces import Namespace
+from tests.processes.fleet import AN_OPERATOR, a_member, a_vehicle, make_relay
+from tests.processes.frames import sender_of
+from tests.processes.harness import Stage
+from tests.processes.process import DaemonProcess, Status
+from tests.processes.tls import listen_for_tls
+from tests.processes.udp import Sockaddr, open_socket, shown
 from tests.sitl.ledger import SETTLED_S, Comparison, Passing, compare, compare_by, source_of, split
 from tests.sitl.radio import Condition, Radio
 from tests.sitl.simulators import Simulator

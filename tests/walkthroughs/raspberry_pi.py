@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from tests.compose.machine import Machine
-from tests.daemon.frames import heartbeat
+from tests.processes.frames import heartbeat
 from tests.walkthroughs import autopilot
 from tests.walkthroughs.hosts import until
 from tests.walkthroughs.test_walkthroughs import Walk, blocks_of, position, return_home, walk

@@ -12,8 +12,8 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from tests.compose.machine import Machine
-from tests.daemon.frames import GROUND_SYSTEM, command_long, ground_heartbeat, heartbeat, numbered
 from tests.namespaces import need_namespaces
+from tests.processes.frames import GROUND_SYSTEM, command_long, ground_heartbeat, heartbeat, numbered
 from tests.samples import pack
 from tests.walkthroughs.hosts import Autopilot, Container, GroundStation, Host, Network, until
 

@@ -10,9 +10,9 @@ from typing import Final, Literal, NamedTuple, get_args
 from axe_playwright_python.async_playwright import Axe
 from playwright.async_api import Browser, ConsoleMessage, Locator, Page, Request, async_playwright, expect
 
-from tests.daemon.harness import Stage
-from tests.daemon.process import DaemonProcess
 from tests.needs import need
+from tests.processes.harness import Stage
+from tests.processes.process import DaemonProcess
 from tests.waiting import PATIENCE_S
 from tests.web.served import served
 

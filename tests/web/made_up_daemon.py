@@ -6,7 +6,7 @@ import asyncio
 from copy import deepcopy
 from typing import Any
 
-from tests.daemon.harness import Stage
+from tests.processes.harness import Stage
 from tests.web.statuses import Status
 from uavlinkd.ops.control import Answer
 

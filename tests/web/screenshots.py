@@ -17,12 +17,12 @@ from typing import Final
 
 from playwright.async_api import Browser
 
-from tests.daemon.fleet import AN_OPERATOR, a_vehicle, beat
-from tests.daemon.frames import ground_heartbeat
-from tests.daemon.harness import Stage
-from tests.daemon.process import DaemonProcess
-from tests.daemon.relay import End, Relay
-from tests.daemon.udp import shown
+from tests.processes.fleet import AN_OPERATOR, a_vehicle, beat
+from tests.processes.frames import ground_heartbeat
+from tests.processes.harness import Stage
+from tests.processes.process import DaemonProcess
+from tests.processes.relay import End, Relay
+from tests.processes.udp import shown
 from tests.web.browser import Scheme, card_of, open_browser, window
 from tests.web.served import served
 from uavlinkd.lab.child_processes import end_with_parent

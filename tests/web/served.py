@@ -17,8 +17,8 @@ import h11
 
 from tests.waiting import PATIENCE_S
 from tests.web.statuses import overview
-from uavlinkd.core.crypto import sha256
 from uavlinkd.ops.control import Answer, ControlServer
+from uavlinkd.protocol.crypto import sha256
 from uavlinkd.system.addresses import Address
 from uavlinkd.web import server
 from uavlinkd.web.page import Page

@@ -17,10 +17,10 @@ from tests.tls_files import write_tls_files
 from tests.waiting import PATIENCE_S
 from tests.web.served import Served, basic, is_answered, peaceful
 from uavlinkd.cli import main
-from uavlinkd.core.crypto import sha256
 from uavlinkd.lab.child_processes import end_with_parent
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.ops.control import ControlServer
+from uavlinkd.protocol.crypto import sha256
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.terminal import FAILED, OK, WRONG
 

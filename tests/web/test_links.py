@@ -11,11 +11,11 @@ import sys
 import pytest
 from playwright.async_api import Browser, Locator, expect
 
-from tests.daemon.fleet import relay_for
-from tests.daemon.harness import Stage
-from tests.daemon.process import DaemonProcess
-from tests.daemon.relay import End, Relay
-from tests.daemon.udp import shown
+from tests.processes.fleet import relay_for
+from tests.processes.harness import Stage
+from tests.processes.process import DaemonProcess
+from tests.processes.relay import End, Relay
+from tests.processes.udp import shown
 from tests.waiting import Stopwatch
 from tests.web.browser import card_of, headline, linked_pair, until_lost, window
 from tests.web.served import served

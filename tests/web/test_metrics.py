@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from tests.needs import need
-from uavlinkd.core.drops import DropReason
 from uavlinkd.mavlink.policy.gate import Refusal
+from uavlinkd.protocol.drops import DropReason
 from uavlinkd.web import metrics
 from uavlinkd.web.metrics import exposition
 

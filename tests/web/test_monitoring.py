@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.web.test_metrics import STATUS, promtool
-from uavlinkd.core.drops import DropReason
+from uavlinkd.protocol.drops import DropReason
 from uavlinkd.web.metrics import exposition
 
 CONFIGS = Path(__file__).parents[2] / "configs"

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from tests.daemon.conftest import stage
-from tests.daemon.harness import Stage
+from tests.processes.conftest import stage
+from tests.processes.harness import Stage
 from tests.waiting import PATIENCE_S, Stopwatch
 from tests.web.statuses import few_facts, overview
 from uavlinkd.ops.control import MAX_REQUEST_BYTES

@@ -17,9 +17,9 @@ from typing import Any
 import pytest
 from starlette.requests import Request
 
-from tests.daemon.conftest import stage
-from tests.daemon.harness import Stage
 from tests.needs import need
+from tests.processes.conftest import stage
+from tests.processes.harness import Stage
 from tests.waiting import PATIENCE_S
 from tests.web.test_metrics import STATUS
 from uavlinkd.lab.child_processes import end_with_parent

@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from tests.daemon.conftest import stage
-from tests.daemon.harness import Stage
+from tests.processes.conftest import stage
+from tests.processes.harness import Stage
 from tests.waiting import PATIENCE_S, Stopwatch
 from tests.web.served import is_answered, served
 from tests.web.statuses import Status, few_facts, overview

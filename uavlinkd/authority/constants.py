@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from uavlinkd.core.constants import Rate
+from uavlinkd.protocol.constants import Rate
 
 CERTIFIED_PEERS = 256  # peers by certificate, provisional ones included: one for each system id
 CONTACTS_FIRST_S = 1.0

@@ -10,8 +10,7 @@ import base64
 import struct
 from typing import NamedTuple
 
-from uavlinkd.authority.trust import Trust
-from uavlinkd.core.certificates import (
+from uavlinkd.authority.certificates import (
     BULLETIN_BYTES,
     FLEET_LABEL,
     NAME,
@@ -21,11 +20,12 @@ from uavlinkd.core.certificates import (
     role_bits,
     roles_in,
 )
-from uavlinkd.core.constants import KEY_BYTES
-from uavlinkd.core.crypto import AuthorityKey, is_usable_public_key, sha256
-from uavlinkd.core.drops import Drop
-from uavlinkd.core.suites import SUITES, Suite
-from uavlinkd.core.wire import CERTIFICATE_BYTES
+from uavlinkd.authority.trust import Trust
+from uavlinkd.protocol.constants import KEY_BYTES
+from uavlinkd.protocol.crypto import AuthorityKey, is_usable_public_key, sha256
+from uavlinkd.protocol.drops import Drop
+from uavlinkd.protocol.suites import SUITES, Suite
+from uavlinkd.protocol.wire import CERTIFICATE_BYTES
 from uavlinkd.system.addresses import AddressError, parse_place
 from uavlinkd.system.base64_text import from_base64, to_base64
 from uavlinkd.system.terminal import UsageError

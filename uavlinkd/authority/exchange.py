@@ -14,9 +14,9 @@ from typing import NamedTuple
 
 from uavlinkd.authority import constants as c
 from uavlinkd.authority.trust import BulletinVerdict, Trust
-from uavlinkd.core.crypto import Entropy
-from uavlinkd.core.drops import Drop, DropReason
-from uavlinkd.core.relay_records import BulletinRecord, CertificateRecord, FleetRecord, Have
+from uavlinkd.protocol.crypto import Entropy
+from uavlinkd.protocol.drops import Drop, DropReason
+from uavlinkd.protocol.relay_records import BulletinRecord, CertificateRecord, FleetRecord, Have
 
 ROLLED_BACK = "bulletin_rolled_back"
 """A peer has an older bulletin than it had before: its disk was restored."""
@@ -110,7 +110,8 @@ class BulletinExchange:
     def receive(self, key: bytes, record: FleetRecord, order: int, now: float) -> Reaction:
         """A peer sent *have*, a bulletin, or a certificate for its own key or this daemon's.
 
-        ``order``: that of :class:`~uavlinkd.core.outputs.RecordReceived`. Raises Drop if the record has no effect.
+        ``order``: that of :class:`~uavlinkd.protocol.outputs.RecordReceived`. Raises Drop if the record has no
+        effect.
         """
         peer = self._peers.get(key)
         if peer is None or not peer.is_up:

@@ -14,10 +14,10 @@ from stat import S_ISREG
 from types import MappingProxyType
 from typing import NamedTuple
 
+from uavlinkd.authority.certificates import parse_certificate
 from uavlinkd.authority.trust import BulletinVerdict, Trust, is_same_member
-from uavlinkd.core.certificates import parse_certificate
-from uavlinkd.core.crypto import sha256
-from uavlinkd.core.drops import Drop
+from uavlinkd.protocol.crypto import sha256
+from uavlinkd.protocol.drops import Drop
 from uavlinkd.system.folders import sync_folder, write_new
 
 _TITLE = b"uavlinkd fleet state 1"

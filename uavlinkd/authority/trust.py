@@ -9,8 +9,7 @@ from collections.abc import Collection, Container, Iterable, Iterator, Mapping
 from enum import Enum
 from typing import NamedTuple
 
-from uavlinkd.authority.constants import CERTIFIED_PEERS
-from uavlinkd.core.certificates import (
+from uavlinkd.authority.certificates import (
     GENERATION,
     Certificate,
     MemberRole,
@@ -22,9 +21,10 @@ from uavlinkd.core.certificates import (
     parse_certificate,
     verified_bulletin,
 )
-from uavlinkd.core.crypto import AuthorityKey
-from uavlinkd.core.drops import Drop, DropReason
-from uavlinkd.core.peer import Peer
+from uavlinkd.authority.constants import CERTIFIED_PEERS
+from uavlinkd.protocol.crypto import AuthorityKey
+from uavlinkd.protocol.drops import Drop, DropReason
+from uavlinkd.protocol.peer import Peer
 from uavlinkd.system.base64_text import to_base64
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from itertools import combinations
 
+from uavlinkd.authority.certificates import parse_bulletin, parse_certificate
 from uavlinkd.config.model import Config, EndpointConfig, FleetConfig, PeerAddress, PeerConfig
-from uavlinkd.core.certificates import parse_bulletin, parse_certificate
-from uavlinkd.endpoints.url import EndpointKind, NetworkUrl
+from uavlinkd.io.url import EndpointKind, NetworkUrl
 from uavlinkd.mavlink.policy.settings import read_settings
 from uavlinkd.system.addresses import Address
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
+from uavlinkd.authority.certificates import Certificate, MemberRole
 from uavlinkd.config.members import DEFAULT_POLICIES, fleet_link, member_peer
 from uavlinkd.config.model import (
     Config,
@@ -33,13 +34,12 @@ from uavlinkd.config.schema import (
     PolicySection,
     RelayServerSection,
 )
-from uavlinkd.core import constants as c
-from uavlinkd.core import wire
-from uavlinkd.core.certificates import Certificate, MemberRole
-from uavlinkd.core.path import RELAY_HOST
-from uavlinkd.core.settings import Link, PeerSettings, Redundancy, Timers
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.mavlink.policy.settings import PolicyError, read_settings
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol import wire
+from uavlinkd.protocol.path import RELAY_HOST
+from uavlinkd.protocol.settings import Link, PeerSettings, Redundancy, Timers
 from uavlinkd.system.addresses import IPV6_UDP_BYTES
 
 if TYPE_CHECKING:

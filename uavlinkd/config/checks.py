@@ -12,7 +12,7 @@ from uavlinkd.config.build import inherited, policy_data, policy_problems
 from uavlinkd.config.model import HttpsServer
 from uavlinkd.config.problems import Found, Sections, Values, unique
 from uavlinkd.config.schema import LinkSection
-from uavlinkd.endpoints.url import EndpointKind, NetworkUrl
+from uavlinkd.io.url import EndpointKind, NetworkUrl
 from uavlinkd.system.addresses import Address, overlaps
 
 _RETRIES_BEFORE_REJECT = 2

@@ -6,13 +6,13 @@ from collections.abc import Iterator
 from itertools import combinations
 from typing import TYPE_CHECKING, NamedTuple
 
+from uavlinkd.authority.certificates import MemberRole, fleet_id_of, is_certified, verified_bulletin
 from uavlinkd.config.build import fleet_policies, member_role, policy_data, policy_problems
 from uavlinkd.config.problems import Found, Sections, Values, role_of, unique
 from uavlinkd.config.relay_rules import over_ip
 from uavlinkd.config.schema import ENROLL_AGAIN
-from uavlinkd.core.certificates import MemberRole, fleet_id_of, is_certified, verified_bulletin
-from uavlinkd.core.crypto import AuthorityKey
 from uavlinkd.mavlink.policy.settings import PolicyError, read_settings
+from uavlinkd.protocol.crypto import AuthorityKey
 
 if TYPE_CHECKING:
     from uavlinkd.authority.trust import HeldCertificate

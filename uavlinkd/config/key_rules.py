@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator
 
 from uavlinkd.config.keys import encode_key, looks_private
 from uavlinkd.config.problems import Found, Sections, Values, unique
-from uavlinkd.core.crypto import x25519_public_key
+from uavlinkd.protocol.crypto import x25519_public_key
 
 EXAMPLE_KEYS = frozenset(
     {

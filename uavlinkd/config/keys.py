@@ -13,8 +13,8 @@ from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from uavlinkd.core.constants import KEY_BYTES
-from uavlinkd.core.crypto import FIELD_PRIME, Secret, x25519_public_key
+from uavlinkd.protocol.constants import KEY_BYTES
+from uavlinkd.protocol.crypto import FIELD_PRIME, Secret, x25519_public_key
 from uavlinkd.system.base64_text import from_base64, to_base64
 from uavlinkd.system.folders import sync_folder
 from uavlinkd.system.terminal import CommandError

@@ -24,7 +24,7 @@ from uavlinkd.config.model import Config, ConfigError, Problem
 from uavlinkd.config.problems import Problems, Sections, Values, example_of
 from uavlinkd.config.section import Section
 from uavlinkd.config.tls_files import TlsFileError, find_tls_files
-from uavlinkd.core.crypto import Secret
+from uavlinkd.protocol.crypto import Secret
 from uavlinkd.system.tasks import Threads
 
 STATES = "STATE_DIRECTORY"

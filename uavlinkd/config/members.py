@@ -7,13 +7,13 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
+from uavlinkd.authority.certificates import Certificate, MemberRole
 from uavlinkd.config.model import Config, FleetConfig, PeerConfig, PolicyData
 from uavlinkd.config.relay_rules import MOST_MEMBERS
-from uavlinkd.core import constants as c
-from uavlinkd.core.certificates import Certificate, MemberRole
-from uavlinkd.core.settings import Link, PeerSettings
 from uavlinkd.mavlink.policy.roles import ROLES
 from uavlinkd.mavlink.policy.settings import read_settings
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol.settings import Link, PeerSettings
 
 if TYPE_CHECKING:
     from uavlinkd.authority.trust import Pinned

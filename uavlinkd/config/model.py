@@ -8,13 +8,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from uavlinkd.core.certificates import MemberRole
-from uavlinkd.core.crypto import AuthorityKey, Secret
-from uavlinkd.core.path import RELAY_HOST, SERIAL_HOST
-from uavlinkd.core.settings import Link, PeerSettings
-from uavlinkd.endpoints.url import EndpointUrl, SerialUrl
+from uavlinkd.authority.certificates import MemberRole
+from uavlinkd.io.url import EndpointUrl, SerialUrl
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.mavlink.policy.compilation import Policy
+from uavlinkd.protocol.crypto import AuthorityKey, Secret
+from uavlinkd.protocol.path import RELAY_HOST, SERIAL_HOST
+from uavlinkd.protocol.settings import Link, PeerSettings
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.terminal import UsageError
 

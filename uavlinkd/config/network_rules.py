@@ -10,7 +10,7 @@ from typing import Final
 from uavlinkd.config.model import NetworkConfig, PeerAddress
 from uavlinkd.config.problems import Found, Sections, Values, unique
 from uavlinkd.config.schema import NetworkSection
-from uavlinkd.endpoints.url import SerialUrl
+from uavlinkd.io.url import SerialUrl
 from uavlinkd.system.addresses import Address
 
 USUAL_BAUD: Final = 57600  # the baud rate of SiK modems as they are sold

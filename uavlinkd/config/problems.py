@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pydantic_core import ErrorDetails
 
+from uavlinkd.authority.certificates import MemberRole
 from uavlinkd.config import schema
 from uavlinkd.config.model import ConfigError, Problem
 from uavlinkd.config.section import Key, Section, read
-from uavlinkd.core.certificates import MemberRole
-from uavlinkd.core.crypto import Secret, x25519_public_key
 from uavlinkd.mavlink.policy.settings import INSTEAD_OF_DENIAL
+from uavlinkd.protocol.crypto import Secret, x25519_public_key
 
 if TYPE_CHECKING:
     from uavlinkd.authority.trust import HeldCertificate

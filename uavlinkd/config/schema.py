@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 from pydantic_core import CoreSchema
 
+from uavlinkd.authority.certificates import LAST_SERIAL, parse_bulletin, parse_certificate
+from uavlinkd.authority.certificates import NAME as MEMBER_NAME
 from uavlinkd.config.keys import decode_key, is_canonical_public_key
 from uavlinkd.config.model import SERIAL, HttpsServer, PeerAddress
 from uavlinkd.config.section import (
@@ -29,14 +31,12 @@ from uavlinkd.config.section import (
     number,
     parsed,
 )
-from uavlinkd.core import constants as c
-from uavlinkd.core.certificates import LAST_SERIAL, parse_bulletin, parse_certificate
-from uavlinkd.core.certificates import NAME as MEMBER_NAME
-from uavlinkd.core.crypto import AuthorityKey, is_usable_public_key
-from uavlinkd.core.drops import Drop
-from uavlinkd.core.suites import SUITES_BY_NAME, X25519, Suite
-from uavlinkd.endpoints.url import EndpointUrl, SerialUrl, parse_line, parse_url
+from uavlinkd.io.url import EndpointUrl, SerialUrl, parse_line, parse_url
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol.crypto import AuthorityKey, is_usable_public_key
+from uavlinkd.protocol.drops import Drop
+from uavlinkd.protocol.suites import SUITES_BY_NAME, X25519, Suite
 from uavlinkd.system.addresses import Address, AddressError, parse_address, parse_place
 from uavlinkd.system.base64_text import from_base64
 

@@ -37,7 +37,7 @@ def find_tls_files(server: HttpsServer, folder: Path, environ: Mapping[str, str]
 
 def load_tls(certificate: Path, key: Path) -> SSLContext:
     """What a server of TLS needs. Raises TlsFileError if the files cannot be used."""
-    from uavlinkd.endpoints.tls_channel import server_context  # noqa: PLC0415  only if configured
+    from uavlinkd.tls.channel import server_context  # noqa: PLC0415  only if configured
 
     for what, path in (("certificate", certificate), ("key", key)):
         try:

@@ -13,8 +13,8 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+from uavlinkd.authority.certificates import MemberRole
 from uavlinkd.authority.enrolment import LONGEST_LINE, FleetError, fingerprint_of, parse_request
-from uavlinkd.core.certificates import MemberRole
 from uavlinkd.fleet import enrolling, operations
 from uavlinkd.fleet.authority_key import (
     AUTHORITY_FILE,

@@ -15,9 +15,9 @@ from pathlib import Path
 
 from uavlinkd.authority.enrolment import FleetError
 from uavlinkd.config.keys import read_private_file
-from uavlinkd.core.constants import KEY_BYTES
-from uavlinkd.core.crypto import Secret, read_signing_key, sha256
 from uavlinkd.fleet.manifest import FleetFileError
+from uavlinkd.protocol.constants import KEY_BYTES
+from uavlinkd.protocol.crypto import Secret, read_signing_key, sha256
 
 AUTHORITY_FILE = "authority.pem"
 SUCCESSOR_FILE = "successor.pem"

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from uavlinkd.authority.certificates import Certificate, parse_bulletin, parse_certificate
 from uavlinkd.authority.enrolment import (
     FleetError,
     Reply,
@@ -20,13 +21,12 @@ from uavlinkd.authority.enrolment import (
 )
 from uavlinkd.config import keys
 from uavlinkd.config.load import read_toml
-from uavlinkd.core.certificates import Certificate, parse_bulletin, parse_certificate
-from uavlinkd.core.crypto import x25519_public_key
-from uavlinkd.core.drops import Drop
 from uavlinkd.fleet.files import config_file, key_file, listen_on, new_table, with_fleet, written
 from uavlinkd.fleet.manifest import FleetSettings
 from uavlinkd.fleet.transaction import aside_of, changing, recover
 from uavlinkd.mavlink.dialect import SYSTEM_ID
+from uavlinkd.protocol.crypto import x25519_public_key
+from uavlinkd.protocol.drops import Drop
 from uavlinkd.system.base64_text import from_base64
 
 _NEXT = ".next.key"  # no name of a member has a dot

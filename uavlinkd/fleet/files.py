@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
 
+from uavlinkd.authority.certificates import MemberRole, parse_certificate
 from uavlinkd.authority.enrolment import Contact, FleetError, Reply, ids_of
-from uavlinkd.core.certificates import MemberRole, parse_certificate
-from uavlinkd.core.drops import Drop
-from uavlinkd.core.path import WEB_HOST
-from uavlinkd.core.suites import SUITES_BY_NAME
 from uavlinkd.fleet.manifest import Fleet, FleetSettings, Member, fill, toml_text
+from uavlinkd.protocol.drops import Drop
+from uavlinkd.protocol.path import WEB_HOST
+from uavlinkd.protocol.suites import SUITES_BY_NAME
 from uavlinkd.system.addresses import parse_place
 from uavlinkd.system.base64_text import from_base64, to_base64
 

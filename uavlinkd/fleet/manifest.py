@@ -14,8 +14,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from uavlinkd.authority.enrolment import MOST_CONTACTS, FleetError, ids_of
-from uavlinkd.core.certificates import (
+from uavlinkd.authority.certificates import (
     Bulletin,
     Certificate,
     MemberRole,
@@ -24,9 +23,10 @@ from uavlinkd.core.certificates import (
     parse_certificate,
     verified_bulletin,
 )
-from uavlinkd.core.crypto import AuthorityKey
-from uavlinkd.core.drops import Drop
-from uavlinkd.core.suites import SUITES_BY_NAME
+from uavlinkd.authority.enrolment import MOST_CONTACTS, FleetError, ids_of
+from uavlinkd.protocol.crypto import AuthorityKey
+from uavlinkd.protocol.drops import Drop
+from uavlinkd.protocol.suites import SUITES_BY_NAME
 from uavlinkd.system.addresses import Address, AddressError, parse_place
 from uavlinkd.system.base64_text import from_base64, to_base64
 from uavlinkd.system.terminal import FAILED, printable

@@ -23,13 +23,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from uavlinkd.authority.certificates import MemberRole
 from uavlinkd.authority.enrolment import FleetError, Request
 from uavlinkd.authority.trust import BulletinVerdict
 from uavlinkd.config import keys
 from uavlinkd.config.load import read_toml
 from uavlinkd.config.model import ConfigError
-from uavlinkd.core.certificates import MemberRole
-from uavlinkd.core.crypto import Secret, SigningKey, sha256, signing_key_pem
 from uavlinkd.fleet import authority_key, files, signing
 from uavlinkd.fleet.authority_key import AUTHORITY_FILE, SUCCESSOR_FILE, Passphrase
 from uavlinkd.fleet.manifest import (
@@ -46,6 +45,7 @@ from uavlinkd.fleet.recovery import recovered
 from uavlinkd.fleet.signing import Identity
 from uavlinkd.fleet.transaction import FileChanges, changing, lock, recover
 from uavlinkd.ops.control import ask as ask_daemon
+from uavlinkd.protocol.crypto import Secret, SigningKey, sha256, signing_key_pem
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.base64_text import to_base64
 

@@ -12,12 +12,18 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Final
 
+from uavlinkd.authority.certificates import (
+    LAST_SERIAL,
+    MemberRole,
+    is_certified,
+    parse_certificate,
+    verified_bulletin,
+)
 from uavlinkd.authority.enrolment import FleetError
 from uavlinkd.config.load import read_toml
-from uavlinkd.core.certificates import LAST_SERIAL, MemberRole, is_certified, parse_certificate, verified_bulletin
-from uavlinkd.core.crypto import AuthorityKey
-from uavlinkd.core.drops import Drop
 from uavlinkd.fleet.manifest import Fleet, FleetSettings, Member, check_settings, parse_addresses
+from uavlinkd.protocol.crypto import AuthorityKey
+from uavlinkd.protocol.drops import Drop
 from uavlinkd.system.base64_text import from_base64
 
 SERIALS_LEFT_OUT: Final = 1000

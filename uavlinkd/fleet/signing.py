@@ -7,9 +7,7 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
 
-from uavlinkd.authority.enrolment import FleetError, check_name
-from uavlinkd.config.keys import is_canonical_public_key
-from uavlinkd.core.certificates import (
+from uavlinkd.authority.certificates import (
     GENERATION,
     LARGEST_OFFSET,
     LAST_SERIAL,
@@ -20,8 +18,10 @@ from uavlinkd.core.certificates import (
     fleet_id_of,
     verified_bulletin,
 )
-from uavlinkd.core.crypto import AuthorityKey, SigningKey, is_usable_public_key
+from uavlinkd.authority.enrolment import FleetError, check_name
+from uavlinkd.config.keys import is_canonical_public_key
 from uavlinkd.fleet.manifest import Fleet, FleetSettings, Member
+from uavlinkd.protocol.crypto import AuthorityKey, SigningKey, is_usable_public_key
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.base64_text import from_base64
 

@@ -41,7 +41,7 @@ from enum import IntEnum
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from uavlinkd.core.settings import Class
+from uavlinkd.protocol.settings import Class
 
 _tables = json.loads(Path(__file__).with_name("dialect.json").read_bytes())
 

@@ -52,7 +52,7 @@ class NewestStates:
     def pick(self, frames: list[Frame], order: int) -> list[Frame]:
         """The frames of one envelope without the states that are superseded.
 
-        ``order``: that of the envelope, as in :attr:`uavlinkd.core.outputs.Deliver.order`.
+        ``order``: that of the envelope, as in :attr:`uavlinkd.protocol.outputs.Deliver.order`.
         """
         return [
             frame for frame in frames if not frame.header.kind.is_state or self._is_newest(flow_key(frame), order)

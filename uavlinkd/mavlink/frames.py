@@ -35,9 +35,9 @@ from typing import Final, NamedTuple, final
 
 from fastcrc.crc16 import mcrf4xx
 
-from uavlinkd.core.drops import Reason
 from uavlinkd.mavlink.dialect import MESSAGES
 from uavlinkd.mavlink.headers import OTHER_DEFINITION, Header, add_sender_message, sender_messages, targeted_header
+from uavlinkd.protocol.drops import Reason
 
 MAVLINK1: Final = 0xFE
 MAVLINK2: Final = 0xFD

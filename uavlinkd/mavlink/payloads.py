@@ -10,9 +10,9 @@ from __future__ import annotations
 
 from typing import Final
 
-from uavlinkd.core.settings import Class
 from uavlinkd.mavlink.dialect import IDS, KINDS
 from uavlinkd.mavlink.frames import Frame, SplitCounters, payload_bytes, split_payload
+from uavlinkd.protocol.settings import Class
 
 HEARTBEAT: Final = 0
 _TYPE_IN_HEARTBEAT: Final = 4  # offsets in the payload

@@ -1,6 +1,6 @@
 """Equal bytes that arrive again: a new sending, a copy by another route, or a return from a circle.
 
-The rule, its reasons and its limits are in the specification (`uavlinkd/core/README.md`, section 19).
+The rule, its reasons and its limits are in the specification (`uavlinkd/protocol/README.md`, section 19).
 """
 
 from __future__ import annotations

@@ -9,15 +9,15 @@ from typing import Final
 from structlog.typing import FilteringBoundLogger
 
 from uavlinkd.config.keys import encode_key
-from uavlinkd.core.constants import PROTOCOL_VERSION
-from uavlinkd.core.drops import Attention, DropReason, Reason
-from uavlinkd.link.journal import DaemonJournal, Fact, Key
+from uavlinkd.daemon.journal import DaemonJournal, Fact, Key
 from uavlinkd.mavlink.dialect import name_of
 from uavlinkd.mavlink.headers import Header
 from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.observe.conditions import Conditions, OpenCondition, Phase
 from uavlinkd.ops.line_limits import LineLimits
 from uavlinkd.ops.log import shown
+from uavlinkd.protocol.constants import PROTOCOL_VERSION
+from uavlinkd.protocol.drops import Attention, DropReason, Reason
 from uavlinkd.system.error_meanings import meaning_of
 
 PERSISTENT_S = 5

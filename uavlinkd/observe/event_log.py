@@ -7,12 +7,12 @@ from collections.abc import Callable, Iterable
 
 from structlog.typing import FilteringBoundLogger
 
-from uavlinkd.core import outputs as o
-from uavlinkd.core.path import Path
 from uavlinkd.observe.conditions import Conditions, OpenCondition, Phase
 from uavlinkd.observe.finding import Finding, Severity, Subject
 from uavlinkd.ops.line_limits import LineLimits
 from uavlinkd.ops.log import shown
+from uavlinkd.protocol import outputs as o
+from uavlinkd.protocol.path import Path
 
 FINDING_DELAY_S = 2.0
 """A finding is logged if it lasts for so long; one about an attack at once. Three lost answers in a row make a moment

@@ -9,16 +9,16 @@ from typing import Any, Final
 
 from uavlinkd.config.keys import encode_key
 from uavlinkd.config.model import EndpointConfig
-from uavlinkd.core.drops import Detail, DropReason
-from uavlinkd.core.path import Path, SocketAddress
-from uavlinkd.endpoints.ports import Endpoint
-from uavlinkd.endpoints.url import EndpointKind
-from uavlinkd.link.evidence import ELSEWHERE, REPORTED, Sighting
-from uavlinkd.link.parts import DaemonParts
-from uavlinkd.link.peer_link import NOT_ANSWERING_S, PeerLink
-from uavlinkd.link.relay_link import RelayLink
+from uavlinkd.daemon.evidence import ELSEWHERE, REPORTED, Sighting
+from uavlinkd.daemon.parts import DaemonParts
+from uavlinkd.daemon.peer_link import NOT_ANSWERING_S, PeerLink
+from uavlinkd.io.ports import Endpoint
+from uavlinkd.io.url import EndpointKind
 from uavlinkd.observe.history import History
 from uavlinkd.ops.log import shown
+from uavlinkd.protocol.drops import Detail, DropReason
+from uavlinkd.protocol.path import Path, SocketAddress
+from uavlinkd.relay.client_link import RelayLink
 from uavlinkd.system.error_meanings import meaning_of
 
 Fields = dict[str, Any]

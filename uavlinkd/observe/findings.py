@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Final
 
-from uavlinkd.link.parts import DaemonParts
+from uavlinkd.daemon.parts import DaemonParts
 from uavlinkd.observe import table, traffic_signs
 from uavlinkd.observe.facts import EndpointFacts, Moment, PartFacts, PeerFacts
 from uavlinkd.observe.finding import Finding, Severity, Subject

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Hashable, Iterable, Mapping
 from typing import Final, Generic, TypeVar
 
-from uavlinkd.endpoints.ports import Endpoint
-from uavlinkd.link.peer_link import PeerLink
+from uavlinkd.daemon.peer_link import PeerLink
+from uavlinkd.io.ports import Endpoint
 from uavlinkd.mavlink.egress.lanes import EgressDrop
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import Gate, Refusal

@@ -6,14 +6,14 @@ from math import inf
 
 from structlog.typing import FilteringBoundLogger
 
-from uavlinkd.core.outputs import Event
-from uavlinkd.link.parts import DaemonParts
+from uavlinkd.daemon.parts import DaemonParts
 from uavlinkd.observe.drop_log import DropLog
 from uavlinkd.observe.event_log import EventLog
 from uavlinkd.observe.finding import Finding
 from uavlinkd.observe.findings import find, has_no_client, own_codes
 from uavlinkd.observe.history import History
 from uavlinkd.ops.line_limits import LineLimits
+from uavlinkd.protocol.outputs import Event
 from uavlinkd.system.guard import run
 
 
@@ -30,7 +30,7 @@ class Observer:
         self.events = EventLog(log, limits, parts.peer_sockets.network_name)
         parts.journal.watcher = self
 
-    # Rare events, as :class:`uavlinkd.link.journal.JournalReader`.
+    # Rare events, as :class:`uavlinkd.daemon.journal.JournalReader`.
 
     def write(self, event: Event, now: float) -> None:
         self.events.write(event, now)

@@ -13,17 +13,17 @@ from functools import partial
 from typing import Final
 
 from uavlinkd.config.keys import encode_key
-from uavlinkd.core import constants as c
-from uavlinkd.core.drops import Detail, DropReason
-from uavlinkd.core.path import RELAY_HOST, SocketAddress
-from uavlinkd.core.peer import Peer
-from uavlinkd.core.sessions import Twin
-from uavlinkd.link.evidence import ELSEWHERE, EVIDENCE_S, REPORTED, Sighting
-from uavlinkd.link.peer_link import PeerLink
-from uavlinkd.link.relay_link import RelayLink
-from uavlinkd.link.switch import Port
+from uavlinkd.daemon.evidence import ELSEWHERE, EVIDENCE_S, REPORTED, Sighting
+from uavlinkd.daemon.peer_link import PeerLink
+from uavlinkd.daemon.switch import Port
 from uavlinkd.observe.facts import UNROUTED, Fields, Moment, PeerFacts, at, details_at, hosts_of, listed
 from uavlinkd.ops.log import shown, titled
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol.drops import Detail, DropReason
+from uavlinkd.protocol.path import RELAY_HOST, SocketAddress
+from uavlinkd.protocol.peer import Peer
+from uavlinkd.protocol.sessions import Twin
+from uavlinkd.relay.client_link import RelayLink
 from uavlinkd.system.error_meanings import CONNECTED, meaning_of, web_problem
 
 SECURITY_S: Final = 600.0

@@ -12,13 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 from uavlinkd import __version__
 from uavlinkd.config.keys import encode_key
-from uavlinkd.core.path import Path, SocketAddress, relay_name
-from uavlinkd.core.path_state import PathState
-from uavlinkd.core.peer import Peer
-from uavlinkd.endpoints.ports import Endpoint
-from uavlinkd.link.parts import DaemonParts
-from uavlinkd.link.peer_link import PeerLink
-from uavlinkd.link.relay_link import RelayLink
+from uavlinkd.daemon.parts import DaemonParts
+from uavlinkd.daemon.peer_link import PeerLink
+from uavlinkd.io.ports import Endpoint
 from uavlinkd.mavlink.dialect import command_name, name_of
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import ANY_OTHER, REFUSALS, Refusal
@@ -29,10 +25,14 @@ from uavlinkd.observe.signs import is_contested
 from uavlinkd.observe.traffic_signs import codes_there, name_of_problem, stops_frames
 from uavlinkd.ops import LOG_SCHEMA, STATUS_SCHEMA
 from uavlinkd.ops.log import shown
+from uavlinkd.protocol.path import Path, SocketAddress, relay_name
+from uavlinkd.protocol.path_state import PathState
+from uavlinkd.protocol.peer import Peer
+from uavlinkd.relay.client_link import RelayLink
 from uavlinkd.system.addresses import Address
 
 if TYPE_CHECKING:
-    from uavlinkd.link.fleet_members import FleetMembers
+    from uavlinkd.fleet.members import FleetMembers
     from uavlinkd.relay.service import RelayMember, RelayService
 
 WayOf = Callable[[Path], tuple[str | None, SocketAddress | None]]

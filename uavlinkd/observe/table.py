@@ -11,11 +11,11 @@ from enum import Enum
 from functools import partial
 from typing import Any, Final, NamedTuple
 
-from uavlinkd.core.drops import DropReason
 from uavlinkd.mavlink.dialect import SYSTEM_ID
 from uavlinkd.observe import signs, traffic_signs
 from uavlinkd.observe.facts import Fields
 from uavlinkd.observe.finding import Severity
+from uavlinkd.protocol.drops import DropReason
 
 SECURITY, FAULT, WARNING = Severity
 

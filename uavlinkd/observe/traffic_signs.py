@@ -8,11 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
-from uavlinkd.core import constants as c
-from uavlinkd.core.peer import Peer
-from uavlinkd.core.refusals import Claim
-from uavlinkd.endpoints.udp import UdpClient
-from uavlinkd.endpoints.url import EndpointKind
+from uavlinkd.io.udp import UdpClient
+from uavlinkd.io.url import EndpointKind
 from uavlinkd.mavlink.dialect import command_name, name_of
 from uavlinkd.mavlink.egress.lanes import EgressDrop
 from uavlinkd.mavlink.policy.gate import ANY_OTHER, REFUSALS, Refusal
@@ -20,6 +17,9 @@ from uavlinkd.observe.facts import KERNEL_ERRORS, NOT_LISTENING, SILENT_S, Endpo
 from uavlinkd.observe.history import GateHistory
 from uavlinkd.observe.signs import SECURITY_S, Signs
 from uavlinkd.ops.log import shown
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol.peer import Peer
+from uavlinkd.protocol.refusals import Claim
 from uavlinkd.system.error_meanings import meaning_of
 
 COMMANDS_S: Final = 300.0

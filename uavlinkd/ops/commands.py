@@ -249,7 +249,7 @@ def _netcheck(options: argparse.Namespace) -> int:
 def _record(options: argparse.Namespace) -> int:
     import asyncio
 
-    from uavlinkd.endpoints.url import UrlError, parse_url
+    from uavlinkd.io.url import UrlError, parse_url
     from uavlinkd.ops.recorder import record
 
     if not 1 <= options.system_id <= 254:

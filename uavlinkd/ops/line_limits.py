@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 
-from uavlinkd.core.limits import TokenBucket
+from uavlinkd.protocol.limits import TokenBucket
 
 LINES_PER_S = 1 / 300
 """The average limit of one peer or endpoint, for each kind of line. An attacker with a peer's key can cause

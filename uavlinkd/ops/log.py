@@ -16,7 +16,7 @@ from typing import Final, TextIO, cast
 import structlog
 from structlog.typing import EventDict, Processor
 
-from uavlinkd.core.path import SocketAddress, relay_name
+from uavlinkd.protocol.path import SocketAddress, relay_name
 from uavlinkd.system.addresses import Address
 
 PRIORITIES: Final = {"critical": 2, "error": 3, "warning": 4, "info": 6, "debug": 7}

@@ -18,11 +18,11 @@ from contextlib import closing, suppress
 from pathlib import Path
 from typing import BinaryIO, Final
 
-from uavlinkd.endpoints.ports import Endpoint, LocalPort
-from uavlinkd.endpoints.sockets import udp_socket
-from uavlinkd.endpoints.tcp import TcpClient
-from uavlinkd.endpoints.udp import UdpClient, UdpServer
-from uavlinkd.endpoints.url import EndpointKind, EndpointUrl, NetworkUrl
+from uavlinkd.io.ports import Endpoint, LocalPort
+from uavlinkd.io.sockets import udp_socket
+from uavlinkd.io.tcp import TcpClient
+from uavlinkd.io.udp import UdpClient, UdpServer
+from uavlinkd.io.url import EndpointKind, EndpointUrl, NetworkUrl
 from uavlinkd.mavlink.dialect import SETUP_SIGNING
 from uavlinkd.mavlink.frames import Frame, SplitCounters, pack, split_payload
 from uavlinkd.mavlink.payloads import HEARTBEAT

@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Mapping
 from time import monotonic
 
-from uavlinkd.core.constants import NEVER
+from uavlinkd.protocol.constants import NEVER
 
 UNSENT_MESSAGES = 16
 """Limit of messages that wait for the service manager. Beyond it, the oldest is dropped."""

@@ -9,11 +9,11 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain
 from typing import Any, Final, NamedTuple
 
-from uavlinkd.core.drops import DropReason, LinkProblem, Reason
 from uavlinkd.mavlink.egress.lanes import EgressDrop
 from uavlinkd.mavlink.frames import FrameFault
 from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.ops.log import titled
+from uavlinkd.protocol.drops import DropReason, LinkProblem, Reason
 from uavlinkd.relay.forwarding import RelayReason
 from uavlinkd.system.error_meanings import meaning_of
 

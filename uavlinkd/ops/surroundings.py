@@ -15,8 +15,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from uavlinkd.config.model import Config
-from uavlinkd.endpoints.sockets import family_of, look
-from uavlinkd.endpoints.url import NetworkUrl, SerialUrl
+from uavlinkd.io.sockets import family_of, look
+from uavlinkd.io.url import NetworkUrl, SerialUrl
 from uavlinkd.system.addresses import Address
 
 _MAX_SOCKET_PATH = 107

@@ -7,12 +7,12 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from textwrap import wrap
 from typing import Final
 
+from uavlinkd.authority.certificates import parse_bulletin
 from uavlinkd.authority.enrolment import fingerprint_of, ids_of
 from uavlinkd.config.advice import exposure
 from uavlinkd.config.keys import encode_key, looks_private
 from uavlinkd.config.model import Config, EndpointConfig, FleetConfig, PeerConfig, PolicyData, RelayConfig
 from uavlinkd.config.network_rules import used_networks
-from uavlinkd.core.certificates import parse_bulletin
 from uavlinkd.mavlink import dialect
 from uavlinkd.mavlink.policy.compilation import Policy, PolicyRow
 from uavlinkd.mavlink.policy.roles import ROLES

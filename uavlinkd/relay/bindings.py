@@ -1,6 +1,6 @@
 """Which members of a relay want to reach which, along which of their paths, and the handles for that.
 
-README.md of :mod:`uavlinkd.core`, section 21. Pure: no I/O, no clock, no randomness of its own. The static public key
+Specification, section 21. Pure: no I/O, no clock, no randomness of its own. The static public key
 of a member names it. Methods return the changes that they caused.
 """
 
@@ -12,10 +12,10 @@ from dataclasses import dataclass, field
 from itertools import product, takewhile
 from typing import NamedTuple
 
-from uavlinkd.core import constants as c
-from uavlinkd.core.crypto import Entropy
-from uavlinkd.core.limits import TokenBucket
-from uavlinkd.core.path import Path
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol.crypto import Entropy
+from uavlinkd.protocol.limits import TokenBucket
+from uavlinkd.protocol.path import Path
 
 HANDLE_BYTES = 2
 QUARANTINED_PER_MEMBER = 4096  # a member that changes its paths fast must not use up the handles of another

@@ -1,6 +1,6 @@
 """The forwarding of datagrams between members: one look-up for each, no cryptography and no queue.
 
-README.md of :mod:`uavlinkd.core`, section 21. The relay never sends more bytes than it received. It does not answer.
+Specification, section 21. The relay never sends more bytes than it received. It does not answer.
 """
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from uavlinkd.core.drops import DropReason, Reason
-from uavlinkd.core.path import Path, SocketAddress
-from uavlinkd.core.relay_records import INNER_STARTS, RELAYED
-from uavlinkd.core.settings import PeerSettings
+from uavlinkd.protocol.drops import DropReason, Reason
+from uavlinkd.protocol.path import Path, SocketAddress
+from uavlinkd.protocol.relay_records import INNER_STARTS, RELAYED
+from uavlinkd.protocol.settings import PeerSettings
 from uavlinkd.relay.bindings import ConnectionEnd, MemberConnection
 
 BURST_S = 0.3

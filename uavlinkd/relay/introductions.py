@@ -11,12 +11,12 @@ from collections.abc import Callable, Iterable, Mapping
 from operator import itemgetter
 
 from uavlinkd.authority import constants as a
+from uavlinkd.authority.certificates import MemberRole, roles_in
 from uavlinkd.authority.trust import HeldCertificate
-from uavlinkd.core import constants as c
-from uavlinkd.core.certificates import MemberRole, roles_in
-from uavlinkd.core.drops import DropReason
-from uavlinkd.core.limits import TokenBucket
-from uavlinkd.core.relay_records import CertificateRecord, Who
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol.drops import DropReason
+from uavlinkd.protocol.limits import TokenBucket
+from uavlinkd.protocol.relay_records import CertificateRecord, Who
 
 _serial = itemgetter(0)
 

@@ -10,16 +10,16 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from uavlinkd.authority.trust import HeldCertificate
-from uavlinkd.core import constants as c
-from uavlinkd.core import outputs as o
-from uavlinkd.core.crypto import Entropy
-from uavlinkd.core.drops import DropReason, Reason
-from uavlinkd.core.limits import TokenBucket
-from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import LinkedPeer, Output
-from uavlinkd.core.path import Path
-from uavlinkd.core.peer import Peer
-from uavlinkd.core.relay_records import Bind, Who, bounds_of
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol import outputs as o
+from uavlinkd.protocol.crypto import Entropy
+from uavlinkd.protocol.drops import DropReason, Reason
+from uavlinkd.protocol.limits import TokenBucket
+from uavlinkd.protocol.node import Node
+from uavlinkd.protocol.outputs import LinkedPeer, Output
+from uavlinkd.protocol.path import Path
+from uavlinkd.protocol.peer import Peer
+from uavlinkd.protocol.relay_records import Bind, Who, bounds_of
 from uavlinkd.relay.bindings import Bindings, Changes
 from uavlinkd.relay.forwarding import Forwarding, MemberSettings, Meter, RelayLimits, RelayReason
 from uavlinkd.relay.introductions import Introductions

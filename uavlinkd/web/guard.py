@@ -13,8 +13,8 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from uavlinkd.core.crypto import equal, sha256
-from uavlinkd.core.limits import SourceLimiter, source_of
+from uavlinkd.protocol.crypto import equal, sha256
+from uavlinkd.protocol.limits import SourceLimiter, source_of
 
 WRONG_PER_S: Final = 1 / 10
 WRONG_AT_ONCE: Final = 10

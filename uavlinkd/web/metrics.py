@@ -23,11 +23,11 @@ from prometheus_client import CONTENT_TYPE_PLAIN_0_0_4, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from uavlinkd.core.drops import DropReason
-from uavlinkd.core.path_state import PathCondition
-from uavlinkd.core.settings import Class
 from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.ops import METRICS_SCHEMA
+from uavlinkd.protocol.drops import DropReason
+from uavlinkd.protocol.path_state import PathCondition
+from uavlinkd.protocol.settings import Class
 from uavlinkd.relay.forwarding import RelayReason
 
 CONTENT_TYPE = CONTENT_TYPE_PLAIN_0_0_4

@@ -12,7 +12,7 @@ from typing import Any
 
 from starlette.routing import BaseRoute, Route
 
-from uavlinkd.endpoints.tcp import tcp_listener
+from uavlinkd.io.tcp import tcp_listener
 from uavlinkd.ops.control import ask
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic

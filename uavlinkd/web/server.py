@@ -24,8 +24,8 @@ from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol, RequestResponseCycle
 from uvicorn.server import ServerState
 
-from uavlinkd.core.limits import source_of
-from uavlinkd.endpoints.sockets import set_options
+from uavlinkd.io.sockets import set_options
+from uavlinkd.protocol.limits import source_of
 
 MOST_CONNECTIONS: Final = 128
 """A browser has up to six: the page's parts, then one for the events."""

@@ -18,8 +18,8 @@ import anyio
 
 from uavlinkd.config.keys import KeyFileError, find_secret_file, read_private_file, write_secret_file
 from uavlinkd.config.tls_files import TlsFileError, load_tls
-from uavlinkd.core.crypto import sha256
 from uavlinkd.ops.commands import control_socket
+from uavlinkd.protocol.crypto import sha256
 from uavlinkd.system.addresses import Address, AddressError, parse_address
 from uavlinkd.system.terminal import OK, CommandError, UsageError, printable
 from uavlinkd.web.page import Page

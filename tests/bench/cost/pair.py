@@ -17,8 +17,8 @@ from typing import Any, Final
 
 from tests.daemon_pair import ANY_PORT, are_linked, attitude, config
 from tests.waiting import until
-from uavlinkd.endpoints.url import EndpointKind, NetworkUrl
-from uavlinkd.link.daemon import Daemon
+from uavlinkd.daemon.daemon import Daemon
+from uavlinkd.io.url import EndpointKind, NetworkUrl
 from uavlinkd.system.addresses import Address
 
 SIDES: Final = ("sending", "receiving")

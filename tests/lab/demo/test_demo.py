@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from uavlinkd.core.drops import DropReason
 from uavlinkd.lab.demo.run import attacks_of
 from uavlinkd.lab.demo.screen import AttackResult, Summary, render
 from uavlinkd.lab.sim.drone_process import DroneProcess
+from uavlinkd.protocol.drops import DropReason
 
 ATTACKED: dict[str, Any] = {"attacks": [AttackResult("drop", 9)]}
 

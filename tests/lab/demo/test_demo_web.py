@@ -18,7 +18,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from tests.daemon.test_demo import ENDED_S, demo
+from tests.processes.test_demo import ENDED_S, demo
 from tests.waiting import PATIENCE_S, until
 from uavlinkd.lab.demo.web import ATTACKS
 from uavlinkd.web.app import make_app

@@ -11,7 +11,6 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from tests.lab.evaluation.quick_runs import run_quickly
-from uavlinkd.core import wire
 from uavlinkd.lab.evaluation.flight_plan import (
     AttackPhase,
     DisplacePositions,
@@ -26,6 +25,7 @@ from uavlinkd.lab.evaluation.flight_report import FlightFindings, flight_problem
 from uavlinkd.lab.evaluation.flight_run import FLIGHT
 from uavlinkd.lab.evaluation.records import Record, Value
 from uavlinkd.lab.mitm.attack import AttackContext, Direction, Send
+from uavlinkd.protocol import wire
 
 ORIGIN = Origin(47.0, 8.0)
 HERE = (470_000_000, 80_000_000)

@@ -6,17 +6,17 @@ import os
 
 import pytest
 
-from tests.core import inside
-from uavlinkd.core import constants as c
-from uavlinkd.core.crypto import KeyPair, Secret
-from uavlinkd.core.drops import DropReason
-from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import Deliver, Transmit
-from uavlinkd.core.path import Path
-from uavlinkd.core.settings import Link, PeerSettings
+from tests.protocol import inside
 from uavlinkd.lab.evaluation.impostors import Achieved, Disguise, Impostor, StolenIdentity
 from uavlinkd.lab.evaluation.ledger import numbered_frame
 from uavlinkd.lab.mitm.attack import Action, Direction, Send
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol.crypto import KeyPair, Secret
+from uavlinkd.protocol.drops import DropReason
+from uavlinkd.protocol.node import Node
+from uavlinkd.protocol.outputs import Deliver, Transmit
+from uavlinkd.protocol.path import Path
+from uavlinkd.protocol.settings import Link, PeerSettings
 
 A, B, C = (KeyPair(bytes((number,)) * 32) for number in (1, 2, 3))
 PRIVATE_A = Secret(b"\1" * 32)

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 
 from tests.lab.evaluation.quick_runs import run_quickly
-from uavlinkd.core.suites import SUITES, X25519
 from uavlinkd.lab.evaluation.records import Status, Value
 from uavlinkd.lab.evaluation.timing_daemons import measured, time_handshake
 from uavlinkd.lab.evaluation.timing_report import TimingFindings, timing_problems
 from uavlinkd.lab.evaluation.timing_run import TIMING, measure_paper, paper_points
+from uavlinkd.protocol.suites import SUITES, X25519
 
 
 @pytest.mark.long

@@ -12,11 +12,11 @@ from typing import Any, Final, NamedTuple
 
 import pytest
 
-from tests.daemon.fleet import relay_for
-from tests.daemon.frames import frame, heartbeat
-from tests.daemon.harness import Stage, secret_forms
-from tests.daemon.process import DaemonProcess
-from tests.daemon.udp import Client, Sockaddr, pour
+from tests.processes.fleet import relay_for
+from tests.processes.frames import frame, heartbeat
+from tests.processes.harness import Stage, secret_forms
+from tests.processes.process import DaemonProcess
+from tests.processes.udp import Client, Sockaddr, pour
 from tests.waiting import until
 from uavlinkd.cli import mitm as main
 from uavlinkd.lab.child_processes import end_with_parent

@@ -11,14 +11,14 @@ from time import monotonic
 
 import pytest
 
-from tests.endpoints.web_streams import Loopback, Owner
+from tests.tls.web_streams import Loopback, Owner
 from tests.tls_files import CERTIFICATE, TLS_KEY, write_tls_files
 from tests.waiting import until
-from uavlinkd.core.relay_records import wrap
 from uavlinkd.lab.hostile.web_proxy import FORWARDED, SPOKEN, WEB_ATTACKS, WebContext, WebProxy
 from uavlinkd.lab.mitm.attack import AttackContext
 from uavlinkd.lab.mitm.attacks import parse_attack
 from uavlinkd.lab.sim.loopback_ports import free_port
+from uavlinkd.protocol.relay_records import wrap
 
 REASONS = {
     "web-garbage": {"protocol"},

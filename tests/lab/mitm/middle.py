@@ -6,10 +6,10 @@ from collections.abc import Callable, Sequence
 from typing import Self
 
 from tests.network.network import Address, Drone, Network
-from uavlinkd.core.settings import Link
 from uavlinkd.lab.mitm.attack import NEVER, Action, AttackContext, AttackObject, Direction, Intervention
 from uavlinkd.lab.mitm.channel import AttackChannel
 from uavlinkd.lab.mitm.proxy import Amplification
+from uavlinkd.protocol.settings import Link
 
 Make = Callable[[AttackContext, float], Sequence[AttackObject]]
 

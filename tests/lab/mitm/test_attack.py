@@ -9,14 +9,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from uavlinkd.core.crypto import Secret, x25519_public_key
-from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import Deliver, Output, Transmit
-from uavlinkd.core.path import Path
-from uavlinkd.core.settings import PeerSettings
 from uavlinkd.lab.mitm.anatomy import has_certificate, mavlink_frame
 from uavlinkd.lab.mitm.attack import CATCH_UP_LIMIT, NEVER, Action, AttackContext, AttackObject, Direction, Send
 from uavlinkd.lab.mitm.attacks import ATTACKS, parse_attack
+from uavlinkd.protocol.crypto import Secret, x25519_public_key
+from uavlinkd.protocol.node import Node
+from uavlinkd.protocol.outputs import Deliver, Output, Transmit
+from uavlinkd.protocol.path import Path
+from uavlinkd.protocol.settings import PeerSettings
 
 AB = Direction("a", "b")
 HEARTBEAT = mavlink_frame(0, bytes((0, 0, 0, 0, 2, 3, 81, 4, 3)), 50, system=1)

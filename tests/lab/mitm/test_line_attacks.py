@@ -6,10 +6,10 @@ from random import Random
 
 import pytest
 
-from uavlinkd.endpoints.line_framing import LineDecoder, encode
 from uavlinkd.lab.mitm.attack import Intervention
 from uavlinkd.lab.mitm.line_attacks import LineAttack, LineAttacker, parse_line_attack
 from uavlinkd.lab.mitm.modem import ModemEnd, ModemLink, ModemSettings
+from uavlinkd.serial.line_framing import LineDecoder, encode
 
 LEFT, RIGHT = ModemEnd.LEFT, ModemEnd.RIGHT
 DATAGRAMS = [Random(number).randbytes(3 + 7 * number) for number in range(40)]

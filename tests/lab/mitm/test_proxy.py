@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from tests.daemon.udp import Client, open_client
+from tests.processes.udp import Client, open_client
 from uavlinkd.lab.child_processes import end_with_parent
 from uavlinkd.lab.mitm.attack import Direction
 from uavlinkd.lab.mitm.attacks import ATTACKS, parse_attack

@@ -11,20 +11,20 @@ import pytest
 
 from tests.lab.mitm.middle import Middle
 from tests.network.network import Drone, Flow, Network
-from uavlinkd.core import handshake, probing, session, wire
-from uavlinkd.core.cookie import CookieJar, MacKeys
-from uavlinkd.core.counters import ReplayWindow
-from uavlinkd.core.drops import DropReason as Reason
-from uavlinkd.core.path import Path
-from uavlinkd.core.path_state import PathState
-from uavlinkd.core.peer import Peer
-from uavlinkd.core.receive_handshake import HandshakeReceiver
-from uavlinkd.core.sessions import EchoRequests, Indices
-from uavlinkd.core.settings import Link, Timers
-from uavlinkd.core.verification import Verification
 from uavlinkd.lab.mitm.anatomy import DatagramKind, kind_of
 from uavlinkd.lab.mitm.attacks import parse_attack
 from uavlinkd.lab.mitm.radio import RadioSettings
+from uavlinkd.protocol import handshake, probing, session, wire
+from uavlinkd.protocol.cookie import CookieJar, MacKeys
+from uavlinkd.protocol.counters import ReplayWindow
+from uavlinkd.protocol.drops import DropReason as Reason
+from uavlinkd.protocol.path import Path
+from uavlinkd.protocol.path_state import PathState
+from uavlinkd.protocol.peer import Peer
+from uavlinkd.protocol.receive_handshake import HandshakeReceiver
+from uavlinkd.protocol.sessions import EchoRequests, Indices
+from uavlinkd.protocol.settings import Link, Timers
+from uavlinkd.protocol.verification import Verification
 
 FAST = Link(timers=Timers(rekey_after_s=1.0, reject_after_s=6.0))
 
@@ -84,7 +84,7 @@ def test_receiver_without_a_sense_of_time_delivers_what_was_held(
         genuine(self, *facts, **named)
         self.trusted_until = float("inf")
 
-    monkeypatch.setattr("uavlinkd.core.peer.c.LATE_AFTER_S", float("inf"))
+    monkeypatch.setattr("uavlinkd.protocol.peer.c.LATE_AFTER_S", float("inf"))
     monkeypatch.setattr(session.Session, "__init__", trusts_indefinitely)
     stage = _stage()
     stage.begin(attack)
@@ -122,7 +122,7 @@ def test_receiver_with_one_key_for_both_directions_takes_its_own_frames(monkeypa
             self._send = self._receive
 
     monkeypatch.setattr(session, "envelope_keys", lambda keys: 2 * genuine(keys)[:1])
-    monkeypatch.setattr("uavlinkd.core.establish.Session", OneKey)
+    monkeypatch.setattr("uavlinkd.protocol.establish.Session", OneKey)
     monkeypatch.setattr(Indices, "pick", lambda _self, _now: 7)
     monkeypatch.setattr(ReplayWindow, "is_used", lambda _self, _counter: False)
     stage = _stage()

@@ -11,13 +11,13 @@ import pytest
 
 from tests.lab.mitm.middle import Middle
 from tests.network.network import Drone, Flow, Network
-from uavlinkd.core.constants import LATE_AFTER_S
-from uavlinkd.core.outputs import PathChanged, PeerLost
-from uavlinkd.core.settings import Class, Link
 from uavlinkd.lab.mitm.attack import Attack
 from uavlinkd.lab.mitm.attacks import parse_attack
 from uavlinkd.lab.mitm.channel import AttackChannel
 from uavlinkd.lab.mitm.radio import RadioSettings
+from uavlinkd.protocol.constants import LATE_AFTER_S
+from uavlinkd.protocol.outputs import PathChanged, PeerLost
+from uavlinkd.protocol.settings import Class, Link
 
 SLOWER = RadioSettings(delay_s=0.02)
 """The second path, in each direction, beyond the delay of the first one."""

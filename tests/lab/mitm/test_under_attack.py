@@ -12,12 +12,12 @@ import pytest
 
 from tests.lab.mitm.middle import Middle
 from tests.network.network import Drone, Network
-from uavlinkd.core.drops import DropReason as Reason
-from uavlinkd.core.settings import Link, Timers
-from uavlinkd.core.suites import SUITES_BY_NAME
 from uavlinkd.lab.mitm.attack import Attack, Operation
 from uavlinkd.lab.mitm.attacks import ATTACKS, parse_attack
 from uavlinkd.lab.mitm.radio import RadioSettings
+from uavlinkd.protocol.drops import DropReason as Reason
+from uavlinkd.protocol.settings import Link, Timers
+from uavlinkd.protocol.suites import SUITES_BY_NAME
 
 pytestmark = pytest.mark.long
 

@@ -7,13 +7,13 @@ from collections.abc import Callable, Iterable, Sequence
 from pymavlink.dialects.v20 import all as mavlink
 
 from tests.samples import attitude, battery, command, frame, heartbeat, parameter, raws, read
-from uavlinkd.core.settings import Class
 from uavlinkd.mavlink.dialect import name_of
 from uavlinkd.mavlink.egress.bucket import Bucket
 from uavlinkd.mavlink.egress.budgeted import EgressSettings, EnvelopeShape
 from uavlinkd.mavlink.egress.peer_egress import PeerEgress
 from uavlinkd.mavlink.flows import FlowKey, flow_key
 from uavlinkd.mavlink.frames import Frame
+from uavlinkd.protocol.settings import Class
 
 SHAPE = EnvelopeShape(payload_limit=1200, seal_bytes=23, carrier_bytes=28)
 SLOW = EgressSettings(budget_bits_s=4000)

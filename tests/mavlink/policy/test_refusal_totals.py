@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from tests.daemon.frames import command_long, heartbeat
-from uavlinkd.core import refusals
-from uavlinkd.core.refusals import Refused
+from tests.processes.frames import command_long, heartbeat
 from uavlinkd.mavlink.frames import SplitCounters, split_payload
 from uavlinkd.mavlink.policy import gate as gates
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import CODES, REFUSALS, Gate, Refusal
+from uavlinkd.protocol import refusals
+from uavlinkd.protocol.refusals import Refused
 
 ARM, TAKE_OFF = 400, 22
 

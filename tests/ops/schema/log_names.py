@@ -15,7 +15,20 @@ from tests.imports import sources
 from tests.ops.schema import golden
 
 _METHODS = frozenset({"debug", "info", "warning", "error", "critical", "exception"})
-_PACKAGES = ("system", "core", "mavlink", "endpoints", "config", "ops", "link", "observe")
+_PACKAGES = (
+    "system",
+    "protocol",
+    "mavlink",
+    "io",
+    "config",
+    "ops",
+    "daemon",
+    "serial",
+    "relay",
+    "tls",
+    "fleet",
+    "observe",
+)
 _EVENT = re.compile(r"[a-z]+(_[a-z]+)+")
 _TYPES = {
     bool: "boolean",

@@ -20,8 +20,6 @@ from time import monotonic
 from rich.console import Console
 from rich.live import Live
 
-from uavlinkd.core.constants import LATE_AFTER_S, LATE_STEP_S
-from uavlinkd.core.drops import LinkProblem
 from uavlinkd.lab.child_processes import private_folder
 from uavlinkd.lab.demo.screen import AttackResult, Summary, render, render_summary
 from uavlinkd.lab.evaluation.middle import MiddleHere
@@ -30,6 +28,8 @@ from uavlinkd.lab.evaluation.stage import DaemonStage
 from uavlinkd.lab.mitm.attack import AttackContext
 from uavlinkd.lab.mitm.attacks import ATTACKS, AttackSpec, parse_attack
 from uavlinkd.lab.sim.drone_process import DroneError
+from uavlinkd.protocol.constants import LATE_AFTER_S, LATE_STEP_S
+from uavlinkd.protocol.drops import LinkProblem
 
 DEMO_ERRORS = (DroneError, EvaluationError)
 """The demo failed. The message is for the operator."""

@@ -17,12 +17,12 @@ from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route
 
-from uavlinkd.core.drops import DropReason, LinkProblem
 from uavlinkd.lab.demo.run import NAMES, SCREEN_S, Demo
 from uavlinkd.lab.demo.screen import AttackResult
 from uavlinkd.lab.evaluation.middle import HOST
 from uavlinkd.lab.mitm.attacks import parse_attack
 from uavlinkd.ops import status_words as words
+from uavlinkd.protocol.drops import DropReason, LinkProblem
 from uavlinkd.system.addresses import Address
 from uavlinkd.web.page import Page
 

@@ -7,8 +7,7 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import Any, Final
 
-from uavlinkd.core import constants as c
-from uavlinkd.core.certificates import (
+from uavlinkd.authority.certificates import (
     GENERATION,
     SIGNATURE_BYTES,
     Bulletin,
@@ -17,12 +16,13 @@ from uavlinkd.core.certificates import (
     fleet_id_of,
     parse_certificate,
 )
-from uavlinkd.core.crypto import AuthorityKey, KeyPair, Secret, SigningKey
-from uavlinkd.core.relay_records import BulletinRecord, CertificateRecord, FleetRecord
 from uavlinkd.lab.evaluation.impostors import Disguise, KeyAttack
 from uavlinkd.lab.evaluation.records import EvaluationError
 from uavlinkd.lab.evaluation.stage import DaemonStage
 from uavlinkd.lab.evaluation.tampering_plan import FLEET
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol.crypto import AuthorityKey, KeyPair, Secret, SigningKey
+from uavlinkd.protocol.relay_records import BulletinRecord, CertificateRecord, FleetRecord
 from uavlinkd.system.base64_text import to_base64
 
 _GONE_ID, _CAPTURED_ID = 98, 99

@@ -1,6 +1,6 @@
 """Attackers with keys against real daemons: with their own keys, stolen ones, or those of a captured drone.
 
-Each is a :class:`~uavlinkd.core.node.Node`, so the attacker follows the protocol: it retries, answers cookies and
+Each is a :class:`~uavlinkd.protocol.node.Node`, so the attacker follows the protocol: it retries, answers cookies and
 confirms sessions. If it gets no session, the reason is the daemon's check.
 """
 
@@ -14,22 +14,6 @@ from itertools import cycle, islice
 from time import monotonic
 
 from uavlinkd.config.keys import decode_key
-from uavlinkd.core import wire
-from uavlinkd.core.constants import FEATURE_FLEET, FEATURE_RECORDS, PROBLEMS_PER_REPORT, REFUSALS_PER_REPORT
-from uavlinkd.core.cookie import MacKeys
-from uavlinkd.core.crypto import KeyPair, Secret
-from uavlinkd.core.drops import DropReason
-from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import Deliver, Output, SessionEstablished, Transmit
-from uavlinkd.core.path import Path
-from uavlinkd.core.peer import Peer
-from uavlinkd.core.problem_reports import ProblemReport
-from uavlinkd.core.refusals import RefusalReport, Refused
-from uavlinkd.core.relay_records import FleetRecord
-from uavlinkd.core.send import seal
-from uavlinkd.core.session import Session
-from uavlinkd.core.settings import Class, Link, PeerSettings, Timers
-from uavlinkd.core.suites import X25519
 from uavlinkd.lab.evaluation.ledger import numbered_frame
 from uavlinkd.lab.evaluation.paper_attacks import PaperRelay
 from uavlinkd.lab.evaluation.stage import DaemonStage
@@ -38,6 +22,22 @@ from uavlinkd.lab.evaluation.tampering_plan import KEYS, TrialPlan
 from uavlinkd.lab.evaluation.tampering_records import RELAY
 from uavlinkd.lab.mitm.anatomy import DatagramKind, kind_of
 from uavlinkd.lab.mitm.attack import NEVER, Action, Direction, Intervention, Operation, PassiveAttack, Send
+from uavlinkd.protocol import wire
+from uavlinkd.protocol.constants import FEATURE_FLEET, FEATURE_RECORDS, PROBLEMS_PER_REPORT, REFUSALS_PER_REPORT
+from uavlinkd.protocol.cookie import MacKeys
+from uavlinkd.protocol.crypto import KeyPair, Secret
+from uavlinkd.protocol.drops import DropReason
+from uavlinkd.protocol.node import Node
+from uavlinkd.protocol.outputs import Deliver, Output, SessionEstablished, Transmit
+from uavlinkd.protocol.path import Path
+from uavlinkd.protocol.peer import Peer
+from uavlinkd.protocol.problem_reports import ProblemReport
+from uavlinkd.protocol.refusals import RefusalReport, Refused
+from uavlinkd.protocol.relay_records import FleetRecord
+from uavlinkd.protocol.send import seal
+from uavlinkd.protocol.session import Session
+from uavlinkd.protocol.settings import Class, Link, PeerSettings, Timers
+from uavlinkd.protocol.suites import X25519
 
 RETRY_S = 0.02
 """How often the attacker initiates, much faster than a daemon, and how often it sends frames."""

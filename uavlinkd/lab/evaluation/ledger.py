@@ -23,7 +23,7 @@ _NUMBER = struct.Struct("<I")
 _HEADER_BYTES = 10
 _STARTS = frozenset(b"\xfd\xfe")
 _SEPARATOR_BYTES = 280
-"""Most bytes before a frame, none of them a start byte: core/README.md, section 19. They occur with two senders."""
+"""Most bytes before a frame, none of them a start byte: specification, section 19. They occur with two senders."""
 # Roll, pitch and yaw in radians, and their rates.
 _ANGLES = struct.pack("<6f", 0.1, -0.05, 1.5, 0.01, 0.02, -0.01)
 # Type, autopilot, base mode, status, version: a ground station's heartbeat must be new, unlike that of a copter.

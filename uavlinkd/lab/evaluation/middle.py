@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 import structlog
 
-from uavlinkd.endpoints.sockets import udp_socket
+from uavlinkd.io.sockets import udp_socket
 from uavlinkd.lab.mitm.attack import AttackContext, AttackObject, Direction
 from uavlinkd.lab.mitm.attacks import parse_attack
 from uavlinkd.lab.mitm.proxy import Proxy, received

@@ -9,8 +9,8 @@ paper times it:
     compute the secret   <------- public --------    compute the secret
     HMAC of the data     ----- data and tag ----->   HMAC again, compare: the end
 
-This module imports ``cryptography``, besides ``core/crypto.py``: in the paper a library generates parameters, and the
-core has only standard groups. The paper's smallest group has 256 bits, which OpenSSL refuses: it is left out.
+This module imports ``cryptography``, besides ``protocol/crypto.py``: in the paper a library generates parameters,
+and the core has only standard groups. The paper's smallest group has 256 bits, which OpenSSL refuses: it is left out.
 
 ``python -m uavlinkd.lab.evaluation.paper REQUEST`` runs one exchange: the request and the result are JSON.
 """
@@ -28,8 +28,8 @@ from typing import TypeAlias
 from cryptography.hazmat.backends.openssl import backend
 from cryptography.hazmat.primitives.asymmetric import dh
 
-from uavlinkd.core.crypto import hkdf_expand, hmac_sha256, sha256
-from uavlinkd.core.kem import ffdhe_prime
+from uavlinkd.protocol.crypto import hkdf_expand, hmac_sha256, sha256
+from uavlinkd.protocol.kem import ffdhe_prime
 
 GENERATOR = 2
 TAG_BYTES = 32

@@ -8,10 +8,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from random import Random
 
-from uavlinkd.core.kem import ffdhe_prime
 from uavlinkd.lab.evaluation import paper_protocol as paper
 from uavlinkd.lab.mitm.anatomy import DatagramKind, kind_of, mavlink_frame
 from uavlinkd.lab.mitm.attack import Action, Direction, Intervention, Operation, PassiveAttack, Send
+from uavlinkd.protocol.kem import ffdhe_prime
 
 _PRIME = ffdhe_prime(paper.GROUP_BITS)
 ELEMENTS = {"zero": 0, "one": 1, "p-1": _PRIME - 1, "p": _PRIME, "p+1": _PRIME + 1}

@@ -28,10 +28,10 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache, partial
 
-from uavlinkd.core import wire
-from uavlinkd.core.crypto import hmac_sha256
 from uavlinkd.lab.evaluation.paper import GroupKey, Parameters, mac_key, make_parameters
 from uavlinkd.lab.mitm.proxy import received
+from uavlinkd.protocol import wire
+from uavlinkd.protocol.crypto import hmac_sha256
 
 HELLO, ANSWER = 1, 2
 GROUP_BITS = 2048

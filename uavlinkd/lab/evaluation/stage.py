@@ -17,7 +17,6 @@ from time import monotonic
 from typing import Any, Self
 
 from uavlinkd.config.keys import decode_key, generate_psk
-from uavlinkd.core.drops import LinkProblem
 from uavlinkd.lab.evaluation.ledger import Ledger
 from uavlinkd.lab.evaluation.middle import HOST, Clients, Middle, MiddleHere
 from uavlinkd.lab.evaluation.paper_protocol import RENEW_S, PaperEnd, paper_pair
@@ -26,6 +25,7 @@ from uavlinkd.lab.evaluation.tampering_records import OURS, PAPER
 from uavlinkd.lab.mitm.attack import Direction
 from uavlinkd.lab.sim.drone_process import DroneProcess
 from uavlinkd.lab.sim.loopback_ports import free_ports
+from uavlinkd.protocol.drops import LinkProblem
 
 PATIENCE_S = 120.0
 """How long linking may take; 0.5 s on a quiet machine."""

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from time import monotonic
 from typing import Any
 
-from uavlinkd.core.constants import LATE_AFTER_S, LATE_STEP_S
-from uavlinkd.core.path_measures import WAITS_S
 from uavlinkd.lab.evaluation.stage import Stage
 from uavlinkd.lab.evaluation.tampering_plan import TamperingSettings, TrialPlan, with_target
 from uavlinkd.lab.evaluation.tampering_records import PAPER, Trial, unseen
 from uavlinkd.lab.mitm.attack import AttackObject
+from uavlinkd.protocol.constants import LATE_AFTER_S, LATE_STEP_S
+from uavlinkd.protocol.path_measures import WAITS_S
 
 GIVE_UP_S, QUICK_GIVE_UP_S = 5.0, 120.0
 """How long to wait for frames after an attack. A quick run may share its machine with much else."""

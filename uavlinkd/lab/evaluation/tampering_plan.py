@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Final
 
-from uavlinkd.core.constants import QUESTION_LIFETIME_S
 from uavlinkd.lab.evaluation.frame import EvaluationSettings
 from uavlinkd.lab.evaluation.tampering_records import PAPER
+from uavlinkd.protocol.constants import QUESTION_LIFETIME_S
 
 HANDSHAKE, DATA, FLOOD, TRAFFIC, KEYS = "handshake", "data", "flood", "traffic", "keys"
 PATHS, LINE, RELAYED, WEB, FLEET = "paths", "line", "relay", "web", "fleet"

@@ -10,10 +10,6 @@ from typing import Final
 
 from uavlinkd.config.keys import encode_key
 from uavlinkd.config.model import RelayServer
-from uavlinkd.core import constants as c
-from uavlinkd.core.crypto import KeyPair, Secret
-from uavlinkd.core.settings import Link, PeerSettings
-from uavlinkd.core.suites import SUITES_BY_NAME
 from uavlinkd.lab.evaluation.middle import HOST, Interventions, interventions, silent_log
 from uavlinkd.lab.evaluation.stage import DaemonStage, until
 from uavlinkd.lab.hostile.hostile_relay import HostileRelay, HostileRelaySettings
@@ -23,6 +19,10 @@ from uavlinkd.lab.mitm.modem import ModemEnd, ModemSettings
 from uavlinkd.lab.mitm.modem_ports import ModemPorts, PortSettings
 from uavlinkd.lab.mitm.radio import RadioSettings
 from uavlinkd.lab.sim.loopback_ports import free_ports
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol.crypto import KeyPair, Secret
+from uavlinkd.protocol.settings import Link, PeerSettings
+from uavlinkd.protocol.suites import SUITES_BY_NAME
 from uavlinkd.relay.forwarding import MemberSettings, RelayLimits
 from uavlinkd.system.addresses import Address
 

@@ -20,12 +20,6 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
-from uavlinkd.core import wire
-from uavlinkd.core.crypto import KeyPair, Secret
-from uavlinkd.core.node import Node
-from uavlinkd.core.path import Path as PeerPath
-from uavlinkd.core.settings import Link, PeerSettings
-from uavlinkd.core.suites import Suite
 from uavlinkd.lab.child_processes import private_folder
 from uavlinkd.lab.evaluation.ledger import numbered_frame
 from uavlinkd.lab.evaluation.middle import MiddleHere
@@ -34,6 +28,12 @@ from uavlinkd.lab.evaluation.stage import DaemonStage, until
 from uavlinkd.lab.mitm.attack import Action, Direction, PassiveAttack, Send
 from uavlinkd.lab.sim.drone_process import DroneError
 from uavlinkd.mavlink.frames import SplitCounters, split_datagram
+from uavlinkd.protocol import wire
+from uavlinkd.protocol.crypto import KeyPair, Secret
+from uavlinkd.protocol.node import Node
+from uavlinkd.protocol.path import Path as PeerPath
+from uavlinkd.protocol.settings import Link, PeerSettings
+from uavlinkd.protocol.suites import Suite
 
 _THERE = PeerPath(0, ("127.0.0.1", 2))
 

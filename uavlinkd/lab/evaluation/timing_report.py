@@ -6,9 +6,9 @@ from collections import Counter
 from collections.abc import Sequence
 from statistics import median
 
-from uavlinkd.core.suites import SUITES_BY_NAME
 from uavlinkd.lab.evaluation.frame import NOTHING, ReportSection, Table, duration, spread
 from uavlinkd.lab.evaluation.records import RunRecords, Status, Value
+from uavlinkd.protocol.suites import SUITES_BY_NAME
 
 SUITE_OF_SIZE = {int(name.removeprefix("ffdhe")): name for name in SUITES_BY_NAME if name.startswith("ffdhe")}
 """The suite of each size of a finite-field group, in bits."""

@@ -12,12 +12,12 @@ from collections.abc import Iterable
 from contextlib import suppress
 from typing import Any, TypeVar
 
-from uavlinkd.core.suites import SUITES, X25519, Suite
 from uavlinkd.lab.child_processes import end_with_parent
 from uavlinkd.lab.evaluation.frame import Evaluation, EvaluationSettings, Work
 from uavlinkd.lab.evaluation.records import Record, Status, Value
 from uavlinkd.lab.evaluation.timing_daemons import measure_initiation, measured, time_handshake
 from uavlinkd.lab.evaluation.timing_report import TimingFindings, sections, summary, timing_problems
+from uavlinkd.protocol.suites import SUITES, X25519, Suite
 
 T = TypeVar("T")
 

@@ -17,26 +17,26 @@ from time import monotonic
 from typing import Final
 
 from uavlinkd.config.model import RelayServer
-from uavlinkd.core.crypto import Secret
-from uavlinkd.core.node import Node
-from uavlinkd.core.outputs import Event, Output, RecordReceived, Transmit
-from uavlinkd.core.path import Path
-from uavlinkd.core.peer import Peer
-from uavlinkd.core.relay_records import (
-    RELAYED,
-    Bound,
-    Record,
-    bounds_of,
-    wrap,
-)
-from uavlinkd.endpoints.reader import RECEIVE_BYTES
-from uavlinkd.endpoints.sockets import udp_socket
+from uavlinkd.io.reader import RECEIVE_BYTES
+from uavlinkd.io.sockets import udp_socket
 from uavlinkd.lab.hostile.relay_attacks import ALL_ATTACKS, Lie, RelayAttack, RelayContext
 from uavlinkd.lab.mitm.attack import Action, AttackContext, AttackObject, Direction, Intervention
 from uavlinkd.lab.mitm.attack_service import ChannelService, RunSettings
 from uavlinkd.lab.mitm.attacks import AttackSpec
 from uavlinkd.lab.mitm.channel import AttackChannel
 from uavlinkd.lab.mitm.proxy import received
+from uavlinkd.protocol.crypto import Secret
+from uavlinkd.protocol.node import Node
+from uavlinkd.protocol.outputs import Event, Output, RecordReceived, Transmit
+from uavlinkd.protocol.path import Path
+from uavlinkd.protocol.peer import Peer
+from uavlinkd.protocol.relay_records import (
+    RELAYED,
+    Bound,
+    Record,
+    bounds_of,
+    wrap,
+)
 from uavlinkd.relay.bindings import MemberConnection
 from uavlinkd.relay.forwarding import Forwarding, Meter
 from uavlinkd.relay.service import RelayService, RelayShell

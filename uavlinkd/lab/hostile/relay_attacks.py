@@ -13,8 +13,6 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import ClassVar, Final, Protocol
 
-from uavlinkd.core import constants as c
-from uavlinkd.core.relay_records import Bound, wrap
 from uavlinkd.lab.mitm.anatomy import DatagramKind
 from uavlinkd.lab.mitm.attack import (
     Action,
@@ -27,6 +25,8 @@ from uavlinkd.lab.mitm.attack import (
 )
 from uavlinkd.lab.mitm.attacks import ATTACKS
 from uavlinkd.lab.mitm.attacks.forgery import COMMAND_FRAMES
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol.relay_records import Bound, wrap
 
 
 class AttackedRelay(Protocol):

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from uavlinkd.config.load import load_config, load_control_socket
 from uavlinkd.config.model import ConfigError
-from uavlinkd.endpoints.sockets import BindError
+from uavlinkd.io.sockets import BindError
 from uavlinkd.lab.hostile.hostile_relay import HostileRelay, HostileRelaySettings
 from uavlinkd.lab.hostile.relay_attacks import ALL_ATTACKS
 from uavlinkd.lab.mitm.attack import AttackError

@@ -19,17 +19,17 @@ from typing import ClassVar, Final
 
 from websockets.uri import parse_uri
 
-from uavlinkd.core.relay_records import RELAYED
-from uavlinkd.endpoints.sockets import udp_socket
-from uavlinkd.endpoints.tcp import tcp_listener
-from uavlinkd.endpoints.tls_channel import TlsFactory, client_tls, server_context, server_tls
-from uavlinkd.endpoints.web_connect import Connector
-from uavlinkd.endpoints.web_stream import WebStream, client_protocol, server_protocol
+from uavlinkd.io.sockets import udp_socket
+from uavlinkd.io.tcp import tcp_listener
 from uavlinkd.lab.mitm.attack import Action, Attack, AttackContext, Operation, Timed
 from uavlinkd.lab.mitm.attacks import ATTACKS
 from uavlinkd.lab.mitm.proxy import received
+from uavlinkd.protocol.relay_records import RELAYED
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.stall import StallWatch
+from uavlinkd.tls.channel import TlsFactory, client_tls, server_context, server_tls
+from uavlinkd.tls.connect import Connector
+from uavlinkd.tls.stream import WebStream, client_protocol, server_protocol
 
 HOST: Final = "127.0.0.1"
 FORWARDED, SPOKEN = 1, 2

@@ -13,11 +13,11 @@ from typing import Final, Literal, NamedTuple
 
 import fastcrc
 
-from uavlinkd.core import constants as c
-from uavlinkd.core import wire
-from uavlinkd.core.drops import Drop
-from uavlinkd.core.probe import ANSWER_BYTES, PROBE, QUESTION_BYTES, parse_probe
-from uavlinkd.core.suites import Suite
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol import wire
+from uavlinkd.protocol.drops import Drop
+from uavlinkd.protocol.probe import ANSWER_BYTES, PROBE, QUESTION_BYTES, parse_probe
+from uavlinkd.protocol.suites import Suite
 
 
 class DatagramKind(StrEnum):

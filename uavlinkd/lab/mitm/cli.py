@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from uavlinkd import __version__
-from uavlinkd.endpoints.sockets import BindError
+from uavlinkd.io.sockets import BindError
 from uavlinkd.lab.mitm.attack import AttackError
 from uavlinkd.lab.mitm.attack_service import REQUESTS
 from uavlinkd.lab.mitm.attacks import list_attacks, parse_attack

@@ -15,11 +15,11 @@ from typing import Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from uavlinkd.core import wire
-from uavlinkd.endpoints.line_framing import DELIMITER, LineDecoder, encode
 from uavlinkd.lab.mitm.anatomy import DatagramKind, kind_of
 from uavlinkd.lab.mitm.attack import CATCH_UP_LIMIT, NEVER, AttackError, Direction, Intervention, Operation
 from uavlinkd.lab.mitm.modem import ModemEnd, ModemLink
+from uavlinkd.protocol import wire
+from uavlinkd.serial.line_framing import DELIMITER, LineDecoder, encode
 
 RECORD_LIMIT: Final = 1024
 """Datagrams recorded at each end, for replays and forgeries."""

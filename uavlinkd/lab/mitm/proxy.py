@@ -16,8 +16,8 @@ from contextlib import suppress
 from time import monotonic
 from typing import Any
 
-from uavlinkd.endpoints.reader import DATAGRAMS_PER_WAKE_UP, RECEIVE_BYTES
-from uavlinkd.endpoints.sockets import BindError, udp_socket
+from uavlinkd.io.reader import DATAGRAMS_PER_WAKE_UP, RECEIVE_BYTES
+from uavlinkd.io.sockets import BindError, udp_socket
 from uavlinkd.lab.mitm.attack import Action, AttackContext, Direction, Intervention
 from uavlinkd.lab.mitm.attack_service import ChannelService
 from uavlinkd.lab.mitm.channel import AttackChannel

@@ -16,11 +16,11 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, PlainValidator, ValidationError
 
-from uavlinkd.core.constants import KEY_BYTES
 from uavlinkd.lab.mitm.attack import AttackContext, AttackError, Direction
 from uavlinkd.lab.mitm.attack_service import RunSettings
 from uavlinkd.lab.mitm.attacks import AttackSpec, attack_from_table
 from uavlinkd.lab.mitm.radio import RadioSettings
+from uavlinkd.protocol.constants import KEY_BYTES
 from uavlinkd.system.addresses import Address, parse_address
 
 

@@ -13,10 +13,10 @@ from heapq import heapify, heappop, heappush
 from operator import attrgetter
 from typing import Final
 
-from uavlinkd.core.drops import Reason
 from uavlinkd.mavlink.dialect import Lane, MessageKind
 from uavlinkd.mavlink.flows import FlowKey, flow_key
 from uavlinkd.mavlink.frames import Frame
+from uavlinkd.protocol.drops import Reason
 
 FLOWS_PER_LANE: Final = 2
 """One flow gets at most this part of its lane. A flow that floods a lane drops its own frames, not another's."""

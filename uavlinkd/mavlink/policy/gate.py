@@ -8,8 +8,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from uavlinkd.core.drops import Attention, Reason
-from uavlinkd.core.refusals import Refused
 from uavlinkd.mavlink.dialect import COMMANDS, GROUPS, IDS, MESSAGES, SETUP_SIGNING
 from uavlinkd.mavlink.flows import FlowKey, flow_key
 from uavlinkd.mavlink.frames import Frame, payload_bytes
@@ -17,6 +15,8 @@ from uavlinkd.mavlink.headers import Header
 from uavlinkd.mavlink.payloads import HEARTBEAT, claims_to_be_ground_station
 from uavlinkd.mavlink.policy.secrets import OPCODES_WITHOUT_PATH, names_secrets
 from uavlinkd.mavlink.policy.settings import FILE_TRANSFER, MAX_MSGID, Direction, Settings
+from uavlinkd.protocol.drops import Attention, Reason
+from uavlinkd.protocol.refusals import Refused
 
 ANY_OTHER: Final = -1  # stands for every message beyond those that are counted by themselves
 # Limits of one policy in one direction:
@@ -102,8 +102,8 @@ class Refusal(Reason):
 
 
 CODES: Final[Mapping[Refusal, int]] = {refusal: code for code, refusal in enumerate(Refusal, 1)}
-"""Of refusal reports (``core/README.md``, section 12), a part of the protocol: a code never changes its meaning. New
-reasons follow the others."""
+"""Of refusal reports (``protocol/README.md``, section 12), a part of the protocol: a code never changes its meaning.
+New reasons follow the others."""
 REFUSALS: Final[Mapping[int, Refusal]] = {code: refusal for refusal, code in CODES.items()}
 
 _Buckets = dict[FlowKey, tuple[float, float]]  # tokens, and when that was, by what shares them

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections import deque
 
-from uavlinkd.core import wire
-from uavlinkd.core.constants import MAC_BYTES
-from uavlinkd.core.suites import X25519
 from uavlinkd.lab.mitm.anatomy import HANDSHAKE, kind_of, random_initiation
 from uavlinkd.lab.mitm.attack import Action, Attack, AttackError, Direction, Operation, Send, Timed
+from uavlinkd.protocol import wire
+from uavlinkd.protocol.constants import MAC_BYTES
+from uavlinkd.protocol.suites import X25519
 
 RECORD_LIMIT = 4096
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 
-from uavlinkd.core import constants as c
-from uavlinkd.core import wire
 from uavlinkd.lab.mitm.anatomy import (
     HANDSHAKE,
     DatagramKind,
@@ -17,6 +15,8 @@ from uavlinkd.lab.mitm.anatomy import (
     with_mac1,
 )
 from uavlinkd.lab.mitm.attack import Action, Alteration, Direction, Timed
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol import wire
 
 MOST_APPENDED_BYTES = 64
 

@@ -6,9 +6,6 @@ receiver drops the message at the check of ``mac1``.
 
 from __future__ import annotations
 
-from uavlinkd.core import constants as c
-from uavlinkd.core import wire
-from uavlinkd.core.suites import SUITES_BY_NAME, X25519
 from uavlinkd.lab.mitm.anatomy import (
     DatagramKind,
     Parts,
@@ -20,6 +17,9 @@ from uavlinkd.lab.mitm.anatomy import (
     with_mac1,
 )
 from uavlinkd.lab.mitm.attack import Alteration, Direction
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol import wire
+from uavlinkd.protocol.suites import SUITES_BY_NAME, X25519
 
 FIELD_PRIME = 2**255 - 19
 """Of X25519 (RFC 7748, section 4.1)."""

@@ -1,0 +1,241 @@
+"""What goes to a peer: frames and records in envelopes, and any datagram."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from uavlinkd.protocol import constants as c
+from uavlinkd.protocol import wire
+from uavlinkd.protocol.constants import NEVER
+from uavlinkd.protocol.drops import DropReason
+from uavlinkd.protocol.outputs import Output, Transmit, new_tuple
+from uavlinkd.protocol.path import FREE, Path
+from uavlinkd.protocol.path_measures import NO_REPEATS
+from uavlinkd.protocol.path_state import PathState
+from uavlinkd.protocol.paths import Route
+from uavlinkd.protocol.peer import Peer
+from uavlinkd.protocol.probe import QUESTION_BYTES
+from uavlinkd.protocol.session import Session
+from uavlinkd.protocol.settings import Class
+from uavlinkd.protocol.timers import Timer
+
+
+def send_frames(peer: Peer, frames: Sequence[bytes], now: float, cls: Class) -> list[Output]:
+    """Put frames that are here together into as few envelopes as hold them, in their order."""
+    session, paths = peer.sessions.current, peer.paths
+    route = paths.stream_route if cls is Class.STREAM else paths.routes[cls]
+    keeps = cls is Class.CRITICAL and paths.has_relayed  # also without a route
+    if session is None or now >= session.reject_at or session.send_counter >= c.SESSION_ENVELOPE_LIMIT:
+        return peer.drop(DropReason.NO_SESSION, len(frames))
+    if not route:
+        return _keep(peer, session, frames, now) if keeps else peer.drop(DropReason.NO_SESSION, len(frames))
+    if peer.timers.deadlines[Timer.PROBE] == NEVER and peer.durations.probe_interval_s:
+        # On a slow network, a request about freshness measures the round trip too: it comes first if frames arrive.
+        least_s = (1 + c.VERIFY_REPEAT_SHARE) * paths.pace.interval_s
+        peer.timers.set(Timer.PROBE, now + max(peer.durations.probe_interval_s, least_s))
+    limit = session.payload_limit - max(0, session.max_envelope - paths.longest[cls])
+    asks_at = NEVER
+    if len(frames) > 1 and not paths.shares_envelopes:
+        paths.shares_envelopes = True
+        paths.schedule(now)
+        peer.set_paths_timer()
+    if len(paths.by_path) > 1:
+        _note_activity(peer, now)
+    if paths.is_multiple and cls is not Class.CRITICAL and len(route) == 1:
+        asks_at = route[0].question_at - c.QUESTION_EARLY_S
+    if len(frames) == 1 and len(frames[0]) <= limit:
+        payloads, too_large = [frames[0]], 0
+    else:
+        payloads, too_large = _payloads(frames, limit, session.payload_limit)
+    if now >= asks_at and payloads:
+        out = send_payloads(peer, session, payloads[:-1], route, now)  # the question counts them
+        payloads = [_ask_too(peer, session, route[0], payloads[-1], limit, now)]
+        out += send_payloads(peer, session, payloads, route, now)
+    else:
+        out = send_payloads(peer, session, payloads, route, now)
+    if too_large:
+        out += peer.drop(DropReason.TOO_LARGE, too_large)
+    if keeps:
+        sent = (output.datagram for output in out if isinstance(output, Transmit))
+        _remember(peer, dict.fromkeys(sent), now)
+    return out
+
+
+def _payloads(frames: Sequence[bytes], limit: int, longest: int) -> tuple[list[bytes], int]:
+    """Frames in as few payloads of at most ``limit`` bytes as hold them; a longer frame has one of its own.
+
+    Returns also how many frames are too large for any.
+    """
+    payloads: list[bytes] = []
+    batch: list[bytes] = []
+    size = too_large = 0
+    for frame in frames:
+        if size + len(frame) > limit:
+            if batch:
+                payloads.append(b"".join(batch))
+                batch, size = [], 0
+            if len(frame) > longest:
+                too_large += 1
+                continue
+        batch.append(frame)
+        size += len(frame)
+    if batch:
+        payloads.append(b"".join(batch))
+    return payloads, too_large
+
+
+def _remember(peer: Peer, datagrams: Iterable[bytes], now: float) -> None:
+    peer.recent += ((now, datagram) for datagram in datagrams)
+    del peer.recent[: -c.RESENT_ENVELOPES]
+
+
+def _keep(peer: Peer, session: Session, frames: Sequence[bytes], now: float) -> list[Output]:
+    """The last handle has ended. The next one is perhaps on its way: it carries what is critical."""
+    left = c.SESSION_ENVELOPE_LIMIT - session.send_counter
+    fitting = [frame for frame in frames if len(frame) <= session.payload_limit][:left]
+    _remember(peer, [session.seal(frame, now) for frame in fitting], now)
+    return peer.drop(DropReason.TOO_LARGE, len(frames) - len(fitting)) if len(fitting) < len(frames) else []
+
+
+def resend(peer: Peer, state: PathState, now: float) -> list[Output]:
+    """Send the recent critical envelopes of the current session along a new path too. Each is sent again once."""
+    session = peer.sessions.current
+    out: list[Output] = []
+    for sent_at, datagram in peer.recent:
+        is_current = session is not None and wire.claimed_receiver_index(datagram) == session.remote_index
+        if now <= sent_at + c.RESENT_S and is_current and peer.paths.carries(state, len(datagram)):
+            state.sent += 1
+            peer.count_sent(state, 1, len(datagram))
+            out.append(Transmit(datagram, state.path, is_copy=True))
+    peer.recent = []
+    return out
+
+
+def _note_activity(peer: Peer, now: float) -> None:
+    """Frames are sent: an idle link, or a stream that begins, is probed more often from now on."""
+    paths = peer.paths
+    begins = paths.is_idle(now)
+    paths.active_at = now
+    if paths.note_stream(now) or begins:
+        paths.schedule(now)
+        peer.set_paths_timer()
+
+
+def _ask_too(peer: Peer, session: Session, state: PathState, frames: bytes, limit: int, now: float) -> bytes:
+    """The payload of a stream envelope: with the question in front that is due soon, if there is room for it."""
+    size = len(frames) + QUESTION_BYTES
+    if size > limit or not state.allows(session.envelope_bytes(size)):
+        return frames
+    record = state.make_probe(peer.new_question(), 0, now)
+    peer.paths.schedule(now)
+    peer.set_paths_timer()
+    return record.encode(frames)
+
+
+def seal(
+    peer: Peer,
+    session: Session,
+    payload: bytes,
+    route: Route,
+    now: float,
+    *,
+    is_answer: bool = False,
+) -> list[Output]:
+    """Send one envelope, as :func:`send_payloads`."""
+    return send_payloads(peer, session, (payload,), route, now, is_answer=is_answer)
+
+
+def send_payloads(
+    peer: Peer,
+    session: Session,
+    payloads: Sequence[bytes],
+    route: Route,
+    now: float,
+    *,
+    is_answer: bool = False,
+) -> list[Output]:
+    """Send each payload in an envelope, the same bytes along each path of a route.
+
+    They expect an answer, unless they are one: two ends must not answer each other endlessly.
+    """
+    out: list[Output] = []
+    traffic = peer.traffic
+    is_counted = session is peer.sessions.current
+    before = session.send_counter
+    for payload in payloads:
+        if session.send_counter >= c.SESSION_ENVELOPE_LIMIT:
+            out += peer.drop(DropReason.NO_SESSION, 1)
+            continue
+        datagram = session.seal(payload, now)
+        size, is_copy = len(datagram), False
+        traffic.envelopes_sent += 1
+        if session.send_counter == c.REKEY_AFTER_ENVELOPES:
+            peer.set_initiate()
+        for state in route:
+            if (is_copy and not peer.paths.carries(state, size)) or not (state.is_proven or state.allows(size)):
+                continue
+            state.sent += is_counted
+            state.datagrams_sent += 1
+            state.bytes_sent += size
+            traffic.datagrams_sent += 1
+            traffic.bytes_sent += size
+            out.append(new_tuple(Transmit, (datagram, state.path, is_copy)))
+            is_copy = True
+    if session.send_counter == before:
+        return out
+    peer.sent_at = now
+    if peer.unanswered_since is None and not is_answer:
+        peer.unanswered_since = now
+        peer.echo_at = now + peer.echo_after_s
+        if now + peer.silence_s < peer.timers.deadlines[Timer.SILENCE]:
+            peer.timers.set(Timer.SILENCE, now + peer.silence_s)
+    return out
+
+
+def transmit(peer: Peer, datagram: bytes, path: Path, *, is_copy: bool = False) -> list[Output]:
+    """Send a handshake message. Only what goes where the peer may be counts towards the budget of its link."""
+    state = peer.paths.find(path)
+    if state is None:
+        peer.traffic.bytes_elsewhere += len(datagram)
+    else:
+        peer.count_sent(state, 1, len(datagram))
+    return [Transmit(datagram, path, is_copy)]
+
+
+def send_echo(peer: Peer, session: Session, echo: wire.Echo, route: Route, now: float) -> list[Output]:
+    """Send an echo request or a reply."""
+    if len(route) > 1:
+        route = (route[0], *(state for state in route[1:] if may_echo(peer, state, now, is_reply=echo.is_reply)))
+    return seal(peer, session, echo.encode(), route, now, is_answer=echo.is_reply)
+
+
+def may_echo(peer: Peer, state: PathState, now: float, *, is_reply: bool) -> bool:
+    """Whether a path gets a copy of an echo request, or of a reply: a slow one, no more than it would as the best."""
+    pace = peer.paths.facts.pace(state.path)
+    if pace is FREE:
+        return True
+    if now < state.echo_at[is_reply]:
+        return False
+    state.echo_at[is_reply] = now + pace.ask_s
+    return True
+
+
+def ask_for_echo(peer: Peer, session: Session, now: float, route: Route = ()) -> list[Output]:
+    """Send an echo request about a session on it, along every proven path unless another ``route`` is given.
+
+    A request that is repeated if it is lost goes along the best path first: ``paths.echo_route``.
+    """
+    peer.timers.stop(Timer.PROBE)  # until traffic asks for another
+    peer.traffic.echoes_unanswered += peer.echo_requests.expire(now)
+    repeat_s = peer.echo_requests.repeat_s(session.held.pace)
+    if not route:
+        session.held.asked(now, repeat_s)
+    session.verification.asked(now, repeat_s)
+    peer.set_freshness()
+    repeats = NO_REPEATS if peer.paths.best is None else peer.paths.best.repeats
+    token = peer.echo_requests.add(session, now, session.send_counter + 1 - session.uncounted, repeats)
+    echo = wire.Echo(False, token, session.received, session.expected)
+    out = send_echo(peer, session, echo, route or peer.paths.routes[Class.CRITICAL], now)
+    peer.asked_at = now
+    peer.echo_at = now + max(peer.echo_after_s, repeat_s)
+    return out

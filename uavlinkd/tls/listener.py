@@ -1,0 +1,424 @@
+"""Where members reach this relay by TLS: one socket that listens, and the connections that it accepted.
+
+To the rest of the daemon they are one socket of UDP: a datagram comes from the address of a connection, and goes back
+to it. Any machine may connect to such a port. A connection belongs to a stranger until a peer has answered a question
+of the core along it. Strangers are limited, and do not stay.
+
+Without a certificate, a web server on this machine has it, and says who connected to it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import resource
+import socket
+from collections import Counter
+from collections.abc import Callable
+from contextlib import suppress
+from ipaddress import IPv6Address, ip_address
+from math import inf
+from typing import Final
+
+from uavlinkd.config.model import HttpsServer
+from uavlinkd.config.tls_files import TlsFileError, load_tls
+from uavlinkd.daemon.journal import DaemonJournal
+from uavlinkd.daemon.networks import Receive
+from uavlinkd.io.ports import failure_name
+from uavlinkd.io.sockets import BindError, set_options
+from uavlinkd.io.tcp import tcp_listener
+from uavlinkd.protocol.limits import TokenBucket
+from uavlinkd.protocol.node import Node
+from uavlinkd.protocol.path import Path, SocketAddress
+from uavlinkd.system.addresses import Address, numeric_host
+from uavlinkd.system.clock import monotonic
+from uavlinkd.system.stall import Backlog, StallWatch
+from uavlinkd.tls.channel import TlsFactory, server_tls
+from uavlinkd.tls.newcomers import NEWCOMERS, Newcomer, Newcomers
+from uavlinkd.tls.stream import WebStream, server_protocol
+
+CONNECTIONS: Final = 4096
+STRANGERS: Final = 256
+"""Connections that no member has proved. One more displaces the oldest: a member needs a second, or less."""
+STRANGERS_OF_PREFIX: Final = 32
+"""Of them, from one IPv4 /24 or IPv6 /48."""
+STRANGER_S: Final = 5.0
+"""So long a stranger may stay."""
+STRANGER_MESSAGES: Final = 128
+"""So many messages it may send. A member needs two or three, and what it has to say until the relay's first question
+has its answer."""
+DISPLACED_S: Final = 1.0
+"""In a network that has its share, a new stranger displaces one that is so old."""
+ACCEPTED_S: Final = 5000.0
+"""TCP connections a second. The others wait in the kernel."""
+ACCEPTED_AT_ONCE: Final = 100
+HANDSHAKES_S: Final = 200.0
+"""Connections a second that get a place when their first bytes are there: each costs a handshake of TLS."""
+HANDSHAKES_AT_ONCE: Final = 20
+PAUSE_S: Final = 0.02
+"""Until there are tokens for the next ones,"""
+EXHAUSTED_S: Final = 1.0
+"""and without a file descriptor."""
+LOOK_AGAIN_S: Final = 0.1
+"""While there are too many strangers, they are looked at this often at most."""
+FILES: Final = CONNECTIONS + NEWCOMERS + 512
+"""File descriptors that the daemon asks for, with those of everything else."""
+SENDER: Final = "members by TLS"
+"""The name of their stale datagrams."""
+_BACKLOG: Final = 1024
+"""So many wait in the kernel, for 0.2 s at most. In a shorter queue, a burst would cost a member a second."""
+_KEEPALIVE: Final = (
+    (socket.SOL_SOCKET, "SO_KEEPALIVE", 1),
+    (socket.IPPROTO_TCP, "TCP_KEEPIDLE", 30),
+    (socket.IPPROTO_TCP, "TCP_KEEPINTVL", 10),
+    (socket.IPPROTO_TCP, "TCP_KEEPCNT", 3),
+)
+"""The kernel notices a member that is gone without a word."""
+_EXHAUSTED: Final = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
+
+
+class _Connection:
+    """One connection, the handler of its stream.
+
+    ``since``: when it became a stranger's. ``messages``: how many it sent since then.
+    """
+
+    __slots__ = ("_listener", "address", "messages", "prefix", "since", "stream")
+
+    def __init__(self, listener: WebListener, address: SocketAddress, prefix: object, now: float) -> None:
+        self._listener = listener
+        self.address = address
+        self.prefix = prefix
+        self.since = now
+        self.messages = 0
+        self.stream: WebStream
+
+    def on_open(self) -> None:
+        self._listener.on_open(self)
+
+    def on_datagrams(self, datagrams: list[bytes], now: float, epoch: int) -> None:
+        self._listener.on_datagrams(self, datagrams, now, epoch)
+
+    def on_room(self) -> None:
+        """What waits for a member is in the stream."""
+
+    def on_lost(self, reason: str) -> None:
+        self._listener.on_lost(self, reason)
+
+
+class WebListener:
+    """``number``: that of the socket, for the core."""
+
+    def __init__(self, config: HttpsServer, number: int, node: Node, stall: StallWatch, drops: DaemonJournal) -> None:
+        """Listen. Raises BindError if the address or the certificate cannot be used."""
+        self.number = number
+        self.refused = Counter[str]()
+        """Connections that were not accepted, or ended before a member proved them, by reason."""
+        self.lost = Counter[str]()
+        """Connections of members that ended, by reason."""
+        self._tls = _tls_of(config)
+        self._node = node
+        self._stall = stall
+        self._drops = drops
+        self._receive: Receive = lambda *_: None
+        self._on_change: Callable[[], None] = lambda: None
+        self._every = set[_Connection]()
+        self._strangers: dict[_Connection, None] = {}  # the oldest first
+        self._strangers_of = Counter[object]()  # by prefix
+        self._by_address: dict[SocketAddress, _Connection] = {}  # the open ones
+        self._dropped = 0  # datagrams, of connections that ended
+        self._accepted = TokenBucket(ACCEPTED_S, ACCEPTED_AT_ONCE, monotonic())
+        self._handshakes = TokenBucket(HANDSHAKES_S, HANDSHAKES_AT_ONCE, monotonic())
+        self._newcomers = Newcomers(is_tls=self._tls is not None, refuse=self._refuse, on_ready=self._welcome)
+        self._welcoming: asyncio.TimerHandle | None = None  # newcomers that are ready wait for tokens
+        self._looked_at = 0.0
+        self._resume: asyncio.TimerHandle | None = None
+        try:
+            self._sock = tcp_listener(config.listen)
+        except BindError as error:
+            raise BindError(f"relay_server.https: {error}") from None
+        self._sock.listen(_BACKLOG)
+        self._backlog = Backlog(stall, self._sock.fileno(), lambda: _BACKLOG + 1)
+        _raise_file_limit()
+        node.facts.add_stream(number)
+
+    @property
+    def address(self) -> Address:
+        return Address(*self._sock.getsockname()[:2])
+
+    def start(self, receive: Receive, on_change: Callable[[], None] = lambda: None) -> None:
+        """Accept connections. ``on_change`` is called after the core lost a path."""
+        self._receive, self._on_change = receive, on_change
+        self._watch()
+
+    def _watch(self) -> None:
+        asyncio.get_running_loop().add_reader(self._sock.fileno(), self._on_acceptable)
+
+    def close(self) -> None:
+        """End every connection, and do not listen any more."""
+        for timer in (self._resume, self._welcoming):
+            if timer is not None:
+                timer.cancel()
+        asyncio.get_running_loop().remove_reader(self._sock.fileno())
+        self._sock.close()
+        self._backlog.close()
+        self._newcomers.end_since(inf, "closed")
+        for connection in list(self._every):
+            connection.stream.finish()  # the sessions of the members have just been closed
+
+    def send(self, datagram: bytes, address: SocketAddress) -> int:
+        """As a socket's ``sendto``."""
+        connection = self._by_address.get(address)
+        if connection is None:
+            raise OSError(errno.ENOTCONN, "the connection has ended")
+        connection.stream.send(datagram)
+        return len(datagram)
+
+    def do_housekeeping(self) -> None:
+        """End the connections of strangers that stayed too long. Call it once a second."""
+        now = monotonic()
+        if self._every:
+            self._look(now)
+        self._newcomers.end_since(now - STRANGER_S, "slow_handshake")
+        for connection in [one for one in self._strangers if now - one.since >= STRANGER_S]:
+            connection.stream.lose("unproven")
+
+    def status(self) -> dict[str, object]:
+        """As plain values."""
+        return {
+            "address": str(self.address),
+            "is_plain": self._tls is None,
+            "connections": len(self._every),
+            "strangers": len(self._strangers),
+            "refused": dict(self.refused),
+            "lost": dict(self.lost),
+            "datagrams_dropped": self._dropped + sum(one.stream.dropped for one in self._every),
+        }
+
+    # Accepting.
+
+    def _on_acceptable(self) -> None:
+        now = monotonic()
+        epoch = self._backlog.begin(now)
+        while self._accepted.take(now):
+            try:
+                sock, sockaddr = self._sock.accept()
+            except BlockingIOError:
+                self._backlog.end(0, is_empty=True)
+                return
+            except OSError as error:
+                if error.errno in _EXHAUSTED:  # else this one is gone already
+                    self._refuse(failure_name(error))
+                    self._pause(EXHAUSTED_S)
+                    return
+                continue
+            self._backlog.end(1, is_empty=False)
+            address = numeric_host(sockaddr), sockaddr[1]
+            self._newcomers.add(Newcomer(sock, address, _prefix_of(address[0]), epoch, now))
+        self._pause(PAUSE_S)
+
+    def _pause(self, seconds: float) -> None:
+        loop = asyncio.get_running_loop()
+        loop.remove_reader(self._sock.fileno())
+        self._resume = loop.call_later(seconds, self._watch)
+
+    def _welcome(self) -> None:
+        """Accept newcomers whose first bytes are there, as far as there are tokens."""
+        if self._welcoming is not None:
+            return
+        now = monotonic()
+        while self._newcomers.ready and self._handshakes.has(now):
+            newcomer = self._newcomers.pop()
+            if reason := self._make_place(newcomer, now):
+                self._refuse(reason)
+                newcomer.sock.close()
+            else:
+                self._handshakes.take(now)
+                self._accept(newcomer, now)
+        if self._newcomers.ready:
+            self._welcoming = asyncio.get_running_loop().call_later(PAUSE_S, self._welcome_later)
+
+    def _welcome_later(self) -> None:
+        self._welcoming = None
+        self._welcome()
+
+    def _accept(self, newcomer: Newcomer, now: float) -> None:
+        set_options(newcomer.sock, _KEEPALIVE)
+        prefix = None if self._tls is None else newcomer.source  # a web server's connections are not its own
+        connection = _Connection(self, newcomer.address, prefix, now)
+        connection.stream = WebStream(
+            newcomer.sock, server_protocol(), self._tls, connection, self._stall, SENDER, newcomer.epoch
+        )
+        self._every.add(connection)
+        self._add_stranger(connection)
+        connection.stream.start()
+
+    def _make_place(self, newcomer: Newcomer, now: float) -> str:
+        """For a stranger. Returns why there is none."""
+        if len(self._every) >= CONNECTIONS:
+            return "too_many_connections"
+        if self._tls is not None and self._is_full(newcomer.source, now):
+            return "prefix_full"
+        if len(self._strangers) >= STRANGERS:
+            self._look_again(now)
+        if len(self._strangers) >= STRANGERS:
+            self._displace(next(iter(self._strangers)), now)
+        return ""
+
+    def _is_full(self, prefix: object, now: float) -> bool:
+        if self._strangers_of[prefix] >= STRANGERS_OF_PREFIX:
+            self._look_again(now)
+        if self._strangers_of[prefix] < STRANGERS_OF_PREFIX:
+            return False
+        oldest = next(one for one in self._strangers if one.prefix == prefix)
+        if now - oldest.since < DISPLACED_S:
+            return True
+        self._displace(oldest, now)
+        return False
+
+    def _displace(self, stranger: _Connection, now: float) -> None:
+        self._drops.add("connections_failed", "displaced", "", 1, now)
+        stranger.stream.lose("displaced")
+
+    def _refuse(self, reason: str) -> None:
+        self.refused[reason] += 1
+        self._drops.add("connections_failed", reason, "", 1, monotonic())
+
+    # Strangers.
+
+    def _look_again(self, now: float) -> None:
+        if now - self._looked_at >= LOOK_AGAIN_S:
+            self._look(now)
+
+    def _look(self, now: float) -> None:
+        """Whose connection is it? A peer's, as long as the core has a path there that was proved."""
+        self._looked_at = now
+        proved = {
+            path.address
+            for peer in self._node.peers.values()
+            for path, state in peer.paths.by_path.items()
+            if path.socket == self.number and state.is_validated
+        }
+        for connection in self._every:
+            is_stranger = connection in self._strangers
+            if connection.address in proved:
+                self._remove_stranger(connection)
+            elif not is_stranger:
+                connection.since, connection.messages = now, 0
+                self._add_stranger(connection)
+
+    def _is_proved(self, address: SocketAddress) -> bool:
+        path = Path(self.number, address)
+        states = (peer.paths.by_path.get(path) for peer in self._node.peers.values())
+        return any(state is not None and state.is_validated for state in states)
+
+    def _add_stranger(self, connection: _Connection) -> None:
+        self._strangers[connection] = None
+        if connection.prefix is not None:
+            self._strangers_of[connection.prefix] += 1
+
+    def _remove_stranger(self, connection: _Connection) -> bool:
+        """Returns whether it was one."""
+        if connection not in self._strangers:
+            return False
+        del self._strangers[connection]
+        if connection.prefix is not None:
+            self._strangers_of[connection.prefix] -= 1
+            if not self._strangers_of[connection.prefix]:
+                del self._strangers_of[connection.prefix]
+        return True
+
+    # As the owner of the connections.
+
+    def on_open(self, connection: _Connection) -> None:
+        """Datagrams may be sent. Behind a web server, now it is known who connected."""
+        if self._tls is None and not self._take_forwarded(connection, monotonic()):
+            return
+        before = self._by_address.get(connection.address)
+        self._by_address[connection.address] = connection
+        if before is not None:
+            before.stream.lose("replaced")
+
+    def _take_forwarded(self, connection: _Connection, now: float) -> bool:
+        """Take over the address that the web server wrote. Returns whether the connection may stay."""
+        request = connection.stream.request
+        assert request is not None, "it opened the stream"
+        hosts = request.headers.get_all("X-Forwarded-For") or [str(connection.address[0])]
+        host = _host_in(hosts[-1])
+        if host is None:
+            connection.stream.lose("forwarded_for")
+            return False
+        prefix = _prefix_of(host)
+        if self._is_full(prefix, now):
+            self._drops.add("connections_failed", "prefix_full", "", 1, now)
+            connection.stream.lose("prefix_full")
+            return False
+        self._remove_stranger(connection)
+        connection.address, connection.prefix = (host, connection.address[1]), prefix
+        self._add_stranger(connection)
+        return True
+
+    def on_datagrams(self, connection: _Connection, datagrams: list[bytes], now: float, epoch: int) -> None:
+        """Messages came in one read."""
+        address = connection.address
+        if connection in self._strangers and not self._may_send(connection, len(datagrams), now):
+            return
+        self._receive(self.number, [(datagram, address) for datagram in datagrams], now, epoch, 0.0)
+
+    def _may_send(self, stranger: _Connection, count: int, now: float) -> bool:
+        stranger.messages += count
+        if stranger.messages <= STRANGER_MESSAGES:
+            return True
+        if self._is_proved(stranger.address):
+            self._remove_stranger(stranger)
+            return True
+        self._drops.add("connections_failed", "flood", "", 1, now)
+        stranger.stream.lose("flood")
+        return False
+
+    def on_lost(self, connection: _Connection, reason: str) -> None:
+        """The connection ended."""
+        self._every.discard(connection)
+        if self._by_address.get(connection.address) is connection:
+            del self._by_address[connection.address]
+            self._node.remove_path(Path(self.number, connection.address), monotonic())
+            self._on_change()
+        ended = self.refused if self._remove_stranger(connection) else self.lost
+        ended[reason] += 1
+        self._dropped += connection.stream.dropped
+
+
+def _tls_of(config: HttpsServer) -> TlsFactory | None:
+    if config.certificate is None or config.key is None:
+        return None
+    try:
+        return server_tls(load_tls(config.certificate, config.key))
+    except TlsFileError as error:
+        raise BindError(f"relay_server.https: {error}") from None
+
+
+def _raise_file_limit() -> None:
+    """Each connection is a file. Services have 1,024, and may have more."""
+    least, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = FILES if most == resource.RLIM_INFINITY else min(FILES, most)
+    if least != resource.RLIM_INFINITY and least < wanted:
+        with suppress(OSError, ValueError):
+            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, most))
+
+
+def _prefix_of(host: str) -> object:
+    """The network from which a stranger may have all addresses."""
+    return IPv6Address(host).packed[:6] if ":" in host else host.rpartition(".")[0]
+
+
+def _host_in(forwarded: str) -> str | None:
+    """The last host of the header: the web server appended it, and the client may have written those before."""
+    try:
+        ip = ip_address(forwarded.rpartition(",")[2].strip())
+    except ValueError:
+        return None
+    if isinstance(ip, IPv6Address):
+        if ip.scope_id is not None:
+            return None
+        ip = ip.ipv4_mapped or ip
+    return str(ip)
