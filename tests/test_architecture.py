@@ -53,7 +53,7 @@ USERS_OF_PYMAVLINK = ("lab/sim/",)
 CORE_WITHOUT_KEYS = {
     f"uavlinkd.protocol.{name}"
     for name in (
-        *("constants", "drops", "limits", "outputs", "path", "probe", "problem_reports", "refusals", "relay_records"),
+        *("constants", "drops", "limits", "outputs", "path", "relay_records", "reports"),
         *("suites", "wire"),
     )
 }

@@ -12,8 +12,8 @@ from uavlinkd.daemon.peer_link import Carriage, PeerLink
 from uavlinkd.mavlink.frames import SplitCounters, split_payload
 from uavlinkd.mavlink.own_frames import TEXT_BYTES, Note, TextSeverity
 from uavlinkd.mavlink.routing import SystemComponent
-from uavlinkd.protocol.refusals import RefusalReport, Refused
 from uavlinkd.protocol.settings import PeerSettings
+from uavlinkd.protocol.wire import RefusalReport, Refused
 
 ARM = Refused(76, 400, 2, 1)
 
@@ -40,7 +40,7 @@ class Cockpit:
 
     def claim(self, now: float, *refused: Refused) -> None:
         """The peer reports."""
-        self.link.peer.refusal_claims.note(RefusalReport(refused), now)
+        self.link.peer.claims.note(RefusalReport(refused), now)
 
     def withhold(self, *raws: bytes) -> None:
         """Frames to the peer meet its policy."""

@@ -20,11 +20,9 @@ from uavlinkd.protocol import handshake, wire
 from uavlinkd.protocol.cookie import MacKeys
 from uavlinkd.protocol.outputs import Deliver, Dropped, Output, Transmit
 from uavlinkd.protocol.path import Path
-from uavlinkd.protocol.probe import ANSWER_BYTES, PROBE, QUESTION_BYTES, Probe
-from uavlinkd.protocol.problem_reports import ProblemReport
-from uavlinkd.protocol.refusals import RefusalReport, Refused
 from uavlinkd.protocol.session import Session
 from uavlinkd.protocol.settings import Link, PeerSettings, Timers
+from uavlinkd.protocol.wire import ANSWER_BYTES, PROBE, QUESTION_BYTES, Probe, ProblemReport, RefusalReport, Refused
 
 PATHS: Final = (AT_A, AT_A, ELSEWHERE, Path(0, ("2001:db8::9", 5, 0, 0)))
 _PROBE_AND_FRAMES: Final = bytes((PROBE, 1))
@@ -243,8 +241,8 @@ class Insider:
         assert inside.owned_indices(self.node) == owned, "an index without an owner"
         assert len(peer.remembered) == inside.remembered_initiations(self.node) <= c.REMEMBERED_MOST
         assert len(peer.echo_requests) <= 64, "too many echo requests"
-        assert len(peer.refusal_claims.recent()) <= c.REFUSALS_KEPT, "too many claims"
-        assert len(peer.problem_claim.codes) <= c.PROBLEMS_PER_REPORT, "too many problems"
+        assert len(peer.claims.refusals()) <= c.REFUSALS_KEPT, "too many claims"
+        assert len(peer.claims.problems.codes) <= c.PROBLEMS_PER_REPORT, "too many problems"
         assert inside.counted_refusals(peer) <= c.REFUSALS_KEPT, "too many refusals"
         for session in sessions.confirmed:
             is_one = inside.held_frames(session) == 1

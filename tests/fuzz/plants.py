@@ -18,7 +18,7 @@ from uavlinkd.lab.mitm import proxy_settings as mitm_settings
 from uavlinkd.mavlink import frames, routing
 from uavlinkd.mavlink.policy import gate
 from uavlinkd.ops import control
-from uavlinkd.protocol import counters, handshake, path_state, receive, refusals, session, wire
+from uavlinkd.protocol import counters, handshake, path_state, receive, reports, session, wire
 from uavlinkd.protocol.drops import Drop, DropReason
 from uavlinkd.protocol.outputs import Deliver, Transmit
 from uavlinkd.relay import client_link as relay_link
@@ -100,7 +100,7 @@ def _delivers_control(right: Any) -> Any:
 
 
 def _keeps_every_claim(_: Any) -> Any:
-    def note(claims: refusals.RefusalClaims, report: refusals.RefusalReport, now: float) -> None:
+    def note(claims: reports.Claims, report: wire.RefusalReport, now: float) -> None:
         inside.believe(claims, report, now)
 
     return note
@@ -181,7 +181,7 @@ PLANTS: Final = {
     "any tag confirms": Plant("responder", session, "equal", _always(True)),
     "forgeries use up counters": Plant("session", session.Session, "open", _marks_first),
     "an envelope is accepted twice": Plant("sealed", counters.ReplayWindow, "is_used", _always(False)),
-    "claims accumulate": Plant("sealed", refusals.RefusalClaims, "note", _keeps_every_claim),
+    "claims accumulate": Plant("sealed", reports.Claims, "note", _keeps_every_claim),
     "a record passes for a frame": Plant("sealed", receive, "_receive_control", _delivers_control),
     "more bytes to an unproven address than received": Plant("sealed", path_state.PathState, "allows", _always(True)),
     "a relay's handle is valid at any address": Plant("relay", forwarding.Forwarding, "take", _forwards_by_handle),

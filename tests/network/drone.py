@@ -20,9 +20,9 @@ from uavlinkd.protocol.outputs import Event, Output, RecordReceived, SessionEsta
 from uavlinkd.protocol.path import Path
 from uavlinkd.protocol.path_measures import limit_at
 from uavlinkd.protocol.peer import Peer
-from uavlinkd.protocol.refusals import Refused
 from uavlinkd.protocol.session import Session
 from uavlinkd.protocol.settings import Link, PeerSettings
+from uavlinkd.protocol.wire import Refused
 
 if TYPE_CHECKING:
     from tests.network.network import Network
@@ -276,10 +276,10 @@ class Drone:
         if self.node is not None:
             self.largest |= check(self.node)
             for name, peer in self.node.peers.items():
-                for claim in peer.refusal_claims.recent():
+                for claim in peer.claims.refusals():
                     reported = self._world.drones[name].reported
                     assert (self.name, claim.refused) in reported, f"{name} never reported {claim} to {self.name}"
-                codes = peer.problem_claim.codes
+                codes = peer.claims.problems.codes
                 if codes:
                     said = self._world.drones[name].said
                     assert (self.name, codes) in said, f"{name} never said {codes} to {self.name}"

@@ -24,8 +24,8 @@ from uavlinkd.protocol import wire
 from uavlinkd.protocol.constants import PROBLEMS_PER_REPORT, REFUSALS_KEPT
 from uavlinkd.protocol.outputs import CertificateShown, Deliver, Dropped, Output, RecordReceived, Transmit
 from uavlinkd.protocol.path import SERIAL_HOST, Path
-from uavlinkd.protocol.refusals import Refused
 from uavlinkd.protocol.settings import Class, Link, Screen, hold_all
+from uavlinkd.protocol.wire import Refused
 
 __all__ = [
     "FRAME_BYTES",

@@ -24,7 +24,7 @@ from uavlinkd.protocol import wire
 from uavlinkd.protocol.constants import LINE_BYTES, NEVER
 from uavlinkd.protocol.path import SERIAL_HOST, Path
 from uavlinkd.protocol.path_measures import limit_at
-from uavlinkd.protocol.probe import PROBE
+from uavlinkd.protocol.wire import PROBE
 from uavlinkd.serial.line_framing import LineDecoder, encode
 
 AIR_BITS_S = 4_000

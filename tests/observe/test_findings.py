@@ -41,10 +41,10 @@ from uavlinkd.protocol import constants as c
 from uavlinkd.protocol.drops import DropReason
 from uavlinkd.protocol.outputs import Dropped
 from uavlinkd.protocol.path import Path
-from uavlinkd.protocol.problem_reports import ProblemClaim
-from uavlinkd.protocol.refusals import RefusalReport, Refused
+from uavlinkd.protocol.reports import ProblemClaim
 from uavlinkd.protocol.sessions import Twin
 from uavlinkd.protocol.settings import PeerSettings
+from uavlinkd.protocol.wire import RefusalReport, Refused
 from uavlinkd.system.addresses import Address
 
 NOW = 1.0
@@ -426,7 +426,7 @@ def test_unverified_freshness(daemon: Daemon) -> None:
 
 def test_a_lying_peer_fills_one_line(daemon: Daemon) -> None:
     """Claims of unknown messages, commands and reasons are numbers, and their text is bounded."""
-    claims = daemon.set_up(role="all", system_ids="all").peer.refusal_claims
+    claims = daemon.set_up(role="all", system_ids="all").peer.claims
     for number in range(100):
         entries = (Refused(0xFFFFFF - number, 60000 + place, 200, 2**32 - 1) for place in range(16))
         claims.note(RefusalReport(tuple(entries)), NOW)
@@ -502,7 +502,7 @@ def test_a_peer_says_what_its_problems_are(daemon: Daemon) -> None:
     """As its word, while it is up and repeats it. Only what stops frames is a fault; unknown codes are numbers."""
     peer = daemon.set_up(role="all", system_ids="all").peer
     for codes, severity in (((2, 3), Severity.FAULT), ((3, 200), Severity.WARNING)):
-        peer.problem_claim = ProblemClaim(codes, NOW)
+        peer.claims.problems = ProblemClaim(codes, NOW)
         assert daemon.findings()["problems_there"].severity is severity
     text = daemon.findings()["problems_there"].text
     assert text == "it says about itself: an endpoint has no client; problem 200"
@@ -516,7 +516,7 @@ def test_a_daemon_reports_its_own_problems_only(daemon: Daemon) -> None:
     daemon.local.append(SimpleNamespace(name="autopilot", ports=[]))
     url = parse_url("udpin:127.0.0.1:14550")
     daemon.parts.config.endpoints.append(SimpleNamespace(name="autopilot", url=url, policy={}))
-    daemon.set_up(role="all", system_ids="all").peer.problem_claim = ProblemClaim((1,), 6.0)
+    daemon.set_up(role="all", system_ids="all").peer.claims.problems = ProblemClaim((1,), 6.0)
     found = find(daemon.parts, daemon.history, 6.0)
     assert own_codes(found, is_cut_off=has_no_client(found, 1)) == [2]
     text = (

@@ -61,8 +61,8 @@ def measure(node: Node) -> Sizes:
                 for shares in (admission._known, admission._known_read, admission._known_versions)
             ),
             "echo requests that wait for an answer": max((len(peer.echo_requests) for peer in peers), default=0),
-            "refusals counted for a peer": max((len(peer.own_refusals._totals) for peer in peers), default=0),
-            "claims of a peer": max((len(peer.refusal_claims.recent()) for peer in peers), default=0),
+            "refusals counted for a peer": max((len(peer.reports.refusals) for peer in peers), default=0),
+            "claims of a peer": max((len(peer.claims.refusals()) for peer in peers), default=0),
             "bytes held on a session": max((session.held.size for session in sessions), default=0),
             "steps of the past of a session": max((len(part._steps) for part in histories), default=0),
             "indices in use or quarantine": len(indices.owners) + len(indices._quarantine),

@@ -19,10 +19,10 @@ from uavlinkd.protocol.node import Node
 from uavlinkd.protocol.outputs import Deliver, Dropped, Output, Transmit
 from uavlinkd.protocol.path import Path
 from uavlinkd.protocol.peer import Peer
-from uavlinkd.protocol.probe import Probe
 from uavlinkd.protocol.session import EnvelopeKey, Session
 from uavlinkd.protocol.settings import Link, PeerSettings, Timers
 from uavlinkd.protocol.suites import SUITES_BY_NAME
+from uavlinkd.protocol.wire import Probe
 
 T = TypeVar("T")
 

@@ -14,8 +14,9 @@ from uavlinkd.protocol.noise import HandshakeState
 from uavlinkd.protocol.path_state import PathCondition, PathState
 from uavlinkd.protocol.paths import PathSet
 from uavlinkd.protocol.peer import Peer
-from uavlinkd.protocol.refusals import Claim, RefusalClaims, RefusalReport
+from uavlinkd.protocol.reports import Claim, Claims
 from uavlinkd.protocol.session import Session
+from uavlinkd.protocol.wire import RefusalReport
 
 
 def set_entropy(node: Node, entropy: Callable[[int], bytes]) -> None:
@@ -74,7 +75,7 @@ def asked_candidates(paths: PathSet) -> int:
 
 def counted_refusals(peer: Peer) -> int:
     """The number of own refusals that are counted for a peer."""
-    return len(peer.own_refusals._totals)
+    return len(peer.reports.refusals)
 
 
 def held_frames(session: Session) -> int:
@@ -87,9 +88,9 @@ def history_steps(session: Session) -> int:
     return len(session._received_history._steps)
 
 
-def believe(claims: RefusalClaims, report: RefusalReport, now: float) -> None:
+def believe(claims: Claims, report: RefusalReport, now: float) -> None:
     """Keep every claim of a report, whatever their number."""
-    claims._claims.update({refused[:3]: Claim(refused, now) for refused in report.entries})
+    claims._refusals.update({refused[:3]: Claim(refused, now) for refused in report.entries})
 
 
 def mix(state: HandshakeState, token: str) -> HandshakeState:

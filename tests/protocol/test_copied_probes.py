@@ -10,7 +10,7 @@ from tests.protocol.harness import AT_A, AT_B, ELSEWHERE, PLAIN, Pair, Side, dat
 from uavlinkd.protocol.drops import DropReason
 from uavlinkd.protocol.outputs import Output, PathChanged, Transmit
 from uavlinkd.protocol.path_state import PathCondition, PathState
-from uavlinkd.protocol.probe import Probe
+from uavlinkd.protocol.wire import Probe
 
 QUESTION = Probe(7, 0, 1, 1).encode()
 

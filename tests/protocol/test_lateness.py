@@ -23,8 +23,8 @@ from uavlinkd.protocol import constants as c
 from uavlinkd.protocol import establish, wire
 from uavlinkd.protocol.drops import DropReason
 from uavlinkd.protocol.outputs import Dropped, PeerLost, PeerUp
-from uavlinkd.protocol.probe import Probe
 from uavlinkd.protocol.session import Session
+from uavlinkd.protocol.wire import Probe
 
 SILENT = 30.0
 """A moment long after the last received envelope."""

@@ -30,8 +30,8 @@ from uavlinkd.protocol.drops import DropReason
 from uavlinkd.protocol.outputs import Output, PathChanged, PathStateChanged, Transmit
 from uavlinkd.protocol.path import Path, relayed
 from uavlinkd.protocol.path_state import PathCondition
-from uavlinkd.protocol.probe import Probe
 from uavlinkd.protocol.settings import Class
+from uavlinkd.protocol.wire import Probe
 
 LONG = FRAME + FRAME
 """Frames whose envelope is longer than one with a question."""

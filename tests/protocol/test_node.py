@@ -46,10 +46,10 @@ from uavlinkd.protocol.node import PEERS_AT_ONCE
 from uavlinkd.protocol.outputs import Dropped, Output, SessionEstablished
 from uavlinkd.protocol.path import Path
 from uavlinkd.protocol.peer import Peer
-from uavlinkd.protocol.probe import Probe
 from uavlinkd.protocol.settings import Link, PeerSettings
 from uavlinkd.protocol.suites import SUITES, SUITES_BY_NAME, Suite
 from uavlinkd.protocol.timeouts import handle_timeout
+from uavlinkd.protocol.wire import Probe
 
 QUIET = quiet()
 LATER = 4.0

@@ -10,7 +10,7 @@ from tests.protocol.harness import AT_A
 from uavlinkd.protocol import constants as c
 from uavlinkd.protocol.constants import NEVER
 from uavlinkd.protocol.path_state import PathCondition, PathState
-from uavlinkd.protocol.probe import Probe
+from uavlinkd.protocol.wire import Probe
 
 UNPROVEN, USABLE, SUSPECT, DOWN = PathCondition
 _tokens = itertools.count(1)

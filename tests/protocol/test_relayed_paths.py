@@ -15,8 +15,8 @@ from uavlinkd.protocol.limits import prefix_of
 from uavlinkd.protocol.node import Node
 from uavlinkd.protocol.outputs import Dropped, Output, PathChanged, PathSuspected, PeerLost, Transmit
 from uavlinkd.protocol.path import Path, relay_name, relayed
-from uavlinkd.protocol.probe import Probe
 from uavlinkd.protocol.settings import Class, Link, PeerSettings
+from uavlinkd.protocol.wire import Probe
 
 LTE, MESH = Path(0, ("192.0.2.1", 5790)), Path(1, ("198.51.100.1", 5790))
 DIRECT = [LTE, *(Path(0, (f"192.0.2.{number}", 5790)) for number in (2, 3, 4))]

@@ -13,9 +13,9 @@ from uavlinkd.protocol import wire
 from uavlinkd.protocol.outputs import PeerLost
 from uavlinkd.protocol.path import FREE, SERIAL_HOST, Pace, Path, SocketFacts
 from uavlinkd.protocol.path_measures import limit_at
-from uavlinkd.protocol.probe import ANSWER_BYTES, QUESTION_BYTES
 from uavlinkd.protocol.settings import Class, Link, PeerSettings
 from uavlinkd.protocol.suites import SUITES_BY_NAME, X25519
+from uavlinkd.protocol.wire import ANSWER_BYTES, QUESTION_BYTES
 
 LTE, SIK = 0, 1
 BUDGET_BITS_S = 4_000

@@ -21,11 +21,9 @@ from tests.protocol.harness import AT_A, AT_B, FRAME, PLAIN, Pair, datagrams, ex
 from uavlinkd.protocol import handshake, wire
 from uavlinkd.protocol.cookie import MacKeys
 from uavlinkd.protocol.crypto import KeyPair
-from uavlinkd.protocol.probe import Probe
-from uavlinkd.protocol.refusals import RefusalReport, Refused
 from uavlinkd.protocol.settings import Link, PeerSettings
 from uavlinkd.protocol.suites import SUITES, Suite
-from uavlinkd.protocol.wire import TAG_LENGTHS
+from uavlinkd.protocol.wire import TAG_LENGTHS, Probe, RefusalReport, Refused
 
 _FILE_HEADER = struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 101)
 """libpcap's file header; 101 is LINKTYPE_RAW: each packet begins with its IP header."""

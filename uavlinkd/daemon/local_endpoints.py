@@ -28,8 +28,8 @@ from uavlinkd.mavlink.policy.delivery import Source
 from uavlinkd.mavlink.policy.gate import REFUSALS, Refusal
 from uavlinkd.mavlink.routing import SystemComponent
 from uavlinkd.protocol.constants import NEVER
-from uavlinkd.protocol.refusals import Refused
 from uavlinkd.protocol.settings import Class
+from uavlinkd.protocol.wire import Refused
 from uavlinkd.system.guard import run
 from uavlinkd.system.stall import StallWatch
 
@@ -281,7 +281,7 @@ class PilotNotes:
 
 def _refused_there(seen: _Seen) -> str:
     """The latest claim since the last look, if the pilot needs to know it."""
-    for claim in seen.link.peer.refusal_claims.recent():
+    for claim in seen.link.peer.claims.refusals():
         if claim.changed_at >= seen.claims_until and _is_wanted(claim.refused):
             reason = _REASONS.get(REFUSALS.get(claim.refused.reason, Refusal.HIDDEN_FRAME), "policy")
             return _fit(seen.link.name, f": {_label(claim.refused)} withheld there, {reason}")

@@ -21,9 +21,8 @@ from uavlinkd.protocol.outputs import Output
 from uavlinkd.protocol.path import Path
 from uavlinkd.protocol.path_state import PathState
 from uavlinkd.protocol.peer import Peer
-from uavlinkd.protocol.problem_reports import LARGEST_PROBLEM_REPORT
-from uavlinkd.protocol.refusals import LARGEST_REPORT
 from uavlinkd.protocol.timers import Deadline, Schedule
+from uavlinkd.protocol.wire import MOST_REPORT_BYTES
 
 NOT_ANSWERING_S = 3.0
 """A peer or relay that is silent for this long is reported. A normal start takes less, and tries are more often."""
@@ -193,14 +192,14 @@ class PeerLink:
 
     def report_refusals(self, now: float) -> None:
         """Report to the peer which of its frames the policy refuses. Call it about once a second."""
-        if not self.peer.is_up or not self.output.has_room(LARGEST_REPORT, now):
+        if not self.peer.is_up or not self.output.has_room(MOST_REPORT_BYTES, now):
             return  # totals lose nothing until the next call
         self._perform(self._node.report_refusals(self.peer, self.policy.incoming.changed_totals(), now))
         self.output.charge(now)
 
     def report_problems(self, codes: Iterable[int], now: float) -> None:
         """Report this daemon's own problems to the peer. Call it about once a second."""
-        if self.peer.is_up and self.output.has_room(LARGEST_PROBLEM_REPORT, now):
+        if self.peer.is_up and self.output.has_room(MOST_REPORT_BYTES, now):
             self._perform(self._node.report_problems(self.peer, codes, now))
             self.output.charge(now)
 

@@ -236,7 +236,7 @@ def _claims(link: PeerLink, now: float) -> list[dict[str, object]]:
             "count": claim.refused.total,
             "last_s": now - claim.changed_at,
         }
-        for claim in link.peer.refusal_claims.recent()
+        for claim in link.peer.claims.refusals()
     ]
 
 

@@ -19,7 +19,7 @@ from uavlinkd.observe.signs import SECURITY_S, Signs
 from uavlinkd.ops.log import shown
 from uavlinkd.protocol import constants as c
 from uavlinkd.protocol.peer import Peer
-from uavlinkd.protocol.refusals import Claim
+from uavlinkd.protocol.reports import Claim
 from uavlinkd.system.error_meanings import meaning_of
 
 COMMANDS_S: Final = 300.0
@@ -155,7 +155,7 @@ def _command(msgid: int, number: int) -> str:
 
 
 def refused_there(peer: PeerFacts) -> Signs:
-    claims = [claim for claim in peer.link.peer.refusal_claims.recent() if peer.now - claim.changed_at <= CLAIMS_S]
+    claims = [claim for claim in peer.link.peer.claims.refusals() if peer.now - claim.changed_at <= CLAIMS_S]
     if claims:
         claims.sort(key=lambda claim: not claim.refused.command)
         kinds = "; ".join(_refused_kind(claim, peer.now) for claim in claims[:_CLAIMS_SHOWN])
@@ -191,7 +191,7 @@ _STOPS_FRAMES: Final = frozenset({1, CUT_OFF})
 
 def codes_there(peer: Peer, now: float) -> tuple[int, ...]:
     """What a peer says about itself now: nothing if it is not up, or did not repeat it."""
-    claim = peer.problem_claim
+    claim = peer.claims.problems
     return claim.codes if peer.is_up and now - claim.received_at <= c.PROBLEMS_LAST_S else ()
 
 

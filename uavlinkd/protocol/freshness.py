@@ -10,10 +10,9 @@ from uavlinkd.protocol import wire
 from uavlinkd.protocol.drops import DropReason
 from uavlinkd.protocol.outputs import Deliver, Output
 from uavlinkd.protocol.peer import Peer
-from uavlinkd.protocol.problem_reports import ProblemReport
-from uavlinkd.protocol.refusals import RefusalReport
 from uavlinkd.protocol.send import ask_for_echo
 from uavlinkd.protocol.session import Session
+from uavlinkd.protocol.wire import Report
 
 
 def deliver(peer: Peer, session: Session, counter: int, payload: bytes, now: float) -> list[Output]:
@@ -49,11 +48,11 @@ def question(peer: Peer, session: Session, now: float) -> list[Output]:
 
 
 def receive_report(
-    peer: Peer, session: Session, counter: int, report: RefusalReport | ProblemReport, now: float, *, is_new: bool
+    peer: Peer, session: Session, counter: int, report: Report, now: float, *, is_new: bool
 ) -> list[Output]:
     """Note a report. After a silence it waits for proof: an older one must not replace a newer one, nor look new."""
     if is_new:
-        peer.note_report(report, now)
+        peer.claims.note(report, now)
         return []
     waiting = session.unverified_reports.get(type(report))
     if waiting is None or waiting[0] < counter:
@@ -86,7 +85,7 @@ def receive_answer(peer: Peer, echo: wire.Echo, now: float) -> list[Output]:
         out += peer.note_received(now)
         for counter, report in session.unverified_reports.values():
             if counter >= echo.fresh:
-                peer.note_report(report, now)
+                peer.claims.note(report, now)
         session.unverified_reports.clear()
         new, late = session.held.release(echo.fresh)
         out += [Deliver(peer, payload, session.order_of(counter)) for counter, payload in new]

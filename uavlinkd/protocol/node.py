@@ -24,7 +24,6 @@ from uavlinkd.protocol.peer import Peer, Shared
 from uavlinkd.protocol.probing import ask_candidates
 from uavlinkd.protocol.receive import DatagramReceiver
 from uavlinkd.protocol.receive_handshake import HandshakeReceiver, ShownInitiation
-from uavlinkd.protocol.refusals import Refused
 from uavlinkd.protocol.relay_records import FleetRecord, Record
 from uavlinkd.protocol.send import ask_for_echo, seal, send_frames
 from uavlinkd.protocol.session import Session
@@ -32,6 +31,7 @@ from uavlinkd.protocol.sessions import Indices
 from uavlinkd.protocol.settings import Class, PeerSettings, Screen, hold_all
 from uavlinkd.protocol.timeouts import handle_timeout
 from uavlinkd.protocol.timers import Schedule, Timer
+from uavlinkd.protocol.wire import Refused
 
 PEERS_AT_ONCE = 8
 """Peers that one call of :meth:`Node.handle_timeout` handles: datagrams wait meanwhile."""
@@ -250,9 +250,9 @@ class Node(DatagramReceiver):
 
         It is sent if there is something new and the peer understands reports. A report expects no answer.
         """
-        peer.own_refusals.update(changed)
+        peer.reports.update_refusals(changed)
         session, route = peer.session_with(c.FEATURE_REFUSALS, now), peer.paths.routes[Class.BULK]
-        if session is None or not route or (report := peer.own_refusals.take(now)) is None:
+        if session is None or not route or (report := peer.reports.next_refusals(now)) is None:
             return []
         return seal(peer, session, report.encode(), route, now, is_answer=True)
 
@@ -261,7 +261,7 @@ class Node(DatagramReceiver):
         session, route = peer.session_with(c.FEATURE_PROBLEMS, now), peer.paths.routes[Class.BULK]
         if session is None or not route:
             return []
-        report = peer.own_problems.take(codes, session.order_base, now)
+        report = peer.reports.next_problems(codes, session.order_base, now)
         return [] if report is None else seal(peer, session, report.encode(), route, now, is_answer=True)
 
     def send_record(self, peer: Peer, path: Path | None, record: Record, now: float) -> list[Output]:

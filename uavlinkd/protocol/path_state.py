@@ -12,7 +12,7 @@ from typing import NamedTuple
 from uavlinkd.protocol import constants as c
 from uavlinkd.protocol.path import Path
 from uavlinkd.protocol.path_measures import NO_REPEATS, EnvelopeLimit, PathLoss, Repeats
-from uavlinkd.protocol.probe import Probe
+from uavlinkd.protocol.wire import Probe
 
 
 class PathCondition(StrEnum):

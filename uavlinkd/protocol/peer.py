@@ -22,8 +22,7 @@ from uavlinkd.protocol.path import Path, SocketAddress, SocketFacts
 from uavlinkd.protocol.path_measures import MissingEnvelopes
 from uavlinkd.protocol.path_state import PathState
 from uavlinkd.protocol.paths import PathSet
-from uavlinkd.protocol.problem_reports import OwnProblems, ProblemClaim, ProblemReport
-from uavlinkd.protocol.refusals import OwnRefusals, RefusalClaims, RefusalReport
+from uavlinkd.protocol.reports import Claims, OwnReports
 from uavlinkd.protocol.session import Session
 from uavlinkd.protocol.sessions import EchoRequests, Indices, Sessions
 from uavlinkd.protocol.settings import PeerSettings, Screen
@@ -75,11 +74,11 @@ class Peer:
     """The link with one peer. It is compared by identity; its parts do not refer to it."""
 
     __slots__ = (
-        *("answers", "answers_while_up", "asked_at", "candidate_questions", "cookied_answers", "durations"),
+        *("answers", "answers_while_up", "asked_at", "candidate_questions", "claims", "cookied_answers", "durations"),
         *("early", "echo_after_s", "echo_at", "echo_requests", "entropy", "established_at", "group_work"),
         *("handshake_after_s", "handshake_s", "hinted_at", "indices", "initiator", "is_up", "losses"),
-        *("lost_after_s", "name", "offered_at", "own_problems", "own_refusals", "paths", "problem_claim"),
-        *("proven_group_work", "provisional_until", "received_at", "recent", "refusal_claims", "remembered"),
+        *("lost_after_s", "name", "offered_at", "paths"),
+        *("proven_group_work", "provisional_until", "received_at", "recent", "remembered", "reports"),
         *("round_trip_s", "screen", "sent_at", "sessions", "settings", "silence_s", "timers", "traffic"),
         *("unanswered_since", "unverified_since", "verify_interval_s", "__weakref__"),
     )
@@ -145,12 +144,8 @@ class Peer:
         self.echo_at = c.NEVER
         """Ask for an echo then, if still nothing was received."""
         self.hinted_at = -c.NEVER
-        self.own_refusals = OwnRefusals()
-        self.refusal_claims = RefusalClaims()
-        """What the peer says that it refuses of our frames. Nothing acts on it."""
-        self.own_problems = OwnProblems()
-        self.problem_claim = ProblemClaim((), -c.NEVER)
-        """What the peer says about its own problems. Nothing acts on it."""
+        self.reports = OwnReports()
+        self.claims = Claims()
 
     @property
     def path(self) -> Path | None:
@@ -230,13 +225,6 @@ class Peer:
         self.is_up = True
         self.set_paths_timer()
         return [PeerUp(self)]
-
-    def note_report(self, report: RefusalReport | ProblemReport, now: float) -> None:
-        """A report that is known to be new."""
-        if isinstance(report, RefusalReport):
-            self.refusal_claims.note(report, now)
-        else:
-            self.problem_claim = ProblemClaim(report.codes, now)
 
     def note_lost(self, now: float) -> list[Output]:
         """The peer is silent, or has no session any more."""

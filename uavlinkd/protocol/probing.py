@@ -10,11 +10,10 @@ from uavlinkd.protocol.outputs import Output
 from uavlinkd.protocol.path import Path
 from uavlinkd.protocol.path_state import PathState
 from uavlinkd.protocol.peer import Peer
-from uavlinkd.protocol.probe import ANSWER_BYTES, QUESTION_BYTES, Probe
 from uavlinkd.protocol.send import resend, seal
 from uavlinkd.protocol.session import Session
 from uavlinkd.protocol.sessions import Unconfirmed
-from uavlinkd.protocol.wire import MACS_BYTES
+from uavlinkd.protocol.wire import ANSWER_BYTES, MACS_BYTES, QUESTION_BYTES, Probe
 
 
 def update(peer: Peer, now: float) -> list[Output]:

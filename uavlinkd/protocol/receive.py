@@ -18,15 +18,13 @@ from uavlinkd.protocol.path import Path, SocketAddress, SocketFacts
 from uavlinkd.protocol.path_state import PathCondition, PathState
 from uavlinkd.protocol.paths import Route
 from uavlinkd.protocol.peer import Peer
-from uavlinkd.protocol.probe import ANSWER_BYTES, PROBE, QUESTION_BYTES
-from uavlinkd.protocol.problem_reports import ProblemReport
 from uavlinkd.protocol.receive_handshake import HandshakeReceiver
-from uavlinkd.protocol.refusals import RefusalReport
 from uavlinkd.protocol.relay_records import FleetRecord, parse_record
 from uavlinkd.protocol.send import may_echo, send_echo
 from uavlinkd.protocol.session import Session
 from uavlinkd.protocol.sessions import Indices
 from uavlinkd.protocol.timers import Schedule, Timer
+from uavlinkd.protocol.wire import ANSWER_BYTES, PROBE, QUESTION_BYTES, ProblemReport, RefusalReport
 
 _unpack_short = wire.SHORT_HEADER.unpack_from
 _SHORT_LEAST: Final = wire.SHORT_HEADER_BYTES + wire.TAG_LENGTHS[0]

@@ -14,10 +14,10 @@ from uavlinkd.protocol.path_measures import NO_REPEATS
 from uavlinkd.protocol.path_state import PathState
 from uavlinkd.protocol.paths import Route
 from uavlinkd.protocol.peer import Peer
-from uavlinkd.protocol.probe import QUESTION_BYTES
 from uavlinkd.protocol.session import Session
 from uavlinkd.protocol.settings import Class
 from uavlinkd.protocol.timers import Timer
+from uavlinkd.protocol.wire import QUESTION_BYTES
 
 
 def send_frames(peer: Peer, frames: Sequence[bytes], now: float, cls: Class) -> list[Output]:

@@ -9,9 +9,8 @@ from uavlinkd.protocol.crypto import AeadKey, MacKey, equal, hkdf_expand
 from uavlinkd.protocol.drops import Drop, DropReason
 from uavlinkd.protocol.handshake import Keys
 from uavlinkd.protocol.path import Pace
-from uavlinkd.protocol.problem_reports import ProblemReport
-from uavlinkd.protocol.refusals import RefusalReport
 from uavlinkd.protocol.verification import HeldFrames, Verification
+from uavlinkd.protocol.wire import Report
 
 EnvelopeKey = MacKey | AeadKey
 """The key of one direction: of HMAC-SHA256, or in a confidential session of ChaCha20-Poly1305."""
@@ -75,7 +74,7 @@ class Session:
         self.first_received_at = c.NEVER
         """When the peer's first envelope came: from then on it sends on this session, or on one of higher rank."""
         self.held = HeldFrames()
-        self.unverified_reports: dict[type, tuple[int, RefusalReport | ProblemReport]] = {}
+        self.unverified_reports: dict[type, tuple[int, Report]] = {}
         """The newest report after a silence, with its counter: kept until the peer shows whether it is new."""
         self.verification = Verification(now, verify_interval_s)
         self.order_base = 0

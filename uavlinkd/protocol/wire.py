@@ -12,9 +12,6 @@ from typing import NamedTuple
 
 from uavlinkd.protocol import constants as c
 from uavlinkd.protocol.drops import Drop, DropReason
-from uavlinkd.protocol.probe import PROBE, Probe, parse_probe
-from uavlinkd.protocol.problem_reports import PROBLEM_REPORT, ProblemReport, parse_problem_report
-from uavlinkd.protocol.refusals import REFUSAL_REPORT, RefusalReport, parse_report
 from uavlinkd.protocol.suites import SUITES, Suite
 
 INITIATION, RESPONSE, COOKIE = 1, 2, 3
@@ -235,10 +232,20 @@ def parse_envelope_header(datagram: bytes) -> tuple[int, int, int]:
 # Control records: the payload of an envelope whose first byte is below FRAMES_FROM.
 
 FRAMES_FROM = 0xF0
-ECHO_REQUEST, ECHO_REPLY, CLOSE, SEALED_RECORD = 1, 2, 5, 7
+ECHO_REQUEST, ECHO_REPLY, PROBE, CLOSE, REFUSAL_REPORT, SEALED_RECORD, PROBLEM_REPORT = 1, 2, 3, 5, 6, 7, 8
 _ECHO_REQUEST = struct.Struct(">BIII")
 _ECHO_REPLY = struct.Struct(">BIIII")
 ECHO_REQUEST_BYTES = _ECHO_REQUEST.size
+_PROBE = struct.Struct(">BBIIIIH")
+_PROBE_ZERO = bytes(2)
+_PROBE_UNUSED = 0xFFFF
+_WITH_FRAMES, _WITH_PADDING = 1, 2
+ANSWER_BYTES = _PROBE.size
+"""A probe that only answers: shorter, so that it fits under the longer header into the length of its question."""
+QUESTION_BYTES = ANSWER_BYTES + len(_PROBE_ZERO)
+_REFUSED = struct.Struct(">BHHBI")  # message id 8 + 16, command, reason, total
+MOST_REPORT_BYTES = 1 + c.REFUSALS_PER_REPORT * _REFUSED.size
+"""The length of a refusal report with as many entries as it may have; a problem report is shorter."""
 
 
 class Echo(NamedTuple):
@@ -258,11 +265,57 @@ class Echo(NamedTuple):
         return _ECHO_REQUEST.pack(ECHO_REQUEST, self.token, self.received, self.expected)
 
 
+class Probe(NamedTuple):
+    """A question along a path, an answer, or both, and a report about that path. README.md, section 15."""
+
+    question: int  # 0 without one
+    answer: int  # the question that it answers; 0 without one
+    sent: int  # datagrams of this session along this path, this one included
+    received: int
+
+    def encode(self, frames: bytes = b"", padding: int = 0) -> bytes:
+        """The record, and behind it whole frames or ``padding`` bytes."""
+        flags = _WITH_FRAMES if frames else _WITH_PADDING if padding else 0
+        counts = self.sent & 2**32 - 1, self.received & 2**32 - 1
+        record = _PROBE.pack(PROBE, flags, self.question, self.answer, *counts, _PROBE_UNUSED)
+        return record + (_PROBE_ZERO if self.question else b"") + frames + bytes(padding)
+
+
 class ProbeAndFrames(NamedTuple):
     """A probe, and the whole frames behind it, if any."""
 
     probe: Probe
     frames: bytes
+
+
+class Refused(NamedTuple):
+    """Frames of one kind that a policy refused for one reason."""
+
+    message: int
+    command: int  # 0 without one
+    reason: int  # its code in README.md
+    total: int  # so far, at most 2**32 - 1
+
+
+class RefusalReport(NamedTuple):
+    """What the sender refuses of the receiver's frames: 1 to :data:`c.REFUSALS_PER_REPORT` entries."""
+
+    entries: tuple[Refused, ...]
+
+    def encode(self) -> bytes:
+        """Type 6, and ten bytes for each entry."""
+        packed = (_REFUSED.pack(message >> 16, message & 0xFFFF, *rest) for message, *rest in self.entries)
+        return bytes((REFUSAL_REPORT,)) + b"".join(packed)
+
+
+class ProblemReport(NamedTuple):
+    """The sender's own problems: 0 to :data:`c.PROBLEMS_PER_REPORT` ascending codes of one byte."""
+
+    codes: tuple[int, ...]
+
+    def encode(self) -> bytes:
+        """Type 8, and a byte for each code."""
+        return bytes((PROBLEM_REPORT, *self.codes))
 
 
 class Close(NamedTuple):
@@ -283,7 +336,9 @@ class SealedRecord(NamedTuple):
         return bytes((SEALED_RECORD,)) + self.sealed
 
 
-Control = Echo | ProbeAndFrames | Close | RefusalReport | SealedRecord | ProblemReport
+Report = RefusalReport | ProblemReport
+"""A claim of the peer: people read it, and the daemon never acts on it."""
+Control = Echo | ProbeAndFrames | Close | SealedRecord | Report
 
 
 def parse_control(payload: bytes) -> Control:
@@ -299,16 +354,35 @@ def parse_control(payload: bytes) -> Control:
         _, token, received, expected, fresh = _ECHO_REPLY.unpack(payload)
         return Echo(True, token, received, expected, fresh)
     if kind == PROBE and (probe := parse_probe(payload)) is not None:
-        return ProbeAndFrames(*probe)
+        return probe
     if kind == CLOSE and size == 1:
         return Close()
-    if kind == REFUSAL_REPORT and (report := parse_report(payload)) is not None:
-        return report
+    if kind == REFUSAL_REPORT and size <= MOST_REPORT_BYTES and size % _REFUSED.size == 1 < size:
+        rows = _REFUSED.iter_unpack(payload[1:])
+        return RefusalReport(tuple(Refused(high << 16 | low, *rest) for high, low, *rest in rows))
     if kind == SEALED_RECORD and size > 1 + c.AEAD_TAG_BYTES:
         return SealedRecord(payload[1:])
-    if kind == PROBLEM_REPORT and (problems := parse_problem_report(payload)) is not None:
-        return problems
+    if kind == PROBLEM_REPORT and size <= 1 + c.PROBLEMS_PER_REPORT and list(payload[1:]) == sorted({*payload[1:]}):
+        return ProblemReport(tuple(payload[1:]))
     raise Drop(DropReason.BAD_CONTROL)
+
+
+def parse_probe(payload: bytes) -> ProbeAndFrames | None:
+    """The probe in a payload that begins with its type, and the frames behind it. None if it is invalid."""
+    if len(payload) < ANSWER_BYTES:
+        return None
+    _, flags, question, answer, sent, received, _ = _PROBE.unpack_from(payload)
+    size = QUESTION_BYTES if question else ANSWER_BYTES
+    is_valid = (
+        (question or answer)
+        and flags in (0, _WITH_FRAMES, _WITH_PADDING)
+        and len(payload) >= size
+        and (len(payload) == size) == (flags == 0)
+        and payload[ANSWER_BYTES:size] == _PROBE_ZERO[: size - ANSWER_BYTES]
+    )
+    if not is_valid:
+        return None
+    return ProbeAndFrames(Probe(question, answer, sent, received), payload[size:] if flags == _WITH_FRAMES else b"")
 
 
 def claimed_receiver_index(datagram: bytes) -> int:

@@ -12,8 +12,8 @@ from uavlinkd.mavlink.frames import SplitCounters, split_payload
 from uavlinkd.mavlink.policy import gate as gates
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import CODES, REFUSALS, Gate, Refusal
-from uavlinkd.protocol import refusals
-from uavlinkd.protocol.refusals import Refused
+from uavlinkd.protocol import reports
+from uavlinkd.protocol.wire import Refused
 
 ARM, TAKE_OFF = 400, 22
 
@@ -31,7 +31,7 @@ def check(gate: Gate, *raws: bytes) -> None:
 
 def test_codes_are_those_of_the_specification() -> None:
     """Each reason has a code, and the document lists the same."""
-    text = (Path(refusals.__file__).parent / "README.md").read_text()
+    text = (Path(reports.__file__).parent / "README.md").read_text()
     table = text.partition("### Refusal reports")[2].partition("Other codes are valid")[0]
     documented = {name: int(code) for code, name in re.findall(r"\| (\d+) \| `([a-z_0-9]+)`", table)}
     assert documented == {refusal.value: code for refusal, code in CODES.items()}

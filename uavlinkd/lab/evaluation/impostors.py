@@ -31,13 +31,12 @@ from uavlinkd.protocol.node import Node
 from uavlinkd.protocol.outputs import Deliver, Output, SessionEstablished, Transmit
 from uavlinkd.protocol.path import Path
 from uavlinkd.protocol.peer import Peer
-from uavlinkd.protocol.problem_reports import ProblemReport
-from uavlinkd.protocol.refusals import RefusalReport, Refused
 from uavlinkd.protocol.relay_records import FleetRecord
 from uavlinkd.protocol.send import seal
 from uavlinkd.protocol.session import Session
 from uavlinkd.protocol.settings import Class, Link, PeerSettings, Timers
 from uavlinkd.protocol.suites import X25519
+from uavlinkd.protocol.wire import ProblemReport, RefusalReport, Refused
 
 RETRY_S = 0.02
 """How often the attacker initiates, much faster than a daemon, and how often it sends frames."""

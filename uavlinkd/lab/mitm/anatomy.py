@@ -16,8 +16,8 @@ import fastcrc
 from uavlinkd.protocol import constants as c
 from uavlinkd.protocol import wire
 from uavlinkd.protocol.drops import Drop
-from uavlinkd.protocol.probe import ANSWER_BYTES, PROBE, QUESTION_BYTES, parse_probe
 from uavlinkd.protocol.suites import Suite
+from uavlinkd.protocol.wire import ANSWER_BYTES, PROBE, QUESTION_BYTES, parse_probe
 
 
 class DatagramKind(StrEnum):

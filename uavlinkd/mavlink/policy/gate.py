@@ -16,7 +16,7 @@ from uavlinkd.mavlink.payloads import HEARTBEAT, claims_to_be_ground_station
 from uavlinkd.mavlink.policy.secrets import OPCODES_WITHOUT_PATH, names_secrets
 from uavlinkd.mavlink.policy.settings import FILE_TRANSFER, MAX_MSGID, Direction, Settings
 from uavlinkd.protocol.drops import Attention, Reason
-from uavlinkd.protocol.refusals import Refused
+from uavlinkd.protocol.wire import Refused
 
 ANY_OTHER: Final = -1  # stands for every message beyond those that are counted by themselves
 # Limits of one policy in one direction:

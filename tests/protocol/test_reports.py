@@ -1,6 +1,8 @@
-"""Refusal reports: what is sent and when, what a receiver keeps, and that nothing acts on a claim."""
+"""Refusal and problem reports: what is sent and when, what a receiver keeps, and that nothing acts on a claim."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import pytest
 
@@ -19,29 +21,32 @@ from tests.protocol.harness import (
 )
 from tests.protocol.independent_records import refusal_report
 from uavlinkd.protocol import constants as c
-from uavlinkd.protocol.drops import DropReason
+from uavlinkd.protocol.drops import Drop, DropReason
 from uavlinkd.protocol.outputs import Transmit
-from uavlinkd.protocol.refusals import MAX_TOTAL, OwnRefusals, RefusalClaims, RefusalReport, Refused, parse_report
+from uavlinkd.protocol.reports import Claims, OwnReports
 from uavlinkd.protocol.timers import Timer
+from uavlinkd.protocol.wire import ProblemReport, RefusalReport, Refused, Report, parse_control
 
 ARM = Refused(76, 400, 4, 1)
 HEARTBEAT = Refused(0, 0, 1, 7)
+MOST = 2**32 - 1
 
 
-def kinds(count: int, total: int = 1) -> list[Refused]:
-    """So many kinds of refused frames."""
-    return [Refused(number, 0, 2, total) for number in range(count)]
+def own(*refused: Refused) -> OwnReports:
+    """The reports of an end that refuses these frames."""
+    reports = OwnReports()
+    reports.update_refusals(refused)
+    return reports
 
 
 def totals(report: RefusalReport | None) -> list[tuple[int, int]]:
     """Message and total of each entry."""
-    assert report is not None
-    return [(refused.message, refused.total) for refused in report.entries]
+    return [] if report is None else [(refused.message, refused.total) for refused in report.entries]
 
 
 def claims(side: Side) -> list[Refused]:
     """What a side believes that the other one refuses."""
-    return [claim.refused for claim in side.peer.refusal_claims.recent()]
+    return [claim.refused for claim in side.peer.claims.refusals()]
 
 
 def report(side: Side, now: float, *refused: Refused) -> list[bytes]:
@@ -49,17 +54,39 @@ def report(side: Side, now: float, *refused: Refused) -> list[bytes]:
     return datagrams(side.node.report_refusals(side.peer, refused, now))
 
 
-# The record.
+def report_problems(side: Side, now: float, *codes: int) -> list[bytes]:
+    """The datagrams by which a side reports these problems."""
+    return datagrams(side.node.report_problems(side.peer, codes, now))
+
+
+# The records.
+
+
+def parsed(payload: bytes) -> object:
+    """The record in a payload; None if it is invalid."""
+    try:
+        return parse_control(payload)
+    except Drop:
+        return None
 
 
 def test_encoding_is_the_documented_one() -> None:
     """Byte by byte, as the specification draws it: 1 to 16 whole entries, which fit the smallest envelope."""
-    encoded = RefusalReport((ARM, Refused(0x123456, 0, 255, MAX_TOTAL))).encode()
+    encoded = RefusalReport((ARM, Refused(0x123456, 0, 255, MOST))).encode()
     assert encoded.hex(" ") == "06 00 00 4c 01 90 04 00 00 00 01 12 34 56 00 00 ff ff ff ff ff"
-    assert encoded == refusal_report(ARM, (0x123456, 0, 255, MAX_TOTAL))
-    valid = [size for size in range(1, 182) if parse_report(bytes((6,)) + bytes(size - 1)) is not None]
+    assert encoded == refusal_report(ARM, (0x123456, 0, 255, MOST))
+    valid = [size for size in range(1, 182) if parsed(bytes((6,)) + bytes(size - 1)) is not None]
     assert valid == [1 + 10 * count for count in range(1, c.REFUSALS_PER_REPORT + 1)]
     assert valid[-1] <= c.MIN_ENVELOPE_LIMIT - 39
+
+
+def test_encoding_of_problems_is_the_documented_one() -> None:
+    """A byte for each of at most eight ascending codes, also unknown ones."""
+    assert ProblemReport((2, 255)).encode().hex() == "0802ff"
+    for codes in (b"", b"\x00", bytes(range(248, 256))):
+        assert parsed(b"\x08" + codes) == ProblemReport(tuple(codes))
+    for codes in (b"\x02\x01", b"\x01\x01", bytes(range(9))):
+        assert parsed(b"\x08" + codes) is None
 
 
 # The sender.
@@ -67,49 +94,54 @@ def test_encoding_is_the_documented_one() -> None:
 
 def test_changes_are_reported_twice_at_an_interval() -> None:
     """Without new totals there is no report; however fast they grow, a peer gets one per interval."""
-    own = OwnRefusals()
-    own.update([])
-    assert own.take(0.0) is None
+    reports = own()
+    assert reports.next_refusals(0.0) is None
     sent = []
     for second in range(0, 60, 2):
-        own.update([ARM])
-        sent.append(own.take(float(second)))
+        reports.update_refusals([ARM])
+        sent.append(reports.next_refusals(float(second)))
     assert len([one for one in sent if one is not None]) == c.REFUSALS_SENDS
     moments = []
     for tenth in range(1000, 1200):
-        own.update([ARM._replace(total=tenth)])
-        if own.take(tenth / 10) is not None:
+        reports.update_refusals([ARM._replace(total=tenth)])
+        if reports.next_refusals(tenth / 10) is not None:
             moments.append(tenth / 10)
     assert moments == [100.0 + 2.0 * number for number in range(10)]
 
 
-def test_a_report_has_the_oldest_changes() -> None:
-    """What does not fit into one report is in the next one."""
-    own = OwnRefusals()
-    own.update(kinds(20))
-    reported = [totals(own.take(now)) for now in (0.0, 2.0, 4.0)]
-    first, rest = [(number, 1) for number in range(16)], [(number, 1) for number in range(16, 20)]
-    assert reported == [first, first, rest]
-
-
 def test_memory_of_the_sender_is_bounded() -> None:
-    """The kind that changed longest ago is forgotten. A total above 32 bits is the greatest one."""
-    own = OwnRefusals()
-    own.update(kinds(c.REFUSALS_KEPT))
-    own.update([Refused(0, 0, 2, 2), Refused(9999, 0, 2, 1)])  # 0 changed again: 1 is now the oldest
-    assert len(own._totals) == c.REFUSALS_KEPT
-    assert [(number, 0, 2) in own._totals for number in (0, 1)] == [True, False]
-    own = OwnRefusals()
-    own.update([ARM._replace(total=2**40)])
-    assert [totals(own.take(now)) for now in (0.0, 2.0)] == [[(76, MAX_TOTAL)]] * 2
-    own.update([ARM._replace(total=2**41)])
-    assert own.take(4.0) is None
+    """The kind that changed longest ago is forgotten. The oldest are reported first. A total has 32 bits."""
+    reports = own(*(Refused(number, 0, 2, 1) for number in range(c.REFUSALS_KEPT)))
+    reports.update_refusals([Refused(0, 0, 2, 2), Refused(9999, 0, 2, 1)])  # 0 changed again: 1 is now the oldest
+    assert len(reports.refusals) == c.REFUSALS_KEPT
+    reported = [totals(reports.next_refusals(now)) for now in range(0, 20, 2)]
+    kept = [*((number, 1) for number in range(2, c.REFUSALS_KEPT)), (0, 2), (9999, 1)]
+    first, last = kept[:16], kept[48:]
+    assert reported == [first, first, *[kept[16:32]] * 2, *[kept[32:48]] * 2, last, last, [], []]
+    reports = own(ARM._replace(total=2**40))
+    assert [totals(reports.next_refusals(now)) for now in (0.0, 2.0)] == [[(76, MOST)]] * 2
+    reports.update_refusals([ARM._replace(total=2**41)])
+    assert reports.next_refusals(4.0) is None
+
+
+def test_problems_are_reported_after_changes_and_each_minute() -> None:
+    """However often they change, a peer gets one report per interval. The smallest codes are reported."""
+    reports, sent = OwnReports(), list[float]()
+    for second in range(300):
+        codes = (200, *range(20, 0, -1)) if 10 <= second < 200 else ()
+        if (taken := reports.next_problems(codes, 1, float(second))) is not None:
+            sent.append(second)
+            assert taken.codes == (tuple(range(1, 9)) if codes else ())
+    assert sent == [0, 2, 10, 12, 72, 132, 192, 200, 202]
+    assert reports.next_problems((200, 9), 2, 300.0) == ProblemReport((9, 200))
+    flapping = [now for now in range(302, 322) if reports.next_problems([now % 256], 2, float(now)) is not None]
+    assert flapping == [*range(302, 322, 2)]
 
 
 def test_report_needs_a_session_that_can_seal() -> None:
     """What is refused without one is reported when there is a session. A lost report is repeated."""
     pair = Pair()
-    assert report(pair.b, 0.0, ARM) == []
+    assert report(pair.b, 0.0, ARM) == report_problems(pair.b, 0.0, 1) == []
     pair.establish()
     assert report(pair.b, 500.0) == []
     assert report(pair.b, 1.0)  # lost
@@ -138,18 +170,32 @@ def test_a_report_asks_for_nothing_and_goes_where_the_traffic_goes() -> None:
     assert pair.a.receive(sent.datagram, 1.0) == []
 
 
-# The feature bit.
+def test_a_peer_that_restarted_soon_gets_a_report_again() -> None:
+    """Both ends have lost their sessions, so the generation of the next one is the one before."""
+    pair = Pair().establish()
+    assert report_problems(pair.b, 1.0, 2)
+    assert report_problems(pair.b, 3.0, 2)
+    pair.b.receive(only(datagrams(pair.a.node.close(4.0))), 4.0)
+    pair.a.configure_path(10.0)
+    pair.establish(10.0)
+    assert pair.b.session.parameters.generation == 1
+    assert report_problems(pair.b, 10.0, 2)
 
 
-@pytest.mark.parametrize(("ours", "theirs"), [(1, 0), (0, 1), (0, 0)])
+# The feature bits.
+
+
+@pytest.mark.parametrize(("ours", "theirs"), [(5, 0), (0, 5), (4, 1)])
 def test_both_ends_must_agree(ours: int, theirs: int) -> None:
     """Without the bit of either end no report is sent, and one that arrives is invalid."""
     pair = Pair(link_a=quiet(features=ours), link_b=quiet(features=theirs)).establish()
     assert pair.a.session.parameters.features == pair.b.session.parameters.features == 0
-    assert report(pair.a, 1.0, ARM) == report(pair.b, 1.0, ARM) == []
-    uninvited = pair.a.envelope(1.0, RefusalReport((ARM,)).encode())
-    assert reasons(pair.b.receive(uninvited, 1.0)) == [DropReason.BAD_CONTROL]
+    for side in (pair.a, pair.b):
+        assert report(side, 1.0, ARM) == report_problems(side, 1.0, 1) == []
+    for record in (RefusalReport((ARM,)), ProblemReport((1,))):
+        assert reasons(pair.b.receive(pair.a.envelope(1.0, record.encode()), 1.0)) == [DropReason.BAD_CONTROL]
     assert claims(pair.b) == []
+    assert pair.b.peer.claims.problems.codes == ()
     assert pair.carries(1.0)
 
 
@@ -158,26 +204,33 @@ def test_both_ends_must_agree(ours: int, theirs: int) -> None:
 
 def test_claims_are_bounded_and_repeated_ones_keep_their_time() -> None:
     """A peer replaces its own claims. Only a change is new, such as a smaller total after a restart."""
-    kept = RefusalClaims()
+    kept = Claims()
     for now, total in ((1.0, 5), (3.0, 5), (5.0, 2)):
         kept.note(RefusalReport((ARM._replace(total=total),)), now)
-        (claim,) = kept.recent()
+        (claim,) = kept.refusals()
         assert (claim.refused.total, claim.changed_at) == (total, 1.0 if now < 5 else 5.0)
     for number in range(1000, 2000):
         kept.note(RefusalReport((Refused(number, 0, 2, 1),)), float(number))
-    assert [claim.refused.message for claim in kept.recent()] == [*range(1999, 1999 - c.REFUSALS_KEPT, -1)]
+    assert [claim.refused.message for claim in kept.refusals()] == [*range(1999, 1999 - c.REFUSALS_KEPT, -1)]
 
 
-def test_a_claim_changes_nothing_else() -> None:
+def _refusals(number: int) -> Report:
+    return RefusalReport(tuple(Refused(number * 16 + place, 400, 4, 9) for place in range(16)))
+
+
+@pytest.mark.parametrize("report_of", [_refusals, lambda number: ProblemReport((number % 250, 255))])
+def test_a_claim_changes_nothing_else(report_of: Callable[[int], Report]) -> None:
     """A flood of claims leaves the receiver as keepalives would: only the claims, in bounded memory, are added."""
     pair, twin = Pair().establish(), Pair().establish()
     for number in range(500):
-        entries = tuple(Refused(number * 16 + place, 400, 4, 9) for place in range(16))
-        assert pair.b.receive(pair.a.envelope(1.0, RefusalReport(entries).encode()), 1.0) == []
+        assert pair.b.receive(pair.a.envelope(1.0, report_of(number).encode()), 1.0) == []
         twin.b.receive(twin.a.envelope(1.0, b""), 1.0)
-    assert len(claims(pair.b)) == c.REFUSALS_KEPT
+    if report_of is _refusals:
+        assert len(claims(pair.b)) == c.REFUSALS_KEPT
+    else:
+        assert pair.b.peer.claims.problems == ((249, 255), 1.0)
     pair.b.peer.traffic.bytes_received = twin.b.peer.traffic.bytes_received
-    for name in ("timers", "traffic", "path", "is_up", "received_at", "unanswered_since", "own_refusals"):
+    for name in ("timers", "traffic", "path", "is_up", "received_at", "unanswered_since"):
         ours, theirs = (state_of(getattr(side.peer, name)) for side in (pair.b, twin.b))
         assert ours == theirs, name
     for name in ("send_counter", "window", "verification", "trusted_until", "reject_at"):
@@ -202,12 +255,13 @@ def test_an_old_report_changes_nothing() -> None:
 
 @pytest.mark.parametrize(("arrives_after_s", "counts"), [(0.0, True), (2 * c.LATE_AFTER_S, False)])
 def test_after_a_silence_the_peer_is_asked_whether_a_report_is_new(arrives_after_s: float, counts: bool) -> None:
-    """On an idle link nearly every report comes so. The newest one of several is kept."""
+    """On an idle link nearly every report comes so. The newest one of each kind is kept."""
     pair, later = Pair().establish(), 3 * c.LATE_AFTER_S
     newer = ARM._replace(total=ARM.total + 1)
     first, second = (only(report(pair.b, later + after_s, entry)) for after_s, entry in ((0.0, ARM), (2.0, newer)))
+    problem = only(report_problems(pair.b, later + 2.0, 2))
     now = later + 2.0 + arrives_after_s
-    arrived = [second, first]
+    arrived = [second, first, problem]
     if arrives_after_s:
         pair.b.timeout(now)
         arrived.insert(0, pair.b.envelope(now))  # an empty one comes before, and is asked about: all below it is old
@@ -218,3 +272,4 @@ def test_after_a_silence_the_peer_is_asked_whether_a_report_is_new(arrives_after
     for answer in answers:
         pair.a.receive(answer, now + 0.2)
     assert claims(pair.a) == ([newer] if counts else [])
+    assert pair.a.peer.claims.problems.codes == ((2,) if counts else ())
