@@ -12,21 +12,56 @@ import re
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, Final, NoReturn
 
 from uavlinkd import __version__
 from uavlinkd.protocol.constants import PROTOCOL_NAME
 from uavlinkd.system.terminal import FAILED, OK, WRONG, CommandError, UsageError, add_json, printable
 
 _LINE_LIMIT = 4096
-OF_THE_LABORATORY = {
-    "sim": "fly a simulated autopilot",
-    "demo": "run two daemons on this machine that exchange frames",
-    "evaluate": "measure uavlinkd: beside the paper's method, under attack, and in flight",
+COMMANDS: Final = {
+    "run": ("run the daemon", f"{__name__}:_add_run"),
+    "relay": ("run a relay: it passes datagrams between its members, and cannot forge them", f"{__name__}:_add_run"),
+    "check": ("check a configuration and show its effect", f"{__name__}:_add_check"),
+    "status": (
+        "show the links and problems of a running daemon; exit status 0 if frames can pass",
+        "uavlinkd.ops.commands:add_status",
+    ),
+    "web": ("show the links of a running daemon in a browser", "uavlinkd.web.commands:add_arguments"),
+    "reload": ("make a running daemon read its configuration again", "uavlinkd.ops.commands:add_reload"),
+    "netcheck": (
+        "show whether UDP and TLS reach each relay, and the public address of this machine",
+        "uavlinkd.ops.commands:add_netcheck",
+    ),
+    "keygen": ("make a private key and print its public key", f"{__name__}:_add_keygen"),
+    "pubkey": ("print the public key of a private key on standard input, or in FILE", f"{__name__}:_add_pubkey"),
+    "psk": ("make a pre-shared key for one pair of peers", f"{__name__}:_add_psk"),
+    "record": (
+        "record the frames that a daemon sends to a local client, until Ctrl-C",
+        "uavlinkd.ops.commands:add_record",
+    ),
+    "fleet": ("sign and revoke the members of a fleet", "uavlinkd.fleet.commands:add_fleet"),
+    "enroll": (
+        "make this machine a member of a fleet, with one line each way",
+        "uavlinkd.fleet.commands:add_enroll",
+    ),
+    "sim": ("fly a simulated autopilot", "uavlinkd.lab.commands:add_arguments"),
+    "demo": ("run two daemons on this machine that exchange frames", "uavlinkd.lab.commands:add_arguments"),
+    "evaluate": (
+        "measure uavlinkd: beside the paper's method, under attack, and in flight",
+        "uavlinkd.lab.commands:add_arguments",
+    ),
 }
-"""Commands of an optional package, which adds their arguments."""
-_REMOVED = {"report": "send what `uavlinkd status --json` prints, and the log of `journalctl -u uavlinkd`"}
+"""Each command with what it does, and the function that adds its arguments: it is imported for this command only."""
+_LABORATORY: Final = "uavlinkd.lab"
+_REMOVED: Final = {
+    "report": "send what `uavlinkd status --json` prints, and the log of `journalctl -u uavlinkd`",
+    "help": "`uavlinkd --help` shows the commands, and `uavlinkd COMMAND --help` the options of one",
+    "peer": "`uavlinkd status` shows the peers, and `uavlinkd status --json` their keys too",
+    "ping": "`uavlinkd status --watch` shows whether each path answers, its round trip and its loss",
+}
 """Commands of earlier versions, each with what to do in its place."""
 _NOT_A_RELAY = (
     "is not the file of a relay: that has a [[member]] for each daemon that may use it, no [[peer]] and no"
@@ -38,8 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = sys.argv[1:] if arguments is None else arguments
 
     def command() -> int:
-        parser = _make_daemon_parser()[0] if words[:1] in (["run"], ["relay"]) else make_parser()
-        options = parser.parse_args(words)
+        options = make_parser().parse_args(words)
         return int(options.command(options))
 
     return _to_the_end(command)
@@ -107,18 +141,24 @@ def _need_lab(command: str) -> None:
         )
 
 
-class _Parser(argparse.ArgumentParser):
-    """The parser of a command. ``fill`` adds the arguments, and imports what they need, for that command only."""
+class CommandParser(argparse.ArgumentParser):
+    """The parser of a command. :meth:`fill` adds the arguments, and imports what they need, for that command only."""
 
-    def __init__(self, *args: Any, fill: Callable[[argparse.ArgumentParser], None] | None = None, **kwargs: Any):
-        super().__init__(*args, **kwargs)
-        self._fill = fill
+    adding = ""
+    """The function that adds the arguments, with its module; empty if they are there."""
+
+    def fill(self) -> None:
+        """Add the arguments. Raises CommandError if the command needs the laboratory, which is not installed."""
+        module, _, function = self.adding.partition(":")
+        self.adding = ""
+        if module.startswith(_LABORATORY):
+            _need_lab(self.prog)
+        if module:
+            getattr(import_module(module), function)(self)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Parse the command's arguments, ``--help`` among them."""
-        if self._fill is not None:
-            self._fill(self)
-            self._fill = None
+        self.fill()
         return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
@@ -135,90 +175,26 @@ class _Parser(argparse.ArgumentParser):
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """The parser of ``uavlinkd``. The commands of the laboratory have no arguments before ``fill_by_lab``."""
-    from uavlinkd.fleet.commands import add_parser as add_fleet
-    from uavlinkd.ops.commands import add_parsers as add_daemon_commands
-    from uavlinkd.web.commands import add_parser as add_web
-
-    parser, commands = _make_daemon_parser()
-
-    def add(name: str, function: Callable[[argparse.Namespace], int], text: str) -> argparse.ArgumentParser:
-        return _add(commands, name, function, text)
-
-    add_daemon_commands(commands)
-    add_web(commands)
-    check = add("check", _check, "check a configuration and show its effect")
-    check.add_argument("--config", metavar="FILE", type=Path, required=True)
-    check.add_argument(
-        "--keys", metavar="DIR", type=Path, help="for a service: the folder of its keys, as in LoadCredential="
-    )
-    check.add_argument(
-        "--elsewhere", action="store_true", help="the file is for another machine: do not look at this one"
-    )
-    add_json(check)
-
-    keygen = add("keygen", _keygen, "make a private key and print its public key")
-    keygen.add_argument(
-        "--out", metavar="FILE", type=Path, help="write the private key to FILE (mode 0600) instead of stdout"
-    )
-
-    pubkey = add("pubkey", _pubkey, "print the public key of a private key on standard input, or in FILE")
-    pubkey.add_argument("file", metavar="FILE", type=Path, nargs="?")
-
-    psk = add("psk", _psk, "make a pre-shared key for one pair of peers")
-    psk.add_argument("--out", metavar="FILE", type=Path, help="write it to FILE (mode 0600) instead of stdout")
-
-    help_ = add("help", _help, "show the commands, or the options of one")
-    help_.add_argument("words", metavar="COMMAND", nargs="*")
-
-    for name, text in OF_THE_LABORATORY.items():
-        commands.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.", fill=fill_by_lab)
-    add_fleet(commands)
-    return parser
-
-
-def _make_daemon_parser() -> tuple[argparse.ArgumentParser, argparse._SubParsersAction[argparse.ArgumentParser]]:
-    """The parser of ``uavlinkd`` with ``run`` and ``relay`` alone: to make all of it takes a tenth of their start."""
-    parser = _Parser(
+    """The parser of ``uavlinkd``. Its commands have no arguments before :meth:`CommandParser.fill`."""
+    parser = CommandParser(
         prog="uavlinkd",
         description="Carry MAVLink between drones over an authenticated link. An attacker on the network cannot "
         "forge, alter, replay or redirect a frame.",
     )
     parser.add_argument("--version", action="version", version=f"uavlinkd {__version__}, {PROTOCOL_NAME.decode()}")
-    commands: argparse._SubParsersAction[argparse.ArgumentParser] = parser.add_subparsers(
-        title="commands", metavar="COMMAND", required=True, parser_class=_Parser
-    )
-    run = _add(commands, "run", _run, "run the daemon")
-    text = "run a relay: it passes datagrams between its members, and cannot forge them"
-    relay = _add(commands, "relay", _run, text)
-    for command in (run, relay):
-        command.set_defaults(is_relay=command is relay)
-        command.add_argument("--config", metavar="FILE", type=Path, required=True)
-    return parser, commands
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    for name, (text, adding) in COMMANDS.items():
+        command = commands.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
+        command.adding = adding
+    return parser
 
 
-def _add(
-    commands: argparse._SubParsersAction[argparse.ArgumentParser],
-    name: str,
-    function: Callable[[argparse.Namespace], int],
-    text: str,
-) -> argparse.ArgumentParser:
-    command = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
-    command.set_defaults(command=function)
-    return command
+# Running a daemon.
 
 
-def fill_by_lab(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of a command of the laboratory. Raises CommandError if it is not installed."""
-    _need_lab(parser.prog)
-    from uavlinkd.lab.commands import add_arguments
-
-    add_arguments(parser)
-
-
-def _help(options: argparse.Namespace) -> int:
-    make_parser().parse_args([*options.words, "--help"])
-    return OK
+def _add_run(parser: argparse.ArgumentParser) -> None:
+    parser.set_defaults(command=_run, is_relay=parser.prog == "uavlinkd relay")
+    parser.add_argument("--config", metavar="FILE", type=Path, required=True)
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -268,6 +244,21 @@ def _run_daemon(options: argparse.Namespace) -> int:
     return OK
 
 
+# Configurations and keys.
+
+
+def _add_check(parser: argparse.ArgumentParser) -> None:
+    parser.set_defaults(command=_check)
+    parser.add_argument("--config", metavar="FILE", type=Path, required=True)
+    parser.add_argument(
+        "--keys", metavar="DIR", type=Path, help="for a service: the folder of its keys, as in LoadCredential="
+    )
+    parser.add_argument(
+        "--elsewhere", action="store_true", help="the file is for another machine: do not look at this one"
+    )
+    add_json(parser)
+
+
 def _check(options: argparse.Namespace) -> int:
     import json
 
@@ -298,6 +289,12 @@ def _check(options: argparse.Namespace) -> int:
     return FAILED if errors else OK
 
 
+def _add_keygen(parser: argparse.ArgumentParser) -> None:
+    parser.set_defaults(command=_keygen)
+    text = "write the private key to FILE (mode 0600) instead of stdout"
+    parser.add_argument("--out", metavar="FILE", type=Path, help=text)
+
+
 def _keygen(options: argparse.Namespace) -> int:
     from uavlinkd.config.keys import generate_private_key, public_key_text, write_secret_file
 
@@ -310,6 +307,11 @@ def _keygen(options: argparse.Namespace) -> int:
         return OK
     write_secret_file(options.out, private)
     return _print(public_key_text(private))
+
+
+def _add_pubkey(parser: argparse.ArgumentParser) -> None:
+    parser.set_defaults(command=_pubkey)
+    parser.add_argument("file", metavar="FILE", type=Path, nargs="?")
 
 
 def _pubkey(options: argparse.Namespace) -> int:
@@ -325,6 +327,11 @@ def _pubkey(options: argparse.Namespace) -> int:
         return _print(public_key_text(private))
     except ValueError as error:
         raise CommandError(f"{options.file or 'standard input'}: {error}") from None
+
+
+def _add_psk(parser: argparse.ArgumentParser) -> None:
+    parser.set_defaults(command=_psk)
+    parser.add_argument("--out", metavar="FILE", type=Path, help="write it to FILE (mode 0600) instead of stdout")
 
 
 def _psk(options: argparse.Namespace) -> int:

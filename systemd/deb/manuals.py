@@ -41,14 +41,16 @@ def main() -> None:
 def parsers() -> Iterator[argparse.ArgumentParser]:
     """The parser of each console script, with those of all its commands."""
     uavlinkd = cli.make_parser()
-    try:
-        for commands in subparsers(uavlinkd):
-            for name in cli.OF_THE_LABORATORY:
-                cli.fill_by_lab(commands.choices[name])
-    except CommandError:
-        yield uavlinkd
-        return
+    has_laboratory = True
+    for commands in subparsers(uavlinkd):
+        for command in commands.choices.values():
+            try:
+                command.fill()  # type: ignore[attr-defined]
+            except CommandError:
+                has_laboratory = False
     yield uavlinkd
+    if not has_laboratory:
+        return
     from uavlinkd.lab.hostile import relay_cli  # noqa: PLC0415  the Debian package has no laboratory
     from uavlinkd.lab.mitm import cli as mitm_cli  # noqa: PLC0415
 

@@ -14,7 +14,7 @@ __all__ = ["stage"]
 
 
 async def test_the_link_is_described(stage: Stage) -> None:
-    """State, path, suite, mode, tag and ages, as they are, in strict JSON: no NaN, no infinity. A ping asks again."""
+    """State, path, suite, mode, tag and ages, as they are, in strict JSON: no NaN, no infinity."""
     a, b = stage.pair(probe_interval_s=0.1)
     into_a, into_b = a.add_endpoint("autopilot"), b.add_endpoint("autopilot")
     await stage.start(a, b)
@@ -38,11 +38,6 @@ async def test_the_link_is_described(stage: Stage) -> None:
     for key in ("round_trip_s", "last_received_s", "handshake_s"):
         assert 0 <= peer[key] < PATIENCE_S  # both ends may turn within one tick of the clock
     assert peer["handshakes"] >= 1
-    (path,) = (await a.ask("ping drone1"))["paths"]
-    (later,) = (await a.ask("ping drone1"))["paths"]
-    assert later["address"] == b.address
-    assert later["datagrams_sent"] > path["datagrams_sent"]
-    assert "there is no peer of this name" in (await a.ask("ping stranger"))["error"]
     for line in a.statuses:
         json.loads(line, parse_constant=refuse)
 

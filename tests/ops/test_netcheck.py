@@ -1,15 +1,14 @@
-"""``uavlinkd netcheck``: what it prints of each relay. ``ping``: what it prints of each path."""
+"""``uavlinkd netcheck``: what it prints of each relay."""
 
 from __future__ import annotations
 
 import re
-import time
 from typing import Any
 
 import pytest
 
 from tests.test_readmes import ROOT
-from uavlinkd.ops.netcheck import INTERVAL_S, folded, ping, report
+from uavlinkd.ops.netcheck import folded, report
 from uavlinkd.system.error_meanings import WEB_ERRORS
 
 RELAY = {"state": "up", "is_udp": True, "round_trip_s": 0.0234, "silent": [], "unresolved": [], "views": []}
@@ -106,54 +105,3 @@ def test_reasons_by_tls_are_a_closed_list() -> None:
     rows = [line.split(" | ")[0] for line in table.partition("\n\n")[0].splitlines()]
     names = {name for row in rows for name in re.findall(r"`(\w+)`", row)}
     assert names - {"ECONNREFUSED"} == set(WEB_ERRORS)
-
-
-DIRECT: dict[str, Any] = {
-    "address": "203.0.113.7:5790",
-    "relay": None,
-    "network": "lte",
-    "answered_s": 1.02,  # at once, an interval ago
-    "round_trip_s": 0.0234,
-    "reason": "answered",
-    "loss_in": 0.0,
-    "loss_out": 0.02,
-    "carries": ["critical", "stream", "bulk"],
-}
-RELAYED = {
-    **DIRECT,
-    "number": 1,
-    "address": "relayed via vps",
-    "relay": "vps",
-    "relay_address": "198.51.100.2:5790",
-    "network": None,
-    "carries": ["critical"],
-}
-SILENT = {**RELAYED, "answered_s": 3.0, "carries": []}
-BY_TLS_BEFORE = {**SILENT, "network": "TLS", "reason": "closed"}
-
-
-@pytest.mark.parametrize(
-    ("paths", "is_answered"), [([DIRECT, SILENT], True), ([SILENT], False), ([], False), ([BY_TLS_BEFORE], False)]
-)
-def test_each_question_has_a_line_for_each_path(
-    paths: list[dict[str, Any]],
-    is_answered: bool,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    """The answers to the first question are shown a second later."""
-    slept: list[float] = []
-    monkeypatch.setattr(time, "sleep", slept.append)
-    assert ping(lambda: {"paths": paths}, 3) is is_answered
-    lines = capsys.readouterr().out.splitlines()
-    assert slept == [INTERVAL_S] * 3
-    assert len(lines) == 3 * max(1, len(paths))
-    assert lines[-1].startswith("3: ")
-    if len(paths) == 2:
-        assert lines[:2] == [
-            "1: direct to 203.0.113.7:5790 on lte, 23.4 ms, loss 0 % in, 2 % out, carries critical and stream and"
-            " bulk",
-            "1: relayed via vps, no answer, loss 0 % in, 2 % out, carries no frames",
-        ]
-    if paths == [BY_TLS_BEFORE]:
-        assert lines[0].startswith("1: relayed via vps on TLS, not connected, loss")

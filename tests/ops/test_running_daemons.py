@@ -1,4 +1,4 @@
-"""`status`, `reload` and `peer list` without an option find the daemons that run as services."""
+"""`status` and `reload` without an option find the daemons that run as services."""
 
 from __future__ import annotations
 
@@ -53,9 +53,7 @@ def status(name: str, state: str = "up") -> dict[str, Any]:
     return status_of({"drone1": peer(state, public_key="A=")}, name=name)
 
 
-@pytest.mark.parametrize(
-    "command", ["status", "status --json", "peer list", "netcheck --json", "reload", "ping d --count 1 --json"]
-)
+@pytest.mark.parametrize("command", ["status", "status --json", "netcheck --json", "reload"])
 @pytest.mark.parametrize("answer", [{}, {"frames_pass": 1, "peers": 7}, {"relays": [], "problems": 5, "paths": "x"}])
 def test_answer_of_another_form_ends_a_command_with_a_sentence(
     daemons: Daemons, capsys: pytest.CaptureFixture[str], command: str, answer: dict[str, Any]
@@ -95,12 +93,6 @@ def test_several_daemons_are_shown_one_after_another(daemons: Daemons, capsys: p
     assert main(["status", "--json"]) == FAILED
     names = ["ground", "drone1", "drone2"]
     assert [json.loads(line)["name"] for line in capsys.readouterr().out.splitlines()] == names
-    assert main(["peer", "list"]) == OK
-    lines = capsys.readouterr().out.splitlines()
-    assert main(["peer", "list", "--json"]) == OK
-    peers = [json.loads(line)["peers"] for line in capsys.readouterr().out.splitlines()]
-    assert peers[1:] == [{"drone1": {"public_key": "A=", "state": state}} for state in ("up", "waiting")]
-    assert [line for line in lines if line.endswith(":")] == [f"{name}:" for name in names]
 
 
 def test_a_daemon_that_does_not_answer_does_not_hide_others(

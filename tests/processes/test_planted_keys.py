@@ -46,7 +46,7 @@ async def test_nothing_that_a_daemon_gives_away_holds_a_key(stage: Stage) -> Non
         await daemon.status()
         output += [line.encode() for line in (*daemon.lines, *daemon.statuses)]
         output += [Path(f"/proc/{daemon.pid}/{name}").read_bytes() for name in ("cmdline", "environ")]
-        for command in (["check"], ["status", "--json"], ["status"], ["peer", "list"], ["reload"]):
+        for command in (["check"], ["status", "--json"], ["status"], ["reload"]):
             done = await asyncio.to_thread(run, daemon, *command)
             output.append(f"{done.stdout}{done.stderr}".encode())
     assert all(output), "something said nothing"

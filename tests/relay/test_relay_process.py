@@ -107,7 +107,6 @@ async def test_netcheck_of_a_member_shows_that_udp_reaches_the_relay(host: str, 
     said = " ".join(printed.decode().split())
     assert said.startswith("UDP vps: answers")
     assert said.endswith(f"seen as {own} by vps at {listen}")
-    assert (await member.ask("ping vps"))["error"].startswith("vps is a relay, not a peer: `uavlinkd netcheck`")
 
 
 async def test_members_change_while_the_relay_runs(relay: DaemonProcess, make_member: MakeMember) -> None:

@@ -209,7 +209,7 @@ def test_fleet(walk: Walk) -> None:
     walk.follow(blocks[before:])
 
     converse(walk, {1: autopilots[1]}, station)
-    status = laptop.run("uavlinkd peer list --config fleet/ground-station/ground-station.toml")
+    status = laptop.run("uavlinkd status --config fleet/ground-station/ground-station.toml")
     assert "drone1" in status
     assert "drone2" not in status
 

@@ -19,7 +19,7 @@ from uavlinkd.daemon.parts import DaemonParts
 from uavlinkd.daemon.peer_link import radio_figures
 from uavlinkd.mavlink.own_frames import INTERVAL_S
 from uavlinkd.observe.observer import Observer
-from uavlinkd.observe.status import daemon_status, overview, paths_status, state_of
+from uavlinkd.observe.status import daemon_status, overview, state_of
 from uavlinkd.ops import LOG_SCHEMA
 from uavlinkd.ops.control import ControlServer
 from uavlinkd.ops.log import shown
@@ -166,8 +166,6 @@ class Daemon:
                 return parts.fleet.trust.known()
             case ("publish", " ", signed) if parts.fleet is not None:
                 return parts.fleet.publish(signed, monotonic())
-            case ("ping", " ", name):
-                return ping(parts, self.carrier, name, monotonic())
         return None
 
     async def reload(self) -> None:
@@ -263,20 +261,6 @@ class Daemon:
         for link in self.parts.links.values():
             run(link.report_problems, codes, now)
         self.carrier.arm()
-
-
-def ping(parts: DaemonParts, carrier: FrameCarrier, name: str, now: float) -> dict[str, object]:
-    """The paths to a peer. Asks along each of them: the next answer has the results."""
-    link = parts.links.get(name)
-    if link is None and name in parts.relays.by_name:
-        return {"error": f"{name} is a relay, not a peer: `uavlinkd netcheck` and `uavlinkd status` show it"}
-    if link is None:
-        peers = f"write one of {', '.join(parts.links)}" if parts.links else "this daemon has no peers"
-        return {"error": f"there is no peer of this name: {peers}"}
-    paths = paths_status(link, parts.peer_sockets.way_of, now)
-    for state in link.peer.paths.states:
-        carrier.perform(parts.node.ask(link.peer, state.path, now))
-    return {"paths": paths}
 
 
 def netcheck(parts: DaemonParts) -> dict[str, object]:

@@ -13,13 +13,10 @@ _TYPED = frozenset({"init", "add", "rotate", "revoke", "remove", "publish", "pap
 """Actions that read a passphrase from the terminal, and nothing else."""
 
 
-def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    _add_enroll(commands)
-    fleet = commands.add_parser(
-        "fleet",
-        help="sign and revoke the members of a fleet",
-        description="Sign and revoke the members of a fleet. One key, the authority, signs each member's key. The"
-        " public facts are in fleet.toml, the authority's key in authority.pem.",
+def add_fleet(fleet: argparse.ArgumentParser) -> None:
+    fleet.description = (
+        "Sign and revoke the members of a fleet. One key, the authority, signs each member's key. The public facts"
+        " are in fleet.toml, the authority's key in authority.pem."
     )
     actions = fleet.add_subparsers(title="commands", metavar="COMMAND", required=True)
 
@@ -97,12 +94,10 @@ def _add_list(parser: argparse.ArgumentParser, name: str, metavar: str, text: st
     parser.add_argument(name, action="append", default=[], metavar=metavar, help=text)
 
 
-def _add_enroll(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    enroll = commands.add_parser(
-        "enroll",
-        help="make this machine a member of a fleet, with one line each way",
-        description="Make this machine a member of a fleet: `enroll NAME` makes the private key, which stays, and"
-        " prints a line for `uavlinkd fleet sign`. `enroll --finish` reads the line that this prints.",
+def add_enroll(enroll: argparse.ArgumentParser) -> None:
+    enroll.description = (
+        "Make this machine a member of a fleet: `enroll NAME` makes the private key, which stays, and prints a"
+        " line for `uavlinkd fleet sign`. `enroll --finish` reads the line that this prints."
     )
     enroll.set_defaults(command=_act, action="enroll")
     enroll.add_argument("name", nargs="?", metavar="NAME")

@@ -1,4 +1,4 @@
-"""The commands beside a running daemon: ``status``, ``reload``, ``peer list``, ``ping``, ``netcheck`` and ``record``.
+"""The commands beside a running daemon: ``status``, ``reload``, ``netcheck`` and ``record``.
 
 Each command imports what it needs when it runs: the other commands start without it.
 """
@@ -22,36 +22,33 @@ SOCKET_NAME: Final = "control.sock"
 WATCH_INTERVAL_S = 1.0
 
 
-def add_parsers(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    status = for_daemon(
-        commands, "status", _status, "show a daemon's links and problems; exit status 0 if frames can pass"
-    )
-    form = status.add_mutually_exclusive_group()
+def add_status(parser: argparse.ArgumentParser) -> None:
+    add_daemon(parser)
+    parser.set_defaults(command=_status)
+    form = parser.add_mutually_exclusive_group()
     form.add_argument("--watch", action="store_true", help="refresh each second until interrupted")
     add_json(form)
     form.add_argument("--health", action="store_true", help="print nothing; exit status 0 if the daemon itself works")
-    for_daemon(commands, "reload", _reload, "make a daemon read its configuration again")
-    peer = for_daemon(commands, "peer", _peer_list, "list a daemon's peers and their keys")
-    peer.add_argument("action", choices=["list"])
-    add_json(peer)
-    ping = for_daemon(
-        commands, "ping", _ping, "ask along each path to a peer, and show which answer and carry frames"
-    )
-    ping.add_argument("peer", metavar="PEER", help="its name in the daemon's configuration")
-    ping.add_argument(
-        "--count", metavar="N", type=int, default=5, help="questions, one a second (default: %(default)s)"
-    )
-    add_json(ping)
-    text = "show whether UDP and TLS reach each relay, and the public address of this machine"
-    add_json(for_daemon(commands, "netcheck", _netcheck, text))
-    text = "record the frames that a daemon sends to a local client, until Ctrl-C"
-    record = commands.add_parser("record", help=text, description=f"{text[0].upper()}{text[1:]}.")
-    record.set_defaults(command=_record)
-    record.add_argument(
+
+
+def add_reload(parser: argparse.ArgumentParser) -> None:
+    add_daemon(parser)
+    parser.set_defaults(command=_reload)
+
+
+def add_netcheck(parser: argparse.ArgumentParser) -> None:
+    add_daemon(parser)
+    parser.set_defaults(command=_netcheck)
+    add_json(parser)
+
+
+def add_record(parser: argparse.ArgumentParser) -> None:
+    parser.set_defaults(command=_record)
+    parser.add_argument(
         "url", metavar="URL", help="the daemon's endpoint as a client sees it: udpout:127.0.0.1:14550 for its udpin"
     )
-    record.add_argument("file", metavar="FILE", type=Path, help="a new telemetry log (.tlog, mode 0600)")
-    record.add_argument(
+    parser.add_argument("file", metavar="FILE", type=Path, help="a new telemetry log (.tlog, mode 0600)")
+    parser.add_argument(
         "--system-id",
         metavar="ID",
         type=int,
@@ -60,22 +57,12 @@ def add_parsers(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     )
 
 
-def for_daemon(
-    commands: argparse._SubParsersAction[argparse.ArgumentParser],
-    name: str,
-    function: Callable[[argparse.Namespace], int],
-    text: str,
-) -> argparse.ArgumentParser:
-    command = commands.add_parser(
-        name,
-        help=text,
-        description=f"{text[0].upper()}{text[1:]}. Without an option it finds the running service and its instances.",
-    )
-    command.set_defaults(command=function)
-    daemon = command.add_mutually_exclusive_group()
+def add_daemon(parser: argparse.ArgumentParser) -> None:
+    """Add the options that name a running daemon."""
+    parser.description = f"{parser.description} Without an option it finds the running service and its instances."
+    daemon = parser.add_mutually_exclusive_group()
     daemon.add_argument("--config", metavar="FILE", type=Path, help="the daemon's configuration")
     daemon.add_argument("--socket", metavar="PATH", type=Path, help="the daemon's control socket")
-    return command
 
 
 # The daemons that a command is for.
@@ -221,18 +208,6 @@ def _reload(options: argparse.Namespace) -> int:
     return OK
 
 
-def _ping(options: argparse.Namespace) -> int:
-    from uavlinkd.ops.control import ask
-    from uavlinkd.ops.netcheck import ping
-
-    socket = control_socket(options)
-    if options.count < 1:
-        raise UsageError("--count must be 1 or more")
-    with _of_this_version():
-        answered = ping(lambda: ask(socket, f"ping {options.peer}"), options.count, as_json=options.json)
-        return OK if answered else FAILED
-
-
 def _netcheck(options: argparse.Namespace) -> int:
     from uavlinkd.ops.netcheck import folded, report
 
@@ -262,26 +237,3 @@ def _record(options: argparse.Namespace) -> int:
         raise CommandError(f"{options.file}: {error.strerror}") from None
     print(printable(f"{count} frames in {options.file}"))
     return OK if count else FAILED
-
-
-def _peer_list(options: argparse.Namespace) -> int:
-    from rich.console import Console
-
-    from uavlinkd.ops.status_screen import render_peers
-    from uavlinkd.ops.status_words import peers_of
-
-    console, sockets = Console(), control_sockets(options)
-
-    def show(status: dict[str, Any]) -> int:
-        if options.json:
-            peers = {
-                name: {key: peer[key] for key in ("public_key", "state")} for name, peer in peers_of(status).items()
-            }
-            print(json.dumps({"name": status["name"], "peers": peers}))
-            return OK
-        if len(sockets) > 1:
-            console.print(f"{status['name']}:", style="bold", markup=False, highlight=False)
-        console.print(render_peers(status))
-        return OK
-
-    return _for_each(sockets, "status", show)

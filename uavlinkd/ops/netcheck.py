@@ -1,58 +1,15 @@
-"""The output of ``uavlinkd ping`` and ``netcheck``: which paths to a peer answer, and which relays."""
+"""The output of ``uavlinkd netcheck``: which relays answer, and how they see this daemon."""
 
 from __future__ import annotations
 
-import json
-import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from textwrap import fill
-from typing import Any, Final
+from typing import Any
 
 from uavlinkd.system.error_meanings import web_problem
-from uavlinkd.system.terminal import printable
-
-INTERVAL_S: Final = 1.0  # between the questions of `ping`
 
 Answer = Mapping[str, Any]
-
-
-def ping(ask: Callable[[], Answer], count: int, *, as_json: bool = False) -> bool:
-    """Ask along every path ``count`` times, a second apart, and print a line for each answer that came or did not.
-
-    ``ask`` sends the questions, and returns the paths as they were before. Returns whether the last question was
-    answered along any path.
-    """
-    ask()
-    answered = False
-    for number in range(1, count + 1):
-        time.sleep(INTERVAL_S)
-        paths = ask()["paths"]  # also the next questions
-        # A younger answer is one to the last question, which is an interval old.
-        times = [path["answered_s"] for path in paths]
-        answers = [time_s is not None and time_s < 1.5 * INTERVAL_S for time_s in times]
-        answered = any(answers)
-        if as_json:
-            print(json.dumps({"number": number, "paths": paths}), flush=True)
-            continue
-        for path, address, is_answered in zip(paths, addresses(paths), answers, strict=True):
-            no_answer = "not connected" if path["reason"] == "closed" else "no answer"
-            facts = [
-                address if path["relay"] is not None else f"direct to {address}",
-                f"{1000 * path['round_trip_s']:.1f} ms" if is_answered else no_answer,
-                f"loss {100 * path['loss_in']:.0f} % in, {100 * path['loss_out']:.0f} % out",
-                f"carries {' and '.join(path['carries'])}" if path["carries"] else "carries no frames",
-            ]
-            if path["network"]:
-                facts[0] += f" on {path['network']}"
-            print(printable(f"{number}: {', '.join(facts)}"), flush=True)
-        if not paths:
-            print(
-                f"{number}: no path is known: the peer has not connected, or no relay has bound it;"
-                " `uavlinkd status` names the cause",
-                flush=True,
-            )
-    return answered
 
 
 def addresses(paths: Sequence[Answer]) -> list[str]:

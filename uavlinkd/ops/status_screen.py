@@ -53,15 +53,6 @@ def render_status(status: Status, width: int = 80) -> RenderableType:
     return Group(*parts)
 
 
-def render_peers(status: Status) -> RenderableType:
-    """``uavlinkd peer list``: one line per peer, with its name, key and state, the broken ones first; then why."""
-    table = Table.grid(padding=(0, 2))
-    for name, peer in _by_state(status):
-        table.add_row(Text(name), peer["public_key"], Text(peer["state"], style=_STYLES[peer["state"]]))
-    findings = [finding for finding in status["findings"] if finding["subject"] == "peer"]
-    return Group(table, _findings(findings)) if findings else table
-
-
 def _headline(status: Status) -> Text:
     text = Text(f"{status['name']}  ", style="bold")
     for number, part in enumerate(words.headline(status)):

@@ -9,14 +9,15 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from uavlinkd.ops.commands import for_daemon
+from uavlinkd.ops.commands import add_daemon
 from uavlinkd.system.terminal import CommandError
 
 DEFAULT: Final = "127.0.0.1:8790"
 
 
-def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    web = for_daemon(commands, "web", _web, "show a daemon's links in a browser")
+def add_arguments(web: argparse.ArgumentParser) -> None:
+    add_daemon(web)
+    web.set_defaults(command=_web)
     web.add_argument("--listen", metavar="IP:PORT", default=DEFAULT, help="where the page is (default: %(default)s)")
     web.add_argument(
         "--name",
