@@ -130,7 +130,7 @@ BY_TLS = {**USED, "paths": [{"network": "TLS"}]}
 @pytest.mark.parametrize(
     ("facts", "of_peer", "shown"),
     [
-        ({}, {"path": "[fe80::1%2]:5790"}, "[fe80::1%2]:5790"),  # which is not markup
+        ({}, {"paths": [{**PATH, "address": "[fe80::1%2]:5790"}]}, "[fe80::1%2]:5790"),  # which is not markup
         (
             {},
             refused(foreign_system=900, message_not_allowed=800, rate_limited=700),
@@ -151,7 +151,7 @@ BY_TLS = {**USED, "paths": [{"network": "TLS"}]}
             "1 of 1 peers up, frames stop, as reported by d0, d1, d2, d3, d4, d5, d6, d7 and 1 more",
         ),
         ({"fleet": FLEET}, {}, "1 of 2 peers up fleet k7qd2m4x: vehicle v1, serial 3; bulletin 5, but v2 has 4 "),
-        ({"fleet": FLEET}, {}, "v9 waiting never - 0/0 % 0 B/s 0 B/s drone1 up"),
+        ({"fleet": FLEET}, {}, "v9 waiting silent never - 0/0 0.0/0.0 drone1 up"),
         ({"relays": {"vps": USED}}, {}, "relay vps: up, 12 ms; drone1 bound, drone2 waiting"),
         ({"relays": {"vps": BY_TLS}}, {}, "relay vps: up by TLS, 12 ms; drone1 bound, drone2 waiting"),
     ],
@@ -170,7 +170,7 @@ def test_problems_come_first_with_cause_and_remedy() -> None:
     for label in ("SECURITY zulu: ", "drone8 and 42 more: ", "fault endpoint autopilot: "):
         assert f"{label}the response from 10.13.0.0 does not authenticate" in text
     assert text.count("Remedy: give both the same psk_file") == 3
-    assert text.index("SECURITY") < text.index("fault drone1, drone2") < text.index("silent rtt")
+    assert text.index("SECURITY") < text.index("fault drone1, drone2") < text.index("rtt ms")
     file = io.StringIO()
     Console(file=file, width=80, force_terminal=True, color_system="standard").print(screen)
     assert "\x1b[1;31mSECURITY\x1b[0m" in file.getvalue()
@@ -198,7 +198,7 @@ def test_every_condition_of_a_path_is_shown(condition: PathCondition, reason: st
 
 def test_path_by_tls_that_is_not_needed_is_no_failure() -> None:
     paths = [PATH, {**PATH, "network": "TLS", "state": "down", "reason": "closed"}]
-    text = words(render_status(status_of({"drone1": peer("up", paths=paths)})))
+    text = words(render_status(status_of({"drone1": peer("up", paths=paths)})), 90)
     assert "TLS 203.0.113.255:65535 not connected" in text
     assert "down" not in text
 
@@ -213,7 +213,8 @@ def test_relay_shows_its_members_those_that_are_down_first() -> None:
     relay = {"members": members, "dropped": {"relay_unknown_handle": 7}, "https": https}
     text = words(render_status(status_of({}, relay=relay)))
     assert "relay: 1 of 2 members up" in text
-    assert text.index("ground-station down 59 min") < text.index("drone1 up 59 min 203.0.113.255:65535 1 0 1,234,567")
+    text = words(render_status(status_of({}, relay=relay)), 100)
+    assert text.index("station - down 59 min") < text.index("drone1 203.0.113.255:65535 up 59 min 1 0 1,234,567")
     assert "not forwarded: 7 of an unknown handle of a relay" in text
     assert "by TLS at 0.0.0.0:443: 1,000 members, 2 strangers; refused so far: 1,204 unproven, 9 displaced, 7" in text
     https["refused"] = {}

@@ -38,7 +38,6 @@ LINES = pytest.mark.parametrize(
     [
         ("uavlinkd st", "status"),
         ("uavlinkd status --so", "--socket"),
-        ("uavlinkd peer li", "list"),
         ("uavlinkd fleet ro", "rotate"),
         ("uavlinkd evaluate ti", "timing"),
         ("uavlinkd check --config LIC", "LICENSE"),

@@ -160,7 +160,7 @@ def _status(options: argparse.Namespace) -> int:
         if options.json:
             print(json.dumps(status))
         else:
-            console.print(render_status(status, console.width))
+            console.print(render_status(status))
         return OK if status["frames_pass"] else FAILED
 
     return _for_each(sockets, "status", show)
@@ -181,9 +181,7 @@ def _watch(sockets: Sequence[Path]) -> int:
             with _of_this_version():
                 passes = all(not isinstance(answer, CommandError) and answer["frames_pass"] for answer in answers)
                 screens = [
-                    Text(str(answer), style="bold red")
-                    if isinstance(answer, CommandError)
-                    else render_status(answer, live.console.width)
+                    Text(str(answer), style="bold red") if isinstance(answer, CommandError) else render_status(answer)
                     for answer in answers
                 ]
                 live.update(Group(*screens), refresh=True)

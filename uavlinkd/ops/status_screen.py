@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, Final
+from collections.abc import Iterator, Sequence
+from typing import Final
 
 from rich.box import SIMPLE_HEAD
-from rich.console import Group, JustifyMethod, RenderableType
+from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
@@ -29,10 +29,9 @@ _STYLES: Final = {
 }
 _SHOWN_FINDINGS: Final = 20
 _SHOWN_MEMBERS: Final = 30
-_WIDE: Final = 100  # from so many columns on, the table of paths has bytes too
 
 
-def render_status(status: Status, width: int = 80) -> RenderableType:
+def render_status(status: Status) -> RenderableType:
     """One screen: a headline, the problems, the peers with the broken ones first, the endpoints, and other counts."""
     parts: list[RenderableType] = [_headline(status)]
     if status["findings"]:
@@ -41,7 +40,7 @@ def render_status(status: Status, width: int = 80) -> RenderableType:
         parts.append(_said(words.fleet_line(fleet)))
     relay = status["relay"]
     if relay is None or words.peers_of(status) or status["endpoints"]:
-        parts += [*_peers(status, width), _endpoints(status)]
+        parts += [_peers(status), *map(Text, _problems(status)), _endpoints(status)]
     if relay is not None:
         parts.append(_members(relay))
         if (https := relay["https"]) is not None:
@@ -79,38 +78,44 @@ def _findings(findings: list[dict[str, str]]) -> Table:
     return table
 
 
-def _peers(status: Status, width: int) -> list[RenderableType]:
-    """A table of link quality, a table of paths and sessions in the same order, one of the paths of peers that have
-    several, and the problems.
-
-    The tables fit into 80 columns; long names and IPv6 addresses are folded.
-    """
-    health = _table("peer", whole=("state", "silent", "rtt", "loss in/out", "in", "out"))
-    paths = _table("peer", "path", whole=("suite", "mode", "key age"))
-    problems: list[RenderableType] = []
+def _peers(status: Status) -> Table:
+    """A row for each peer, and below it one for each of its paths. It fits into 80 columns; addresses are folded."""
+    table = _table("peer, path", whole=("state", "carries", "rtt ms", "loss %", "kB/s"))
     for name, peer in _by_state(status):
-        health.add_row(
-            Text(name, style="bold"),
-            Text(peer["state"], style=_STYLES[peer["state"]]),
-            _age(peer["last_received_s"]),
-            "-" if peer["round_trip_s"] is None else f"{1000 * peer['round_trip_s']:.1f} ms",
-            _loss(peer),
-            _rate(peer["bytes_in_s"]),
-            _rate(peer["bytes_out_s"]),
-        )
-        if name not in status["peers"]:
-            continue
-        if (repair := peer["repair"])["is_on"]:
-            problems.append(Text(f"{name} repair: on for {_age(repair['on_s'])}, {words.repair_line(repair)}"))
-        if dropped := words.listed(words.peer_drops(peer)):
-            problems.append(Text(f"{name} dropped: {dropped}"))
-        if overtaken := words.overtaken(peer):
-            problems.append(Text(f"{name} overtaken: {overtaken}"))
-        session = peer["session"] or {}
-        age = _age(peer["handshake_s"]) if session else "-"
-        paths.add_row(Text(name), Text(peer["path"] or "-"), session.get("suite", "-"), session.get("mode", "-"), age)
-    several = [(name, peer["paths"]) for name, peer in _by_state(status) if len(peer["paths"]) > 1]
-    return [health, paths, *([_paths(several, width)] if several else []), *problems]
+        state, silent = Text(peer["state"], style=_STYLES[peer["state"]]), f"silent {_age(peer['last_received_s'])}"
+        table.add_row(Text(name, style="bold"), state, silent, *_figures(peer))
+        for path, address in zip(peer["paths"], addresses(peer["paths"]), strict=True):
+            where = f"{path['network']} {address}" if path["network"] else address
+            is_up = peer["state"] == "up"
+            table.add_row(
+                Text(f" {where}", style="bold" if path["role"] == "best" else ""),
+                Text(words.path_state(path), style=_STYLES[words.condition(path)]) if is_up else "no link",
+                words.carried(path),
+                *_figures(path),
+            )
+    return table
+
+
+def _figures(part: Status) -> Iterator[Text]:
+    """Round trip, losses and rates of a peer or a path."""
+    time_s, worst = part["round_trip_s"], max(part["loss_in"], part["loss_out"])
+    jitter = f"±{_short(1000 * part['jitter_s'])}" if "jitter_s" in part else ""
+    yield Text("-" if time_s is None else f"{_short(1000 * time_s)}{jitter}")
+    style = "bold red" if worst > 0.2 else "yellow" if worst > 0.02 else ""
+    yield Text(f"{100 * part['loss_in']:.0f}/{100 * part['loss_out']:.0f}", style=style)
+    yield Text(f"{_short(part['bytes_in_s'] / 1e3)}/{_short(part['bytes_out_s'] / 1e3)}")
+
+
+def _problems(status: Status) -> Iterator[str]:
+    """The session of each peer, and what was dropped or repeated."""
+    for name, peer in _by_state(status):
+        if session := peer.get("session"):
+            yield f"{name} keys: {session['suite']}, {session['mode']}, {_age(peer['handshake_s'])} old"
+        if (repair := peer.get("repair", {"is_on": False}))["is_on"]:
+            yield f"{name} repair: on for {_age(repair['on_s'])}, {words.repair_line(repair)}"
+        if "drops" in peer:
+            yield from (f"{name} dropped: {text}" for text in [words.listed(words.peer_drops(peer))] if text)
+            yield from (f"{name} overtaken: {text}" for text in [words.overtaken(peer)] if text)
 
 
 def _by_state(status: Status) -> list[tuple[str, Status]]:
@@ -123,13 +128,12 @@ def _endpoints(status: Status) -> Table:
         clients = endpoint["clients"].items()
         listed = ", ".join(f"{address} ({_age(client['last_received_s'])})" for address, client in clients)
         is_active = bool(clients) and endpoint["frames_received"] > 0
-        problems = words.listed(words.endpoint_drops(endpoint))
         table.add_row(
             Text(name, style="bold"),
             Text(listed or "no client", style="" if is_active else "bold yellow"),
             f"{endpoint['frames_received']:,}",
             f"{endpoint['frames_sent']:,}",
-            problems or "-",
+            words.listed(words.endpoint_drops(endpoint)) or "-",
         )
     return table
 
@@ -137,29 +141,26 @@ def _endpoints(status: Status) -> Table:
 def _networks(status: Status) -> Table:
     table = _table("network", "exit", "metered", "addresses")
     for name, network in status["networks"].items():
-        line = network["serial"]
-        leads_out = network["interface"] or network["address"] or f"{line['device']} at {line['baud']} baud"
-        here = Text(", ".join(network["addresses"]) if line is None else words.radio_line(line))
-        if not network["is_present"]:
-            here = Text(f"absent: {network['absent_because']}", style="bold yellow")
-        table.add_row(Text(name, style="bold"), Text(leads_out), "yes" if network["is_metered"] else "no", here)
+        here = Text(words.network_text(network), style="" if network["is_present"] else "bold yellow")
+        metered = "yes" if network["is_metered"] else "no"
+        table.add_row(Text(name, style="bold"), Text(words.network_exit(network)), metered, here)
     return table
 
 
-def _loss(peer: Status) -> Text:
-    worst = max(peer["loss_in"], peer["loss_out"])
-    style = "bold red" if worst > 0.2 else "yellow" if worst > 0.02 else ""
-    return Text(f"{100 * peer['loss_in']:.0f}/{100 * peer['loss_out']:.0f} %", style=style)
-
-
-def _age(seconds: float | None) -> str:
-    """A duration for a column, at most 6 characters long within a year."""
-    if seconds is None:
-        return "never"
-    if seconds < 100:
-        return f"{seconds:.1f} s"
-    minutes = seconds / 60
-    return f"{minutes:.0f} min" if minutes < 100 else f"{minutes / 60:.0f} h"
+def _members(relay: Status) -> Table:
+    table = _table("member", "address", whole=("state", "bound", "waiting", "forwarded", "over\nlimit"))
+    members = sorted(relay["members"].items(), key=lambda item: (item[1]["is_up"], item[0]))
+    for name, member in members[:_SHOWN_MEMBERS]:
+        state, style = ("up", "green") if member["is_up"] else ("down", "yellow")
+        table.add_row(
+            Text(name),
+            Text("\n".join(dict.fromkeys(member["addresses"])) or "-"),
+            Text(f"{state} {_age(member['since_s'])}", style),
+            *(f"{member[key]:,}" for key in ("bound", "waiting", "datagrams", "over_limit")),
+        )
+    if len(members) > _SHOWN_MEMBERS:
+        table.add_row(f"and {len(members) - _SHOWN_MEMBERS:,} more")
+    return table
 
 
 def _table(*columns: str, whole: Sequence[str] = ()) -> Table:
@@ -172,72 +173,20 @@ def _table(*columns: str, whole: Sequence[str] = ()) -> Table:
     return table
 
 
-def _rate(bytes_s: float) -> str:
-    return f"{bytes_s:.0f} B/s" if bytes_s < 1000 else f"{bytes_s / 1000:.1f} kB/s"
+def _said(phrase: words.Phrase) -> Text:
+    return Text(phrase.text, style="" if phrase.is_good else "yellow")
 
 
-# Paths.
-
-
-def _paths(peers: Sequence[tuple[str, list[Status]]], width: int) -> Table:
-    """The paths of these peers, with as many columns as have room. Pairs of numbers are in/out."""
-    more = ("MB",) if width >= _WIDE else ()
-    table = _table("path", whole=("state", "carries", "rtt ms", "loss %", "kB/s", *more))
-    for name, paths in peers:
-        table.add_row(Text(name, style="bold"))
-        for path, address in zip(paths, addresses(paths), strict=True):
-            table.add_row(*_cells(path, address)[: len(table.columns)])
-    return table
-
-
-def _cells(path: Status, address: str) -> list[Text]:
-    where = f"{path['network']} {address}" if path["network"] else address
-    rtt = "-"
-    if path["round_trip_s"] is not None:
-        rtt = f"{_short(1000 * path['round_trip_s'])}±{_short(1000 * path['jitter_s'])}"
-    return [
-        Text(f" {where}", style="bold" if path["role"] == "best" else ""),
-        Text(words.path_state(path), style=_STYLES[words.condition(path)]),
-        Text(words.carried(path)),
-        Text(rtt),
-        Text(f"{100 * path['loss_in']:.0f}/{100 * path['loss_out']:.0f}"),
-        Text(f"{_short(path['bytes_in_s'] / 1e3)}/{_short(path['bytes_out_s'] / 1e3)}"),
-        Text(f"{_short(path['bytes_received'] / 1e6)}/{_short(path['bytes_sent'] / 1e6)}"),
-    ]
+def _age(seconds: float | None) -> str:
+    """A duration for a column, at most 6 characters long within a year."""
+    if seconds is None:
+        return "never"
+    if seconds < 100:
+        return f"{seconds:.1f} s"
+    minutes = seconds / 60
+    return f"{minutes:.0f} min" if minutes < 100 else f"{minutes / 60:.0f} h"
 
 
 def _short(number: float) -> str:
     """One digit behind the point below ten, none above."""
     return f"{number:.1f}" if number < 9.95 else f"{number:.0f}"
-
-
-# Relays.
-
-
-def _members(relay: dict[str, Any]) -> Table:
-    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=0)
-    for title in ("member", "state", "address", "bound", "waiting", "forwarded", "over\nlimit"):
-        is_text = title in ("member", "state", "address")
-        justify: JustifyMethod = "left" if is_text else "right"
-        table.add_column(title, justify=justify, overflow="fold", no_wrap=title == "state")
-    members = sorted(relay["members"].items(), key=lambda item: (item[1]["is_up"], item[0]))
-    for name, member in members[:_SHOWN_MEMBERS]:
-        table.add_row(
-            Text(name),
-            Text(
-                f"{'up' if member['is_up'] else 'down'} {_age(member['since_s'])}",
-                "green" if member["is_up"] else "yellow",
-            ),
-            Text("\n".join(dict.fromkeys(member["addresses"])) or "-"),
-            f"{member['bound']:,}",
-            f"{member['waiting']:,}",
-            f"{member['datagrams']:,}",
-            Text(f"{member['over_limit']:,}", style="yellow" if member["over_limit"] else ""),
-        )
-    if len(members) > _SHOWN_MEMBERS:
-        table.add_row(f"and {len(members) - _SHOWN_MEMBERS:,} more")
-    return table
-
-
-def _said(phrase: words.Phrase) -> Text:
-    return Text(phrase.text, style="" if phrase.is_good else "yellow")

@@ -190,7 +190,21 @@ def repair_line(repair: Status) -> str:
     return f"sends critical frames {repair['transmissions']} times; {kilobytes}"
 
 
-def radio_line(line: Status) -> str:
+def network_exit(network: Status) -> str:
+    """The interface, address or device of a network."""
+    line = network["serial"]
+    return str(network["interface"] or network["address"] or f"{line['device']} at {line['baud']} baud")
+
+
+def network_text(network: Status) -> str:
+    """This machine's addresses on a network, or what is known about its radio; why it is absent."""
+    if not network["is_present"]:
+        return f"absent: {network['absent_because']}"
+    line = network["serial"]
+    return ", ".join(network["addresses"]) if line is None else _radio_line(line)
+
+
+def _radio_line(line: Status) -> str:
     """What is known about the radio behind a serial device. Pairs of numbers are here/there."""
     parts = [f"up to {line['rate_bits_s']:,} bits/s", f"{line['line_noise']:,} damaged"]
     if (radio := line["radio"]) is not None:

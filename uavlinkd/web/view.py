@@ -170,12 +170,5 @@ def _endpoint(name: str, endpoint: Status) -> dict[str, Any]:
 
 
 def _network(name: str, network: Status) -> dict[str, Any]:
-    line = network["serial"]
-    here = ", ".join(network["addresses"]) if line is None else words.radio_line(line)
-    return {
-        "name": name,
-        "exit": network["interface"] or network["address"] or f"{line['device']} at {line['baud']} baud",
-        "is_metered": network["is_metered"],
-        "is_present": network["is_present"],
-        "text": here if network["is_present"] else f"absent: {network['absent_because']}",
-    }
+    facts = {key: network[key] for key in ("is_metered", "is_present")}
+    return {"name": name, "exit": words.network_exit(network), "text": words.network_text(network), **facts}
