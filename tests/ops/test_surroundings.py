@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -60,26 +61,19 @@ def test_control_socket(lacks: Lacks, monkeypatch: pytest.MonkeyPatch) -> None:
     assert "may not write to /tmp" in lacks()[0]
 
 
-def test_check_prints_it_unless_the_file_is_for_another_machine(
-    lacks: Lacks, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_check_prints_it(lacks: Lacks, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The exit status stays 0: the file is valid."""
     lacks(url="serial:/dev/no-such-tty:57600")
-    for options, is_shown in ([], True), (["--elsewhere"], False):
-        assert main(["check", "--config", str(tmp_path / "drone0.toml"), *options]) == 0
-        assert ("/dev/no-such-tty is not there" in " ".join(capsys.readouterr().out.split())) == is_shown
+    assert main(["check", "--config", str(tmp_path / "drone0.toml")]) == 0
+    assert "this machine: endpoint" in (printed := capsys.readouterr().out)
+    assert "/dev/no-such-tty is not there" in printed
 
 
-def test_check_refuses_broadcast_addresses_of_this_machine(
-    lacks: Lacks, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_broadcast_addresses_of_this_machine(lacks: Lacks) -> None:
     """A peer and a client are one machine each."""
     need(sys.platform == "linux", "Linux")
-    lacks(url="udpout:127.255.255.255:14550", address="127.255.255.255:5790")
-    assert main(["check", "--config", str(tmp_path / "drone0.toml")]) == 1
-    says = " ".join(capsys.readouterr().out.split())
-    for place in ('endpoint "autopilot": 127.255.255.255:14550', 'peer "drone1": 127.255.255.255:5790'):
-        assert f"error: {place} is a broadcast address: write the address of one machine" in says
+    for line in lacks(url="udpout:127.255.255.255:14550", address="127.255.255.255:5790"):
+        assert re.match(r'(endpoint|peer) ".*": 127.255.255.255:\d+ is a broadcast address: write the address', line)
 
 
 def test_a_network_that_is_absent(tmp_path: Path) -> None:

@@ -25,20 +25,22 @@ _SERIAL_DEVICES = ("serial/by-id/*", "ttyACM*", "ttyUSB*", "serial0")
 
 def look_around(config: Config) -> list[str]:
     """Sentences for a person. The daemon may run in spite of them, now or later."""
-    lacks = _serial, _listening, _own_addresses, _control_socket, _networks
+    lacks = _serial, _listening, _others, _control_socket, _networks
     return [line for look_for in lacks for line in look_for(config)]
 
 
-def broadcasts(config: Config) -> list[str]:
-    """Errors: addresses that are not those of one machine. The kernel knows the broadcast addresses of the interfaces
-    that are up, and refuses to connect.
+def _others(config: Config) -> Iterator[str]:
+    """Peers, relays and clients whose address is this daemon's, or not that of one machine.
+
+    The kernel knows the broadcast addresses of the interfaces that are up, and refuses to connect.
     """
-    errors: list[str] = []
+    ports = {address.port for address in config.listen}
     for section, address in _numeric(config):
+        if address.port in ports and look(None, address.host).hosts:
+            yield f"{section}: {address} is an address of this daemon itself: write that of the other machine"
         with socket.socket(family_of(address.host), socket.SOCK_DGRAM) as probe, suppress(OSError):
             if probe.connect_ex((address.host, address.port)) == errno.EACCES:
-                errors.append(f"{section}: {address} is a broadcast address: write the address of one machine")
-    return errors
+                yield f"{section}: {address} is a broadcast address: write the address of one machine"
 
 
 def _numeric(config: Config) -> list[tuple[str, Address]]:
@@ -53,14 +55,6 @@ def _numeric(config: Config) -> list[tuple[str, Address]]:
     return [(section, address) for section, address in named if address.ip is not None]
 
 
-def _own_addresses(config: Config) -> Iterator[str]:
-    """Peers, relays and clients whose address is this daemon's."""
-    ports = {address.port for address in config.listen}
-    for section, address in _numeric(config):
-        if address.port in ports and look(None, address.host).hosts:
-            yield f"{section}: {address} is an address of this daemon itself: write that of the other machine"
-
-
 def _listening(config: Config) -> Iterator[str]:
     listening = [("listen", address) for address in config.listen]
     listening += [
@@ -70,10 +64,9 @@ def _listening(config: Config) -> Iterator[str]:
     ]
     for key, address in listening:
         if address.ip is not None and not address.is_wildcard and not look(None, address.host).hosts:
-            wildcard = "0.0.0.0" if ":" not in address.host else "[::]"
             yield (
                 f"{key}: {address.host} is not an address of this machine now (`ip -brief address` lists them): the"
-                f' daemon uses it as soon as it is; for every address, write "{wildcard}:{address.port}"'
+                f" daemon uses it as soon as it is; for every address, write {address.wildcard()}"
             )
 
 
