@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 from uavlinkd.protocol.node import Node
 from uavlinkd.protocol.path import Path, SocketFacts
@@ -16,10 +16,15 @@ class SocketStateLog(Node):
         self.metered: list[int] = []
         self.facts = SocketFacts()
         self.removed: list[Path] = []
+        self.rates: list[Mapping[int, float]] = []
 
     def set_socket_state(self, socket: int, now: float, *, is_up: bool) -> None:
         """As the core's."""
         self.states.append((socket, is_up))
+
+    def set_rates(self, rates: Mapping[int, float], now: float) -> None:
+        """As the core's."""
+        self.rates.append(rates)
 
     def remove_path(self, path: Path, now: float) -> None:
         """As the core's."""

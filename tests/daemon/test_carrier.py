@@ -7,8 +7,10 @@ from collections.abc import Sequence
 from itertools import islice
 from types import SimpleNamespace
 from typing import cast
+from unittest.mock import Mock
 
 import pytest
+from structlog import get_logger
 
 from tests.daemon.test_peer_link import link_of
 from tests.policies import TRUSTED
@@ -36,11 +38,11 @@ from uavlinkd.protocol.drops import DropReason
 from uavlinkd.protocol.node import Node
 from uavlinkd.protocol.outputs import Deliver, Dropped, Output, SessionEstablished, Transmit
 from uavlinkd.protocol.path import Path, relayed
-from uavlinkd.protocol.relay_records import wrap
+from uavlinkd.protocol.relay_records import RELAYED_START, wrap
 from uavlinkd.protocol.settings import PeerSettings
 from uavlinkd.protocol.timers import Schedule
 from uavlinkd.protocol.wire import ENVELOPE_STARTS
-from uavlinkd.relay.client_link import RELAYED_START, RelayHandles
+from uavlinkd.relay.clients import Relays
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.stall import StallWatch
 
@@ -63,7 +65,6 @@ class Scene:
         self.received: list[tuple[bytes, Path]] = []
         self.dropped: list[tuple[str, str, int]] = []
         self.refused: list[Dropped] = []
-        self.handles = RelayHandles()
         self.stall = StallWatch(monotonic(), lambda _: None)
         node = SimpleNamespace(
             receive=self.receive,
@@ -85,19 +86,13 @@ class Scene:
             node=node,
             stall=self.stall,
             link_of={self.peer: self.link},
-            peer_sockets=SimpleNamespace(budgets={}, handles=self.handles),
-            relays=SimpleNamespace(
-                by_name={},
-                next_at=NEVER,
-                on_event=lambda *_: None,
-            ),
-            relay=None,
-            fleet=None,
+            peer_sockets=SimpleNamespace(budgets={}),
+            features=[],
             config=SimpleNamespace(fleet=None),
             journal=drops,
             evidence=SimpleNamespace(add_dropped=lambda *_: None),
         )
-        self.relays, self.node = parts.relays, node
+        self.node = node
         line = Line(
             cast("Switch", None),
             self.stall,
@@ -155,17 +150,18 @@ async def test_peer_with_one_path_has_no_order_and_one_without_a_link_no_frames(
     assert scene.dropped == [("frames_not_allowed", "alpha", 1)] * 2
 
 
-async def test_data_along_a_relay_is_unwrapped_or_dropped() -> None:
+async def test_data_along_a_relay_is_unwrapped_or_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
     """The core gets the inner datagram with the relayed path; without relays it gets, and drops, all."""
     scene = Scene()
-    scene.handles.assign("vps", AT_A, [7])
+    relays = Relays(cast("Node", scene.node), scene.line, Mock(), {}, {}, get_logger())
+    relays.handles.assign("vps", AT_A, [7])
     data = [wrap(7, ENVELOPE + b"rest"), wrap(8, ENVELOPE), RELAYED_START, ENVELOPE]
     scene.read(*data)
     assert scene.received == [(datagram, AT_A) for datagram in data]
     scene.received.clear()
-    scene.relays.by_name = {"vps": None}
+    scene.line.unwrap = relays.unwrap
     unknown: list[Path] = []
-    scene.relays.on_unknown_handle = lambda path, _: unknown.append(path)
+    monkeypatch.setattr(relays, "on_unknown_handle", lambda path, _: unknown.append(path))
     scene.read(*data)
     assert unknown == [AT_A]
     assert scene.received == [(ENVELOPE + b"rest", relayed(AT_A.socket, "vps", 7)), (ENVELOPE, AT_A)]

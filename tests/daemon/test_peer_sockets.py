@@ -30,6 +30,7 @@ from uavlinkd.io.reader import PAUSE_S
 from uavlinkd.io.sockets import BUFFER_BYTES, Presence
 from uavlinkd.protocol.path import Path, relayed
 from uavlinkd.protocol.relay_records import wrap
+from uavlinkd.relay.client_link import RelayHandles
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.resolver import LONGEST_WAIT_S, RELAXED_WAIT_S
 from uavlinkd.system.stall import StallWatch
@@ -87,8 +88,9 @@ def test_relayed_path_goes_to_the_relay_or_nowhere() -> None:
     sock = Refusing(errno.EPERM)
     sock.is_out = False
     sockets = sockets_with(sock, drops)
-    sockets.use_relays()
-    sockets.handles.assign("vps", Path(0, ("127.0.0.1", 9)), [7])
+    handles = RelayHandles()
+    sockets.use_relays(handles.wrap)
+    handles.assign("vps", Path(0, ("127.0.0.1", 9)), [7])
     sockets.send(b"inner", relayed(0, "vps", 7))
     sockets.send(b"inner", relayed(0, "vps", 8))
     assert sock.sent == [wrap(7, b"inner")]

@@ -136,7 +136,6 @@ PLACES: Final[Sequence[Place]] = (
     Place("observe/findings.py", "find"),
     Place("observe/drop_log.py", "DropLog.check"),
     # The relay, the disk, and requests.
-    Place("daemon/carrier.py", "FrameCarrier._unwrap"),
     Place("relay/forwarding.py", "Forwarding.take"),
     Place("authority/state_file.py", "write", trigger="bulletin"),
     Place("authority/state_file.py", "write", "return", trigger="bulletin"),

@@ -23,16 +23,17 @@ from uavlinkd.authority.trust import Trust
 from uavlinkd.config.build import TIMERS
 from uavlinkd.config.model import PeerAddress, PeerConfig, RelayConfig
 from uavlinkd.daemon.peer_link import PeerLink
+from uavlinkd.daemon.peer_sockets import Wrap
 from uavlinkd.protocol import constants as c
 from uavlinkd.protocol import outputs as o
 from uavlinkd.protocol.crypto import Entropy
 from uavlinkd.protocol.drops import DropReason
 from uavlinkd.protocol.path import RELAY_HOST, Path
 from uavlinkd.protocol.peer import Peer
-from uavlinkd.protocol.relay_records import Bind, CertificateRecord
+from uavlinkd.protocol.relay_records import RELAYED_START, Bind, CertificateRecord
 from uavlinkd.protocol.settings import Link, PeerSettings
 from uavlinkd.relay.bindings import QUARANTINED_PER_MEMBER
-from uavlinkd.relay.client_link import RELAYED_START, RelayHandles, RelayLink
+from uavlinkd.relay.client_link import RelayLink
 from uavlinkd.relay.clients import Relays
 from uavlinkd.relay.direct_search import OwnSocket
 from uavlinkd.relay.forwarding import MemberSettings, RelayLimits
@@ -192,11 +193,19 @@ class _Sockets:
     """What relays need of a daemon's sockets: each socket reaches each relay."""
 
     def __init__(self, member: Member) -> None:
-        self.handles = RelayHandles()
         self._member = member
+        self.arm = lambda: None
 
-    def use_relays(self) -> None:
+    def use_relays(self, wrap: Wrap) -> None:
         """As a daemon's."""
+
+    def perform(self, outputs: Iterable[o.Output]) -> None:
+        """As a daemon's line."""
+        self._member.perform(outputs)
+
+    def drop_datagram(self, reason: DropReason, name: str = "", path: Path | None = None) -> None:
+        """As a daemon's line."""
+        self._member.drops[reason] += 1
 
     def follow(self, relay: RelayLink) -> None:
         """Connect to a relay from every socket."""
@@ -246,7 +255,8 @@ class Member(Drone):
         now = self.local_now
         assert self.node is not None
         self.links = {}
-        relays = Relays(self.node, _Sockets(self), self.links, {}, _LOG)  # type: ignore[arg-type]
+        sockets = _Sockets(self)
+        relays = Relays(self.node, sockets, sockets, self.links, {}, _LOG)  # type: ignore[arg-type]
         self.relays = relays
         self.node.set_certificate(self.certificate)
         self._look()
@@ -300,6 +310,10 @@ class Member(Drone):
         wrapped = self.relays.handles.wrap(datagram, path)
         return None if wrapped is None else (wrapped[0], wrapped[1][:2])
 
+    def perform(self, outputs: Iterable[o.Output]) -> None:
+        """Execute outputs of its core."""
+        self._world.perform(self, list(outputs))
+
     def receive(self, datagram: bytes, path: Path) -> None:
         """Data from a relay comes along a relayed path."""
         assert self.relays is not None
@@ -343,7 +357,7 @@ class Member(Drone):
         now = max(self.local_now, self.next_deadline())
         self._perform_timeout(now)
         if now >= self.relays.next_at:
-            self._world.perform(self, self.relays.handle_timeout(now))
+            self.relays.do_due(now)
         if now >= self._housekeeping_at:
             self._housekeeping_at = now + HOUSEKEEPING_S
             self._look()

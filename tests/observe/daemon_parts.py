@@ -24,8 +24,6 @@ def parts_of(node: Node, links: Mapping[str, PeerLink], evidence: Evidence, rout
         absent_networks=dict,
         networks=SimpleNamespace(networks=[]),
         is_own=lambda address: False,
-        serial=SimpleNamespace(networks=[]),
-        web=SimpleNamespace(states=lambda addresses: {}),
     )
     config = SimpleNamespace(
         name="drone0",
@@ -42,8 +40,10 @@ def parts_of(node: Node, links: Mapping[str, PeerLink], evidence: Evidence, rout
         peer_sockets=sockets,
         evidence=evidence,
         journal=DaemonJournal(),
-        relays=SimpleNamespace(by_name={}),
+        relay_links={},
         relay=None,
+        serial=None,
+        tls=None,
         fleet=None,
         guard=SimpleNamespace(faults=Counter(), last_at=0.0),
         local=SimpleNamespace(endpoints=[]),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
@@ -32,7 +33,7 @@ class Member(Daemon):
     def __init__(self) -> None:
         super().__init__()
         self.link.set_paths([], 0.0)
-        self.relays: dict[str, RelayLink] = self.parts.relays.by_name
+        self.relays: dict[str, RelayLink] = self.parts.relay_links
         self.evidence.relays = self.relays
         self.sockets.unresolved = lambda name: set[str]()
 
@@ -77,7 +78,7 @@ URL = "wss://one:443/uavlink"
 
 def test_relay_that_does_not_answer_by_tls_either(member: Member) -> None:
     member.add_relay("one", FIRST)
-    member.parts.peer_sockets.web.states = lambda addresses: {URL: "ECONNREFUSED"}
+    member.parts.tls = SimpleNamespace(states=lambda addresses: {URL: "ECONNREFUSED"})
     finding = member.only()
     assert f": by TLS ({URL}) no process listens there now (ECONNREFUSED); by UDP it is off" in finding.text
     assert finding.remedy.startswith("start it, or correct the port; or run `uavlinkd status` at one")
@@ -97,7 +98,7 @@ def test_relay_with_a_url_alone(member: Member, state: str, text: str, remedy: s
     """The finding names why it is not reached by TLS, and says nothing about UDP."""
     relay = member.add_relay("one")
     relay.set_paths([Path(7, (URL, 0))], 0.0)
-    member.parts.peer_sockets.web.states = lambda addresses: {URL: state}
+    member.parts.tls = SimpleNamespace(states=lambda addresses: {URL: state})
     assert member.findings(LATER - 0.1) == {}
     finding = member.only()
     assert (finding.cause, finding.severity) == ("relay_not_answering", Severity.FAULT)

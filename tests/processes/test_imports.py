@@ -45,7 +45,7 @@ asyncio.SelectorEventLoop.add_signal_handler = refuse
 
 OF_TLS = (
     "websockets",
-    *(f"uavlinkd.tls.{module}" for module in ("channel", "connect", "listener", "stream")),
+    "uavlinkd.tls",
     "uavlinkd.io.send_window",
 )
 
@@ -78,11 +78,9 @@ NOT_CONFIGURED = (
         "starlette",
     ),
     *("uvicorn", "websockets", "cryptography.hazmat.primitives.serialization"),
-    *(f"uavlinkd.{room}" for room in ("fleet", "lab", "web")),
+    *(f"uavlinkd.{room}" for room in ("fleet", "lab", "relay", "serial", "tls", "web")),
     *(f"uavlinkd.authority.{module}" for module in ("enrolment", "exchange", "state_file", "trust")),
-    *(f"uavlinkd.relay.{module}" for module in ("bindings", "forwarding", "service")),
-    *(f"uavlinkd.tls.{module}" for module in ("channel", "connect", "listener", "newcomers", "stream")),
-    *(f"uavlinkd.{module}" for module in ("serial.line_framing", "serial.serial_line", "io.serial", "io.tcp")),
+    *(f"uavlinkd.io.{module}" for module in ("send_window", "serial", "tcp")),
 )
 """What a daemon with one peer and an endpoint of UDP does not need. ``pydantic_core`` is another package."""
 

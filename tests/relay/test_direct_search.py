@@ -231,7 +231,7 @@ def test_relay_that_ends_handles_renews_no_limit() -> None:
     peer, path = network.pair.a.peer, network.pair.a.peer_at
     link = SimpleNamespace(peer=peer, relayed=[path])
     links: dict[str, Any] = {"bravo": link}
-    relays = Relays(network.pair.a.node, Mock(spec=PeerSockets, handles=None), links, {}, get_logger())
+    relays = Relays(network.pair.a.node, Mock(), Mock(spec=PeerSockets), links, {}, get_logger())
     relays._looked_at, relays._own = math.inf, [OwnSocket(0, is_ipv6=True, places=(HOME_A,), leads_to=bool)]
     relays.do_housekeeping(0.0)
     assert relays.on_record(RecordReceived(peer, path, Candidates((HOME_B,)), 5), 0.0) is None

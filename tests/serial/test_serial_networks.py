@@ -36,7 +36,9 @@ def serial(tmp_path: FilePath, states: SocketStateLog) -> SerialNetworks:
     line = SerialUrl(str(tmp_path / "absent"), 57600)
     sik = NetworkConfig("sik", budget_bits_s=BITS_S, serial=line, air_bits_s=24_000)
     stall = StallWatch(monotonic(), lambda pause_s: None)
-    return SerialNetworks([sik], NUMBER, states, stall, structlog.get_logger())
+    serial = SerialNetworks([sik], states, stall, structlog.get_logger())
+    serial.open(lambda *_: NUMBER)
+    return serial
 
 
 async def test_change_is_due_at_once(
@@ -45,7 +47,7 @@ async def test_change_is_due_at_once(
     """The daemon sets its timer after the core knows: else the first try waits for the housekeeping, up to 1 s."""
     known = list[list[tuple[int, bool]]]()
     monkeypatch.setattr(SerialLine, "start", lambda line: None)
-    serial.start(lambda *read: None, lambda: known.append(list(states.states)))
+    serial.start(lambda *read: None, lambda: known.append(list(states.states)), lambda: None)
     (network,), is_open = serial.networks, [False]
     monkeypatch.setattr(SerialLine, "is_open", property(lambda line: is_open[0]))
     for is_open[0] in (True, False):
@@ -53,22 +55,22 @@ async def test_change_is_due_at_once(
     assert known == [[(NUMBER, True)], [(NUMBER, True), (NUMBER, False)]]
 
 
-async def test_this_end_backs_off_while_the_modem_reports_a_full_buffer(serial: SerialNetworks) -> None:
+async def test_this_end_backs_off_while_the_modem_reports_a_full_buffer(
+    serial: SerialNetworks, states: SocketStateLog
+) -> None:
     """Frames and their copies, for 2 s after a report. A modem that reports room again has its rate at once."""
-    now = monotonic()
-    budgets, decoder = serial.budgets(now), serial.networks[0].line.decoder
-    assert budgets[NUMBER].all.rate == BITS_S / 8
-    assert budgets[NUMBER].all.burst == pytest.approx(300, abs=5)
+    budget, decoder = serial.networks[0].budget, serial.networks[0].line.decoder
+    assert budget.all.rate == BITS_S / 8
+    assert budget.all.burst == pytest.approx(300, abs=5)
     full, room = (report(payload=struct.pack("<HHBBBBB", 0, 0, 200, 180, txbuf, 30, 40)) for txbuf in (19, 20))
     for reports, rate in ((b"", BITS_S), (full, BITS_S / 4), (b"", BITS_S / 4), (b"", BITS_S), (full, BITS_S / 4)):
         decoder.feed(reports)
         serial.do_housekeeping()
-        serial.follow_rates(budgets, now)
-        assert budgets[NUMBER].all.rate == rate / 8
-        assert budgets[NUMBER].copies.rate == rate / 16
+        assert budget.all.rate == rate / 8
+        assert budget.copies.rate == rate / 16
     decoder.feed(room)
     serial.do_housekeeping()
-    assert serial.follow_rates(budgets, now) == {NUMBER: BITS_S}
+    assert states.rates[-1] == {NUMBER: BITS_S}
     assert cast(Any, serial.networks[0].status()["serial"])["rate_bits_s"] == BITS_S
 
 
@@ -76,9 +78,7 @@ async def test_finding_about_noise(serial: SerialNetworks) -> None:
     """It names the baud rate, and ends when the noise stops."""
     decoder = serial.networks[0].line.decoder
     serial.do_housekeeping()
-    moment: Any = SimpleNamespace(
-        daemon=SimpleNamespace(peer_sockets=SimpleNamespace(serial=serial)), now=monotonic()
-    )
+    moment: Any = SimpleNamespace(daemon=SimpleNamespace(serial=serial), now=monotonic())
     assert [*line_noise(moment)] == []
     decoder.feed(report())
     decoder.feed(b"noise\0" * NOISE_PIECES)

@@ -42,7 +42,8 @@ class Port:
         self.journal = DaemonJournal()
         config = HttpsServer(Address("127.0.0.1", free_port()))
         stall = StallWatch(monotonic(), lambda seconds: None)
-        self.listener = WebListener(config, NUMBER, self.node, stall, self.journal)
+        self.listener = WebListener(config, self.node, stall, self.journal)
+        self.listener.open(lambda *_: NUMBER)
         self.received: list[tuple[bytes, SocketAddress]] = []
         self._clients: list[socket.socket] = []
 
@@ -51,7 +52,7 @@ class Port:
             assert (number, waited_s) == (NUMBER, 0.0)
             self.received += datagrams
 
-        self.listener.start(cast(Any, receive))
+        self.listener.start(cast(Any, receive), lambda: None, lambda: None)
 
     def prove(self, *addresses: SocketAddress) -> None:
         """A peer has answered along these, and is at another address too."""
@@ -359,8 +360,9 @@ class Exhausted:
 def test_certificate_that_vanished_is_a_problem_at_the_start(tmp_path: Any) -> None:
     """It was there when the file was read."""
     config = HttpsServer(Address("127.0.0.1", free_port()), tmp_path / "tls.crt", tmp_path / "tls.key")
+    listener = WebListener(config, SocketStateLog(), StallWatch(0.0, lambda _: None), DaemonJournal())
     with pytest.raises(BindError, match=r"relay_server\.https: certificate .* cannot be read"):
-        WebListener(config, 0, SocketStateLog(), StallWatch(0.0, lambda _: None), DaemonJournal())
+        listener.open(lambda *_: NUMBER)
 
 
 @pytest.mark.parametrize(

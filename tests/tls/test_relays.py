@@ -71,7 +71,7 @@ def relay(port: int = 443) -> tuple[WebRelay, Recorder]:
     log = Recorder()
     written = PeerAddress(Address("127.0.0.1", port, "/uavlink"))
     stall = StallWatch(monotonic(), lambda seconds: None)
-    return WebRelay(written, NUMBER, SocketStateLog(), stall, cast(Any, log)), log
+    return WebRelay(written, lambda *_: NUMBER, SocketStateLog(), stall, cast(Any, log)), log
 
 
 async def test_connection_that_carries_nothing_is_replaced(

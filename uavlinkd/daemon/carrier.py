@@ -11,6 +11,7 @@ from collections.abc import Callable, Hashable, Iterator
 from time import thread_time
 from typing import Final
 
+from uavlinkd.daemon.features import WaitingDatagram
 from uavlinkd.daemon.parts import DaemonParts
 from uavlinkd.daemon.peer_link import Carriage, PeerLink
 from uavlinkd.daemon.peers import Peers
@@ -21,11 +22,10 @@ from uavlinkd.protocol.constants import NEVER
 from uavlinkd.protocol.drops import DropReason
 from uavlinkd.protocol.node import PEERS_AT_ONCE
 from uavlinkd.protocol.outputs import Deliver, Output, Transmit
-from uavlinkd.protocol.path import Path, SocketAddress
-from uavlinkd.protocol.relay_records import Bind, FleetRecord
+from uavlinkd.protocol.path import Path
+from uavlinkd.protocol.relay_records import RELAYED_START
 from uavlinkd.protocol.timers import Schedule
 from uavlinkd.protocol.wire import ENVELOPE_STARTS
-from uavlinkd.relay.client_link import RELAYED_START, WaitingDatagram
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.guard import report, run
 
@@ -53,14 +53,11 @@ class FrameCarrier:
         self._links = parts.link_of
         self._line = line = parts.line
         self.perform = line.perform
-        line.on_output, line.on_several, line.unwrap = self._on_output, self._receive_several, self._unwrap
+        line.on_output, line.on_several = self._on_output, self._receive_several
         line.drop_held, line.arm = self._drop_held, self.arm
-        if parts.relay is not None:
-            line.on_read = self._settle_relay
-        self._sockets = parts.peer_sockets
         self._loop = asyncio.get_running_loop()
         self._waiting = Schedule[PeerLink]()
-        carriage = Carriage(parts.node, self.perform, self.settle, self._sockets.budgets, self._waiting)
+        carriage = Carriage(parts.node, self.perform, self.settle, parts.peer_sockets.budgets, self._waiting)
         self.peers = Peers(parts, carriage)
         self._turns = Turns()
         self._handshakes: dict[Hashable, WaitingDatagram] = {}  # that wait, the newest of each source
@@ -78,35 +75,13 @@ class FrameCarrier:
                 arrived.append((datagram, self._line.path_of(socket, address)))
                 continue
             try:
-                inside = self._unwrap(socket, datagram, address)
+                inside = self._line.unwrap(socket, datagram, address)
             except Exception as error:
                 report(error)
             else:
                 arrived += [] if inside is None else [inside]
         if arrived:
             self._receive_arrived(arrived, now, epoch)
-
-    def _settle_relay(self) -> None:
-        if (relay := self._parts.relay) is not None and relay.is_due:
-            run(relay.settle, monotonic())
-
-    def _unwrap(self, socket: int, data: bytes, source: SocketAddress) -> WaitingDatagram | None:
-        """The datagram inside one of a relay or a member, with its path; None if it is handled or dropped here."""
-        relays, relay = self._parts.relays, self._parts.relay
-        inside = self._sockets.handles.unwrap(socket, data, source) if relays.by_name else None
-        if isinstance(inside, tuple):
-            return inside
-        if relay is not None:
-            relay.forwarding.take(socket, data, source)
-            return None
-        path = Path(socket, source)
-        if inside is None:
-            return data, path  # the core drops it: this daemon has no relay
-        self._drop_datagram(inside, path=path)
-        if inside is DropReason.RELAY_UNKNOWN_HANDLE:
-            relays.on_unknown_handle(path, monotonic())
-            self.arm()
-        return None
 
     def _receive_arrived(self, arrived: list[WaitingDatagram], now: float, epoch: int) -> None:
         was_busy = self._is_busy
@@ -191,7 +166,8 @@ class FrameCarrier:
             self._line.is_busy = self._is_busy
             if self._is_busy:
                 self._loop.call_soon(self._do_turns)
-            self._settle_relay()
+            if self._line.on_read is not None:
+                self._line.on_read()
 
     def _do_turn(self, arriving: Iterator[WaitingDatagram], now: float, epoch: int) -> None:
         """Receive datagrams until there are no more, or the turn is over. Then forward their frames."""
@@ -233,40 +209,24 @@ class FrameCarrier:
         elif not isinstance(output, Deliver | Transmit):
             self._on_event(output)
 
-    def _drop_datagram(self, reason: DropReason, name: str = "", path: Path | None = None) -> None:
-        """Count a datagram that the core does not drop."""
-        self._node.drops[reason] += 1
-        fact = "" if path is None else ("", path)
-        self._parts.journal.add("datagrams_dropped", reason, name, 1, monotonic(), fact)
-
     def _on_record(self, received: o.RecordReceived) -> None:
-        relay, fleet = self._parts.relay, self._parts.fleet
-        if isinstance(received.record, FleetRecord):
-            reason = DropReason.UNEXPECTED_RECORD if fleet is None else fleet.on_record(received, monotonic())
-            self.arm()
-        elif not isinstance(received.record, Bind):
-            reason = self._parts.relays.on_record(received, monotonic())
-            self.arm()
-        elif relay is None:
-            reason = DropReason.UNEXPECTED_RECORD
-        else:
-            reason = relay.on_record(received, monotonic())
+        owners = (feature for feature in self._parts.features if isinstance(received.record, feature.records))
+        owner = next(owners, None)
+        reason = DropReason.UNEXPECTED_RECORD if owner is None else owner.on_record(received, monotonic())
         if reason is not None:
-            self._drop_datagram(reason, received.peer.name, received.path)
+            self._line.drop_datagram(reason, received.peer.name, received.path)
+        self.arm()
 
     def _on_event(self, event: o.Event) -> None:
         now, parts = monotonic(), self._parts
-        if parts.fleet is not None:
-            run(parts.fleet.on_event, event, now)
+        for feature in parts.features:
+            run(feature.on_event, event, now)
         if isinstance(event, o.PeerAdmitted | o.PeerExpired):  # no other part knows it yet
             return
         if self._handshakes and isinstance(event, o.SessionEstablished):  # its peer waits for no other answer
             for key in self._node.initiations_from(event.path):
                 if (waiting := self._handshakes.pop(key, None)) is not None:
                     self.perform((self._node.refuse(*waiting),))
-        if parts.relay is not None:
-            run(parts.relay.on_event, event, now)
-        run(parts.relays.on_event, event, now)
         link = self._links.get(event.peer)
         if link is not None and not isinstance(event, o.PathSuspected):
             run(parts.journal.write, event, now)
@@ -291,8 +251,8 @@ class FrameCarrier:
 
     def arm(self) -> None:
         """Set the one timer to the next deadline. It is moved only to an earlier time: firing too early is cheap."""
-        fleet_at = NEVER if self._parts.fleet is None else self._parts.fleet.next_at
-        deadline = min(self._node.next_deadline(), self._waiting.next_at, self._parts.relays.next_at, fleet_at)
+        of_features = (feature.next_at for feature in self._parts.features)
+        deadline = min(self._node.next_deadline(), self._waiting.next_at, *of_features)
         if deadline < self._line.timer_at:
             if self._timer is not None:
                 self._timer.cancel()
@@ -309,10 +269,9 @@ class FrameCarrier:
                 run(self._perform_of, self._node.handle_next, now)  # a fault costs one peer its timers
             for link in self._waiting.pop(now):
                 run(link.send_waiting, now)
-            if now >= self._parts.relays.next_at:
-                run(self._perform_of, self._parts.relays.handle_timeout, now)
-            if self._parts.fleet is not None and now >= self._parts.fleet.next_at:
-                run(self._parts.fleet.do_due, now)
+            for feature in self._parts.features:
+                if now >= feature.next_at:
+                    run(feature.do_due, now)
         finally:
             self._line.timer_at = NEVER
             self.arm()

@@ -14,6 +14,7 @@ from uavlinkd.config.changes import compare
 from uavlinkd.config.load import load_in_thread
 from uavlinkd.config.model import Config, ConfigError
 from uavlinkd.daemon.carrier import FrameCarrier
+from uavlinkd.daemon.features import Feature
 from uavlinkd.daemon.local_endpoints import PilotNotes
 from uavlinkd.daemon.parts import DaemonParts
 from uavlinkd.daemon.peer_link import radio_figures
@@ -24,7 +25,6 @@ from uavlinkd.ops import LOG_SCHEMA
 from uavlinkd.ops.control import ControlServer
 from uavlinkd.ops.log import shown
 from uavlinkd.ops.sdnotify import Supervisor
-from uavlinkd.relay.client_link import RelayLink
 from uavlinkd.system.base64_text import to_base64
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.guard import report, run
@@ -32,10 +32,9 @@ from uavlinkd.system.tasks import on_signal
 from uavlinkd.system.terminal import printable
 
 if TYPE_CHECKING:
-    from collections.abc import Hashable, Iterable
+    from collections.abc import Hashable
 
-    from uavlinkd.protocol.outputs import Output
-    from uavlinkd.relay.service import RelayService
+    from uavlinkd.relay.client_link import RelayLink
 
 HOUSEKEEPING_S = INTERVAL_S
 """How often links are measured, and idle clients forgotten."""
@@ -50,7 +49,7 @@ class Daemon:
     def __init__(self, config: Config) -> None:
         self.log = structlog.get_logger().bind(daemon=config.name)
         self._loop = asyncio.get_running_loop()
-        self.parts = DaemonParts(config, self.log, monotonic(), self._perform)
+        self.parts = DaemonParts(config, self.log, monotonic())
         self.observer = Observer(self.parts, self.log, monotonic())
         self.carrier = FrameCarrier(self.parts)
         self._notes = PilotNotes(self.parts.switch.router.addresses)
@@ -62,9 +61,6 @@ class Daemon:
         self._hangups: set[asyncio.Task[None]] = set()
         self._work: dict[Hashable, float] = {}
         self._is_stuck = False
-
-    def _perform(self, outputs: Iterable[Output]) -> None:
-        self.carrier.perform(outputs)
 
     # Life.
 
@@ -85,8 +81,8 @@ class Daemon:
         """Bind every socket, then start to read. Raises BindError or ControlError if one of them cannot be opened."""
         parts, config = self.parts, self.parts.config
         try:
-            relay = config.relay_server
-            parts.peer_sockets.open(config.listen, config.networks, relay.https if relay is not None else None)
+            networks = [network for network in config.networks if network.serial is None]
+            parts.peer_sockets.open(config.listen, networks, parts.path_kinds)
             parts.local.open(config.endpoints)
             if config.control_socket is not None:
                 self._control = ControlServer(config.control_socket, self.answer)
@@ -95,8 +91,7 @@ class Daemon:
             self._close_sockets()
             raise
         self.carrier.peers.start()
-        parts.peer_sockets.web.on_room = self.carrier.send_waiting
-        parts.peer_sockets.start(parts.line.receive, self.carrier.arm)
+        parts.peer_sockets.start(parts.line.receive, self.carrier.arm, self.carrier.send_waiting)
         parts.local.start()
         self._write_warnings()
         self.log.info(
@@ -129,7 +124,7 @@ class Daemon:
         problems = Counter[str]()
         for link in parts.links.values():
             problems.update({problem.value: count for problem, count in link.problems(now).items()})
-        counted = {**self.observer.close(), **+problems, **parts.peer_sockets.serial.totals}
+        counted = {**self.observer.close(), **+problems}
         self.log.info("daemon_stopped", uptime_s=round(now - parts.started_at, 1), counted=counted)
 
     def _close_sockets(self) -> None:
@@ -159,7 +154,7 @@ class Daemon:
                     return {"problems": str(error).splitlines()}
                 return {"problems": [], "name": parts.config.name}
             case ("netcheck", "", ""):
-                return {**netcheck(parts), "web": await parts.peer_sockets.web.probe()}
+                return {**netcheck(parts), "web": {} if parts.tls is None else await parts.tls.probe()}
             case ("bulletin", "", "") if parts.fleet is not None:
                 return {"bulletin": to_base64(parts.fleet.trust.bulletin_bytes)}
             case ("fleet", "", "") if parts.fleet is not None:
@@ -223,13 +218,10 @@ class Daemon:
         self._housekeeping = self._loop.call_later(HOUSEKEEPING_S, self._do_housekeeping)
         parts.stall.turn(now)
         self._feed_watchdog(now)
-        if parts.relay is not None:
-            run(self._do_housekeeping_of_relay, parts.relay, now)
-        sockets, links = parts.peer_sockets, list(parts.links.values())
-        run(sockets.do_housekeeping)
-        if rates := sockets.serial.follow_rates(sockets.budgets, now):
-            run(parts.node.set_rates, rates, now)
-        run(parts.relays.do_housekeeping, now)
+        run(parts.peer_sockets.do_housekeeping)
+        for feature in parts.features:
+            run(self._do_housekeeping_of, feature, now)
+        links = list(parts.links.values())
         for link in links:
             run(link.measure, now)
             run(link.report_refusals, now)
@@ -247,13 +239,10 @@ class Daemon:
         self._is_stuck = bool(stuck)
         self._supervisor.turn(self.carrier.peers.summary(), now, work_moves=not stuck)
 
-    def _do_housekeeping_of_relay(self, relay: RelayService, now: float) -> None:
-        parts = self.parts
-        if parts.fleet is not None:
-            relay.introductions.renew(parts.fleet.trust.held)
-        relay.do_housekeeping(now)
-        for reason, name, count in relay.count_drops():
-            parts.journal.add("datagrams_dropped", reason, name, count, now)
+    def _do_housekeeping_of(self, feature: Feature, now: float) -> None:
+        feature.do_housekeeping(now)
+        for reason, name, count in feature.count_drops():
+            self.parts.journal.add("datagrams_dropped", reason, name, count, now)
 
     def _report(self, now: float) -> None:
         """Report what is wrong. A fault here ends no process that carries frames."""
@@ -266,7 +255,7 @@ class Daemon:
 def netcheck(parts: DaemonParts) -> dict[str, object]:
     """Which addresses of each relay answer, and this daemon's public addresses as the relays see them."""
     return {
-        "relays": {name: _reach(parts, relay) for name, relay in parts.relays.by_name.items()},
+        "relays": {name: _reach(parts, relay) for name, relay in parts.relay_links.items()},
         "is_relay": parts.relay is not None,
     }
 

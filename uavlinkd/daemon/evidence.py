@@ -11,12 +11,11 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Final
 
-from uavlinkd.daemon.peer_link import PeerLink
+from uavlinkd.daemon.features import Reachable
 from uavlinkd.protocol.drops import Detail, DropReason
 from uavlinkd.protocol.outputs import Dropped
 from uavlinkd.protocol.path import RELAY_HOST, SocketAddress, relay_name, remote_of
 from uavlinkd.protocol.peer import Peer
-from uavlinkd.relay.client_link import RelayLink
 
 EVIDENCE_S: Final = 30.0
 """Evidence is forgotten after this time without more of it."""
@@ -73,7 +72,7 @@ class Evidence:
     """The latest evidence by kind and place. Times are monotonic seconds."""
 
     def __init__(
-        self, links: Mapping[str, PeerLink], own_key: bytes, relays: Mapping[str, RelayLink] = MappingProxyType({})
+        self, links: Mapping[str, Reachable], own_key: bytes, relays: Mapping[str, Reachable] = MappingProxyType({})
     ) -> None:
         self._links = links
         self.relays = relays
@@ -107,12 +106,12 @@ class Evidence:
         remote = None if address is None else remote_of(address)
         self._add(error, self._target(remote, now), remote, "", now)
 
-    def seen(self, kind: str, link: PeerLink, now: float) -> Sighting | None:
+    def seen(self, kind: str, link: Reachable, now: float) -> Sighting | None:
         """The newest evidence of this kind about a peer, or from its addresses or hosts."""
         places = [("peer", link.name), *_places_of(link)]
         return self._newest(kind, places, now)
 
-    def seen_at_relay(self, kind: str, relay: RelayLink, now: float) -> Sighting | None:
+    def seen_at_relay(self, kind: str, relay: Reachable, now: float) -> Sighting | None:
         """The newest evidence of this kind from an address of a relay."""
         return self._newest(kind, _addresses_of(relay.peer), now)
 
@@ -168,7 +167,7 @@ def _place_of(core_name: str) -> Place:
     return "peer", core_name
 
 
-def _places_of(link: PeerLink) -> list[Place]:
+def _places_of(link: Reachable) -> list[Place]:
     """The addresses of a peer, and the hosts of those in the configuration."""
     configured = [path.address for path in link.peer.paths.configured]
     hosts = [address[0] for address in configured if relay_name(address) is None]  # a relay leads to many peers

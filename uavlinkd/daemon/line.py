@@ -24,9 +24,9 @@ from uavlinkd.protocol.drops import DropReason
 from uavlinkd.protocol.node import Node
 from uavlinkd.protocol.outputs import Deliver, LinkedPeer, Output, Transmit
 from uavlinkd.protocol.path import Path, SocketAddress
+from uavlinkd.protocol.relay_records import RELAYED_START
 from uavlinkd.protocol.send import send_frames
 from uavlinkd.protocol.settings import Class
-from uavlinkd.relay.client_link import RELAYED_START
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.guard import report
 from uavlinkd.system.stall import STALL_S, StallWatch
@@ -78,6 +78,7 @@ class Line:
         self._schedule = node.schedule
         self._links = links
         self._sockets = sockets
+        self.unwrap = lambda socket, data, source: (data, self.path_of(socket, source))  # no relay is configured
         self._paths: dict[tuple[int, SocketAddress], Path] = {}
         self._frames: dict[PeerLink, list[Frame]] = {}  # delivered, but not forwarded yet
 
@@ -129,8 +130,7 @@ class Line:
                     peer, payload, order = output
                     link = self._links.get(peer)
                     if link is None:  # whatever a policy says
-                        self._node.drops[not_allowed := DropReason.FRAMES_NOT_ALLOWED] += 1
-                        self._drops.add("datagrams_dropped", not_allowed, peer.name, 1, monotonic(), "")
+                        self.drop_datagram(DropReason.FRAMES_NOT_ALLOWED, peer.name)
                         continue
                     # As split_payload, without one call.
                     frames: list[Frame] = []
@@ -164,6 +164,12 @@ class Line:
                         report(error)
         if self._schedule.next_at < self.timer_at:
             self.arm()
+
+    def drop_datagram(self, reason: DropReason, name: str = "", path: Path | None = None) -> None:
+        """Count a datagram that the core does not drop."""
+        self._node.drops[reason] += 1
+        fact = "" if path is None else ("", path)
+        self._drops.add("datagrams_dropped", reason, name, 1, monotonic(), fact)
 
     def forward(self, source: Port, frames: Sequence[Frame], now: float, epoch: int, waited_s: float = 0.0) -> None:
         """Send frames of ``source`` where they belong. A frame that a policy refuses is counted and dropped.

@@ -10,9 +10,8 @@ from typing import Final
 from structlog.typing import FilteringBoundLogger
 
 from uavlinkd.config.model import PeerAddress
-from uavlinkd.daemon.peer_link import PeerLink
+from uavlinkd.daemon.features import Reachable
 from uavlinkd.protocol.path import Path
-from uavlinkd.relay.client_link import RelayLink
 from uavlinkd.system.resolver import LONGEST_WAIT_S, RELAXED_WAIT_S, Resolved, keep_resolving, numeric
 from uavlinkd.system.tasks import keep_running
 
@@ -23,9 +22,7 @@ REFRESH_S: Final = 300.0
 class PeerNames:
     """The numeric addresses of ``link`` now. A look-up that fails leaves the last answer of that name."""
 
-    def __init__(
-        self, link: PeerLink | RelayLink, on_change: Callable[[PeerNames], None], log: FilteringBoundLogger
-    ) -> None:
+    def __init__(self, link: Reachable, on_change: Callable[[PeerNames], None], log: FilteringBoundLogger) -> None:
         self.link = link
         self.paths: dict[PeerAddress, Sequence[Path]] | None = None
         """The paths that the core knows, by address of the configuration; None before it knows any."""

@@ -1,4 +1,4 @@
-"""The UDP sockets for the peers, and the resolution of a peer's names to paths."""
+"""The sockets for the peers: those of UDP, and what other kinds of paths add. Peers' names become paths here."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ import asyncio
 import errno
 import socket
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from structlog.typing import FilteringBoundLogger
 
-from uavlinkd.config.model import HttpsServer, NetworkConfig, PeerAddress
+from uavlinkd.config.model import NetworkConfig, PeerAddress
 from uavlinkd.daemon.evidence import REPORTED, Evidence
+from uavlinkd.daemon.features import NetworkFacts, PathKind, Reachable, Sender
 from uavlinkd.daemon.journal import DaemonJournal, ShellReason
-from uavlinkd.daemon.networks import Network, NetworkBudget, Networks, Receive
-from uavlinkd.daemon.peer_link import PeerLink
+from uavlinkd.daemon.networks import NetworkBudget, Networks, Receive
 from uavlinkd.daemon.peer_names import PeerNames
 from uavlinkd.io.ports import failure_name
 from uavlinkd.io.reader import PAUSE_S, Reader
@@ -33,16 +33,11 @@ from uavlinkd.protocol.constants import IP_BYTES, MAX_ENVELOPE_LIMIT
 from uavlinkd.protocol.node import Node
 from uavlinkd.protocol.path import Path, SocketAddress, relay_name
 from uavlinkd.protocol.path_measures import limit_at
-from uavlinkd.relay.client_link import RelayHandles, RelayLink
-from uavlinkd.serial.serial_networks import SerialNetwork, SerialNetworks
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic
+from uavlinkd.system.guard import run
 from uavlinkd.system.resolver import Resolved
 from uavlinkd.system.stall import StallWatch
-from uavlinkd.tls.relays import WEB_NETWORK, WebRelay, WebRelays
-
-if TYPE_CHECKING:
-    from uavlinkd.tls.listener import WebListener
 
 _EPHEMERAL = (Address("0.0.0.0", 0), Address("::", 0))
 """Without a listen address the daemon only connects to peers, from any port."""
@@ -59,9 +54,8 @@ _NETWORK_CHANGED: Final = frozenset(
 )
 """Errors of a send that an interface without its address, or a removed one, causes."""
 
-
-Sender = Callable[[bytes, SocketAddress], object]
-"""Sends a datagram to an address. Raises OSError."""
+Wrap = Callable[[bytes, Path], tuple[bytes, SocketAddress] | None]
+"""Returns what is sent instead of a datagram along a relayed path, and where; None if the handle is gone."""
 
 
 def _send_nowhere(datagram: bytes, address: SocketAddress) -> int:
@@ -94,13 +88,6 @@ class PeerSockets:
         """The peers none of whose addresses is of a socket's family."""
         self.networks = Networks((), (), self.put, self.open_sockets, node, log)
         """Those of interfaces and addresses."""
-        self.serial = SerialNetworks((), 0, node, stall, log)
-        self.web = WebRelays(node, stall, log, self._add_web)
-        """Those of relays that are reached by TLS."""
-        self.listener: WebListener | None = None
-        """Where members reach this relay by TLS."""
-        self.handles = RelayHandles()
-        """Those that relays assigned to this daemon."""
         self.budgets: dict[int, NetworkBudget] = {}
         """Of networks that have one, by the number of the socket."""
         self.senders: list[Sender] = []
@@ -114,7 +101,9 @@ class PeerSockets:
         self._log = log
         self._node = node
         self._slots: list[_Slot] = []
-        self._uses_relays = False
+        self._kinds: list[PathKind] = []
+        self._envelope_limits: dict[int, int] = {}
+        self._wrap: Wrap | None = None
         self._is_started = False
         self._checked_at = 0.0
         self._on_change: Callable[[], None] = lambda: None
@@ -152,15 +141,15 @@ class PeerSockets:
         )
 
     def network_name(self, number: int) -> str | None:
-        """The network of a socket, or ``TLS``; None if the configuration names no networks."""
-        if self.web.has(number):
-            return WEB_NETWORK
-        network = self.serial.of_number.get(number) or self.networks.of_number.get(number)
-        return None if network is None else network.config.name
+        """What people see as the network of a socket; None if the configuration names no networks."""
+        network = self.networks.of_number.get(number)
+        names = (kind.network_name(number) for kind in self._kinds)
+        return next(filter(None, names), None) if network is None else network.config.name
 
     def way_of(self, path: Path) -> tuple[str | None, SocketAddress | None]:
         """The network of a path, and the relay's address if it is relayed and has a handle."""
-        return self.network_name(path.socket), self.handles.address_of(path)
+        wrapped = None if self._wrap is None else self._wrap(b"", path)
+        return self.network_name(path.socket), None if wrapped is None else wrapped[1]
 
     def absent_networks(self) -> dict[str, str]:
         """The networks that are absent now, each with the reason, and what a person can do."""
@@ -171,9 +160,10 @@ class PeerSockets:
         """Each network by name, as plain values."""
         return {network.config.name: network.status() for network in self._networks()}
 
-    def _networks(self) -> Iterator[Network | SerialNetwork]:
+    def _networks(self) -> Iterator[NetworkFacts]:
         yield from self.networks.networks
-        yield from self.serial.networks
+        for kind in self._kinds:
+            yield from kind.networks
 
     def unresolved(self, name: str) -> set[str]:
         """The host names of a peer that have no address now."""
@@ -183,15 +173,17 @@ class PeerSockets:
         self,
         addresses: Sequence[Address],
         networks: Sequence[NetworkConfig] = (),
-        https: HttpsServer | None = None,
+        kinds: Iterable[PathKind] = (),
     ) -> None:
         """Bind a socket to each address, or ephemeral ones without any; with networks, bind those of each network.
+
+        ``kinds``: those of paths beside UDP.
 
         Raises:
             BindError: if the daemon cannot listen on an address. The message names the key.
         """
-        if ip_networks := [network for network in networks if network.serial is None]:
-            self.networks = Networks(ip_networks, addresses, self.put, self.open_sockets, self._node, self._log)
+        if networks:
+            self.networks = Networks(networks, addresses, self.put, self.open_sockets, self._node, self._log)
             for one in self.networks.sockets.values():
                 self._slots.append(_Slot(one.number, one.family))
             self.networks.open(monotonic())
@@ -203,41 +195,42 @@ class PeerSockets:
                     raise BindError(f"listen: {error}") from None
                 self._slots.append(_Slot(number, sock.family))
                 self.put(number, sock)
-        lines = [network for network in networks if network.serial is not None]
-        self.serial = SerialNetworks(lines, len(self._slots), self._node, self._stall, self._log)
-        for line in self.serial.networks:
-            self._slots.append(_Slot(line.number, socket.AF_UNSPEC, line.send))
-        if https is not None:
-            from uavlinkd.tls.listener import WebListener  # noqa: PLC0415  only if configured
-
-            self.listener = WebListener(https, len(self._slots), self._node, self._stall, self._drops)
-            self._slots.append(_Slot(self.listener.number, socket.AF_UNSPEC, self.listener.send))
-        self._add_budgets(monotonic())
-
-    def _add_budgets(self, now: float) -> None:
-        """The sockets of a network share its budget."""
-        self.budgets.update(self.serial.budgets(now))
         for network in self.networks.networks:
-            if network.config.budget_bits_s:
-                budget = NetworkBudget(network.config.budget_bits_s, now)
+            if network.config.budget_bits_s:  # its sockets share it
+                budget = NetworkBudget(network.config.budget_bits_s, monotonic())
                 self.budgets.update({sock.number: budget for sock in network.sockets})
+        for kind in kinds:
+            kind.open(self._add_sender)
+            self._kinds.append(kind)
         budgets = {number: budget.bits_s for number, budget in self.budgets.items() if budget.bits_s}
         self._node.facts.set_budgets(budgets)
         limits = {number: limit_at(bits_s, IP_BYTES, MAX_ENVELOPE_LIMIT) for number, bits_s in budgets.items()}
-        limits |= {line.number: line.envelope_limit for line in self.serial.networks}
-        self._node.facts.envelope_limits = limits
+        self._node.facts.envelope_limits = limits | self._envelope_limits
         self._choose_senders()
 
-    def use_relays(self) -> None:
+    def _add_sender(
+        self, send: Sender, budget: NetworkBudget | None = None, envelope_limit: int | None = None
+    ) -> int:
+        """Reserve the next socket number for a path of another kind, and return it."""
+        number = len(self._slots)
+        self._slots.append(_Slot(number, socket.AF_UNSPEC, send))
+        if budget is not None:
+            self.budgets[number] = budget
+        if envelope_limit is not None:
+            self._envelope_limits[number] = envelope_limit
+        self._choose_senders()
+        return number
+
+    def use_relays(self, wrap: Wrap) -> None:
         """Paths may lead along relays from now on."""
-        self._uses_relays = True
+        self._wrap = wrap
         self._choose_senders()
 
     def _choose_senders(self) -> None:
         """A socket without a budget, and without relays, is called directly."""
         self.senders = [
             partial(self._send_charged, slot.number)
-            if self._uses_relays or slot.number in self.budgets
+            if self._wrap is not None or slot.number in self.budgets
             else slot.send
             for slot in self._slots
         ]
@@ -255,18 +248,24 @@ class PeerSockets:
         if self._is_started:
             self._read(slot)
 
-    def start(self, receive: Receive, on_change: Callable[[], None] = lambda: None) -> None:
-        """Start to read. ``on_change`` is called after the core got other paths, or other states of networks."""
+    def start(
+        self,
+        receive: Receive,
+        on_change: Callable[[], None] = lambda: None,
+        on_room: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Start to read. ``on_change`` is called after the core got other paths, or other states of networks.
+
+        ``on_room`` is called when frames that wait may leave.
+        """
         self._is_started = True
         self._receive, self._on_change = receive, on_change
         for slot in self._slots:
             self._read(slot)
-        self.serial.start(receive, on_change)
-        if self.listener is not None:
-            self.listener.start(receive, on_change)
-        self.web.start(receive, on_change)
-        for names in self._names.values():
-            self.web.follow(names.link.peer, names.link.config.addresses)
+        for kind in self._kinds:
+            kind.start(receive, on_change, on_room)
+            for names in self._names.values():
+                kind.follow(names.link)
         if self.networks.networks:
             self.check_networks()
 
@@ -285,9 +284,8 @@ class PeerSockets:
             if slot.reports is not None:
                 slot.reports.renew()
         self.check_networks()
-        self.serial.do_housekeeping()
-        if self.listener is not None:
-            self.listener.do_housekeeping()
+        for kind in self._kinds:
+            run(kind.do_housekeeping)
 
     def check_networks(self) -> None:
         """Open and close the sockets of the networks that changed, and resolve names again."""
@@ -302,19 +300,16 @@ class PeerSockets:
         """Close the sockets and stop resolving names."""
         for name in list(self._names):
             self.stop_following(name)
-        for line in self.serial.networks:
-            line.line.close()
-        self.web.close()
-        if self.listener is not None:
-            self.listener.close()
+        for kind in self._kinds:
+            kind.close()
         for slot in self._slots:
             self.put(slot.number, None)
 
     def send(self, datagram: bytes, path: Path) -> None:
         """Pass a datagram to the kernel. A relay forwards with it: no budget is charged."""
         address = path.address
-        if self._uses_relays and path.is_relayed:
-            if (wrapped := self.handles.wrap(datagram, path)) is None:
+        if self._wrap is not None and path.is_relayed:
+            if (wrapped := self._wrap(datagram, path)) is None:
                 self._drops.add("sends_failed", ShellReason.RELAY_HANDLE_GONE, "", 1, monotonic())
                 self.failures[ShellReason.RELAY_HANDLE_GONE] += 1
                 return
@@ -367,19 +362,18 @@ class PeerSockets:
         self._drops.add("sends_failed", name, "", 1, monotonic())
         self._evidence.add_error(name, address, monotonic())
 
-    def follow(self, link: PeerLink | RelayLink) -> None:
+    def follow(self, link: Reachable) -> None:
         """Resolve the peer's names, and connect to it at their addresses from every socket that may reach them."""
         names = self._names[link.name] = PeerNames(link, self._set_paths, self._log)
         self._set_paths(names)
         if self._is_started:
-            self.web.follow(link.peer, link.config.addresses)
+            for kind in self._kinds:
+                kind.follow(link)
 
-    def _add_web(self, make: Callable[[int], WebRelay]) -> WebRelay:
-        web = make(len(self._slots))
-        self._slots.append(_Slot(web.number, socket.AF_UNSPEC, web.send))
-        self.budgets[web.number] = web.budget
-        self._choose_senders()
-        return web
+    def follow_links(self, links: Iterable[Reachable]) -> None:
+        """These are all peers of the daemon from now on."""
+        for kind in self._kinds:
+            kind.follow_links(links)
 
     def _set_paths(self, names: PeerNames) -> None:
         link = names.link
@@ -404,19 +398,12 @@ class PeerSockets:
     def report_absent(self, now: float) -> None:
         """Report the sockets of absent networks to the core. Call it after other paths were set."""
         self.networks.report_absent(now)
-        for line in self.serial.networks:
-            line.report_state()
-        self.web.report_state()
+        for kind in self._kinds:
+            kind.report_state()
 
     def _paths_to(self, written: PeerAddress, resolved: Resolved) -> Iterator[Path]:
         """The paths to an address of a peer."""
-        if written.is_serial:
-            if (path := self.serial.path_to(written.network)) is not None:
-                yield path
-            return
-        if written.address.resource:
-            yield self.web.path_to(written)
-            return
+        yield from filter(None, (kind.path_to(written) for kind in self._kinds))
         for family, sockaddr in resolved:
             for number in (slot.number for slot in self._slots if slot.family == family):
                 if written.network in ("", self.network_name(number)) and self.networks.may_reach(number, sockaddr):
@@ -427,4 +414,5 @@ class PeerSockets:
         self.without_socket.discard(name)
         if (names := self._names.pop(name, None)) is not None:
             names.stop()
-            self.web.unfollow(names.link.config.addresses)
+            for kind in self._kinds:
+                kind.unfollow(names.link)

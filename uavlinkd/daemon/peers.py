@@ -25,8 +25,10 @@ class Peers:
             from uavlinkd.fleet.members import FleetMembers  # noqa: PLC0415  only if configured
             from uavlinkd.fleet.shell import FleetShell  # noqa: PLC0415  only if configured
 
+            assert parts.relays is not None, "a fleet may use relays"
             known = parts.node, parts.links, parts.relays, parts.relay, parts.evidence
             parts.fleet = FleetMembers(parts.config, fleet, FleetShell(*known, self, carriage.perform))
+            parts.features.insert(0, parts.fleet)
 
     def start(self) -> None:
         """Add all that the configuration has."""
@@ -107,8 +109,9 @@ class Peers:
     def _add_relays(self) -> None:
         """Use those of the configuration that are missing. Call it after the peers are there: a relay may be one."""
         parts = self._parts
-        missing = [config for config in parts.config.relays if config.name not in parts.relays.by_name]
-        if accepted := [config for config in missing if self._is_accepted(config.settings)]:
+        missing = [config for config in parts.config.relays if config.name not in parts.relay_links]
+        accepted = [config for config in missing if self._is_accepted(config.settings)]
+        if parts.relays is not None and accepted:
             for config in accepted:
                 parts.relays.add(config, monotonic())
             parts.relays.follow_links(monotonic())
@@ -135,8 +138,9 @@ class Peers:
         parts = self._parts
         parts.link_of.clear()
         parts.link_of.update((link.peer, link) for link in parts.links.values())
-        parts.node.facts.set_point_to_point(parts.peer_sockets.serial.peer_at(parts.links.values()))
-        parts.relays.follow_links(monotonic())
+        parts.peer_sockets.follow_links(parts.links.values())
+        for feature in parts.features:
+            feature.follow_links(monotonic())
 
     def _follow_members(self) -> None:
         """The configuration, or the peers of the core, have changed."""

@@ -6,8 +6,8 @@ from collections import deque
 from collections.abc import Hashable, Iterator
 from typing import Final
 
+from uavlinkd.daemon.features import WaitingDatagram
 from uavlinkd.protocol.path import Path
-from uavlinkd.relay.client_link import WaitingDatagram
 
 STARTS_OF_A_FRAME: Final = 4
 """So many start bytes in payloads cost as much as a frame: each may begin a hidden one

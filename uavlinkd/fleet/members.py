@@ -18,6 +18,7 @@ from uavlinkd.authority.state_file import FleetState
 from uavlinkd.authority.trust import BulletinVerdict, Trust, longest_down
 from uavlinkd.config.members import member_peer, most_members, relay_member, reserved
 from uavlinkd.config.model import Config, FleetConfig, PeerConfig
+from uavlinkd.daemon.features import Feature
 from uavlinkd.fleet.disk import FleetDisk
 from uavlinkd.fleet.member_questions import MemberQuestions
 from uavlinkd.fleet.shell import FleetShell
@@ -37,11 +38,13 @@ EVENT_S: Final = 600.0
 """An event of bulletins is shown for so long, or until a newer bulletin counts."""
 
 
-class FleetMembers:
+class FleetMembers(Feature):
     """Certificates, bulletins and introductions of one daemon. Times are monotonic seconds.
 
     Look at :attr:`next_at` after each call.
     """
+
+    records = FleetRecord
 
     def __init__(self, config: Config, fleet: FleetConfig, daemon: FleetShell) -> None:
         self.config = fleet
@@ -75,6 +78,11 @@ class FleetMembers:
         """When :meth:`do_due` has something to do."""
         ask_at = max(self._questions.next_at, self._settled_at)  # earlier, the answer would be refused
         return min(self.exchange.next_at, ask_at if self._has_required else c.NEVER, self._disk.again_at)
+
+    def do_housekeeping(self, now: float) -> None:
+        """The relay of this daemon introduces members with the certificates that are held now."""
+        if self._relay is not None:
+            self._relay.introductions.renew(self.trust.held)
 
     def do_due(self, now: float) -> None:
         """Send what is due. Call it at :attr:`next_at`."""

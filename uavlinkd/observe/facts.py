@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 from collections.abc import Iterable, Mapping
 from functools import cached_property
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from uavlinkd.config.keys import encode_key
 from uavlinkd.config.model import EndpointConfig
@@ -18,8 +18,10 @@ from uavlinkd.observe.history import History
 from uavlinkd.ops.log import shown
 from uavlinkd.protocol.drops import Detail, DropReason
 from uavlinkd.protocol.path import Path, SocketAddress
-from uavlinkd.relay.client_link import RelayLink
 from uavlinkd.system.error_meanings import meaning_of
+
+if TYPE_CHECKING:
+    from uavlinkd.relay.client_link import RelayLink
 
 Fields = dict[str, Any]
 """The values of a finding that its sentences name."""
@@ -87,7 +89,7 @@ class Moment:
     @cached_property
     def silent_relays(self) -> list[RelayLink]:
         """The relays that do not answer, while no fact of this machine is known to be the reason."""
-        return [relay for relay in self.daemon.relays.by_name.values() if self._is_silent(relay)]
+        return [relay for relay in self.daemon.relay_links.values() if self._is_silent(relay)]
 
     def _is_silent(self, relay: RelayLink) -> bool:
         is_over = not relay.peer.is_up and self.now - relay.silent_since >= NOT_ANSWERING_S
@@ -145,7 +147,7 @@ class PeerFacts(PartFacts):
     @cached_property
     def relay_problems(self) -> list[tuple[str, RelayLink]]:
         """What is wrong with each relay of a peer that has no other path, while none of them is bound for it."""
-        by_name = self.daemon.relays.by_name
+        by_name = self.daemon.relay_links
         relays = [by_name[name] for name in self.link.config.relays if name in by_name]
         if any(relay.peer.is_up and relay.state_for(self.link) == "bound" for relay in relays):
             return []

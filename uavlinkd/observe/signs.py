@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from uavlinkd.config.keys import encode_key
 from uavlinkd.daemon.evidence import ELSEWHERE, EVIDENCE_S, REPORTED, Sighting
@@ -23,8 +23,10 @@ from uavlinkd.protocol.drops import Detail, DropReason
 from uavlinkd.protocol.path import RELAY_HOST, SocketAddress
 from uavlinkd.protocol.peer import Peer
 from uavlinkd.protocol.sessions import Twin
-from uavlinkd.relay.client_link import RelayLink
 from uavlinkd.system.error_meanings import CONNECTED, meaning_of, web_problem
+
+if TYPE_CHECKING:
+    from uavlinkd.relay.client_link import RelayLink
 
 SECURITY_S: Final = 600.0
 """A finding about an attack stays for this time after the last evidence."""
@@ -135,7 +137,7 @@ def _port(port: Port) -> str:
 
 
 def line_noise(moment: Moment) -> Signs:
-    for network in moment.daemon.peer_sockets.serial.networks:
+    for network in () if moment.daemon.serial is None else moment.daemon.serial.networks:
         if (noise := network.recent_noise) is not None:
             damaged, whole = noise
             yield {
@@ -257,7 +259,7 @@ def _silent_relay(moment: Moment, relay: RelayLink) -> Fields:
         why = f"{shown(error[1].address)}: {meaning_of(error[0]).partition(':')[0]} ({error[0]}, ICMP)"
     elif relay.peer.received_at is not None:
         why = "it did before, so it is off, or UDP to it or back is blocked"
-    states = moment.daemon.peer_sockets.web.states(relay.config.addresses)
+    states = {} if (tls := moment.daemon.tls) is None else tls.states(relay.config.addresses)
     problems = {url: web_problem("silent" if state == CONNECTED else state) for url, state in states.items()}
     reasons = [f"by TLS ({url}) {what}" for url, (what, _) in problems.items()]
     reasons += [f"by UDP {why}" if problems else why] if hosts_of(relay) else []
@@ -392,7 +394,7 @@ def no_answer(peer: PeerFacts) -> Signs:
     """A silent peer that has a configured place, or was up before."""
     config, was_up = peer.link.config, peer.link.peer.received_at is not None
     if peer.link.is_overdue(peer.now) and (was_up or config.addresses or config.relays):
-        bound = [name for name, relay in peer.daemon.relays.by_name.items() if relay.state_for(peer.link) == "bound"]
+        bound = [name for name, relay in peer.daemon.relay_links.items() if relay.state_for(peer.link) == "bound"]
         via = f" through the {titled('relay', bound[0])}, which answers" if bound else ""
         more = ", or it has a bulletin that revokes this daemon (`uavlinkd fleet list` shows whether)"
         yield {

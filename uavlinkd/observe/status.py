@@ -28,11 +28,11 @@ from uavlinkd.ops.log import shown
 from uavlinkd.protocol.path import Path, SocketAddress, relay_name
 from uavlinkd.protocol.path_state import PathState
 from uavlinkd.protocol.peer import Peer
-from uavlinkd.relay.client_link import RelayLink
 from uavlinkd.system.addresses import Address
 
 if TYPE_CHECKING:
     from uavlinkd.fleet.members import FleetMembers
+    from uavlinkd.relay.client_link import RelayLink
     from uavlinkd.relay.service import RelayMember, RelayService
 
 WayOf = Callable[[Path], tuple[str | None, SocketAddress | None]]
@@ -99,7 +99,7 @@ def _status(
             name: (peer_status if name in detailed else _few_facts)(link, now, daemon.peer_sockets.way_of)
             for name, link in daemon.links.items()
         },
-        "relays": {name: used_relay_status(relay, daemon, now) for name, relay in daemon.relays.by_name.items()},
+        "relays": {name: used_relay_status(relay, daemon, now) for name, relay in daemon.relay_links.items()},
         "fleet": None if daemon.fleet is None else fleet_status(daemon.fleet, daemon.links, now),
         "networks": daemon.peer_sockets.network_status(),
         "endpoints": {
@@ -116,7 +116,7 @@ def _status(
         else {
             "members": {one.settings.name: _member_status(relay, one, now) for one in relay.members.values()},
             "connections": relay.bindings.connections,
-            "https": None if (listener := daemon.peer_sockets.listener) is None else listener.status(),
+            "https": None if (listener := daemon.listener) is None else listener.status(),
             "dropped": _counts(relay.forwarding.dropped),
         },
     }
@@ -256,7 +256,7 @@ def used_relay_status(relay: RelayLink, daemon: DaemonParts, now: float) -> dict
         "peer": relay.config.peer,
         "public_key": encode_key(peer.settings.public_key),
         "addresses": [str(written) for written in relay.config.addresses],
-        "tls": daemon.peer_sockets.web.states(relay.config.addresses),
+        "tls": {} if daemon.tls is None else daemon.tls.states(relay.config.addresses),
         "seen_as": [str(seen) for _, seen in relay.views()],
         "last_received_s": _age(peer.received_at, now),
         "handshake_s": _age(peer.established_at, now),

@@ -171,6 +171,8 @@ def bounds_of(host: str, port: int, handles: Mapping[bytes, Sequence[int]]) -> I
 # Data along a relay.
 
 RELAYED = 0x50
+RELAYED_START = bytes((RELAYED,))
+RELAYED_HEADER_BYTES = 3
 _RELAYED_HEADER = struct.Struct(">BH")
 INNER_STARTS = frozenset((1, 2, 3, 0x40, 0x41))
 """First bytes of handshake messages, cookie replies and envelopes: what may be inside."""

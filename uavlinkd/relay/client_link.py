@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from uavlinkd.config.model import RelayConfig
+from uavlinkd.daemon.features import WaitingDatagram
 from uavlinkd.daemon.peer_link import PeerLink, Rates, silent_since
 from uavlinkd.protocol import constants as c
 from uavlinkd.protocol import outputs as o
@@ -19,14 +20,17 @@ from uavlinkd.protocol.drops import DropReason
 from uavlinkd.protocol.node import Node
 from uavlinkd.protocol.path import Path, SocketAddress, relayed
 from uavlinkd.protocol.path_state import PathState
-from uavlinkd.protocol.relay_records import RELAYED, WAITING, Bind, Bound, binds_of, handle_of, wrap
+from uavlinkd.protocol.relay_records import (
+    RELAYED_HEADER_BYTES,
+    WAITING,
+    Bind,
+    Bound,
+    binds_of,
+    handle_of,
+    wrap,
+)
 from uavlinkd.system.addresses import Address
 
-WaitingDatagram = tuple[bytes, Path]
-"""A datagram and the path on which it arrived."""
-
-RELAYED_START: Final = bytes((RELAYED,))
-_HEADER_BYTES: Final = 3
 BIND_SOON_S: Final = 0.1
 """The first bind is repeated after this: it may have come before the relay validated the path. Each further wait is
 twice as long, up to ``BIND_RETRY_S``. On a slow path, or to a relay that is busy, after two round trips."""
@@ -63,18 +67,13 @@ class RelayHandles:
         if kept:
             self._assigned[relay, at] = kept
 
-    def address_of(self, path: Path) -> SocketAddress | None:
-        """The relay's address along a relayed path. None if its handle is gone, or it is another path."""
-        known = self._outward.get(path)
-        return None if known is None else known[0]
-
     def unwrap(self, socket: int, data: bytes, source: SocketAddress) -> WaitingDatagram | DropReason:
-        """The datagram in data that begins with :data:`RELAYED_START`, and its relayed path; or why it is dropped."""
+        """The datagram in :data:`.RELAYED_START` data, and its relayed path; or why it is dropped."""
         handle = handle_of(data)
         if not handle:
             return DropReason.RELAY_MALFORMED
         path = self._inward.get((socket, source, handle))
-        return DropReason.RELAY_UNKNOWN_HANDLE if path is None else (data[_HEADER_BYTES:], path)
+        return DropReason.RELAY_UNKNOWN_HANDLE if path is None else (data[RELAYED_HEADER_BYTES:], path)
 
     def wrap(self, datagram: bytes, path: Path) -> tuple[bytes, SocketAddress] | None:
         """What is sent instead of a datagram along a relayed path, and where. None if its handle is gone."""

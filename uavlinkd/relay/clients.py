@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import zip_longest
 from typing import Final
 
 from structlog.typing import FilteringBoundLogger
 
 from uavlinkd.config.model import RelayConfig
+from uavlinkd.daemon.features import Feature, FeatureHost, WaitingDatagram
 from uavlinkd.daemon.peer_link import PeerLink
 from uavlinkd.daemon.peer_sockets import PeerSockets
 from uavlinkd.ops.line_limits import LineLimits
@@ -17,10 +18,11 @@ from uavlinkd.protocol.constants import NEVER
 from uavlinkd.protocol.drops import DropReason
 from uavlinkd.protocol.node import Node
 from uavlinkd.protocol.outputs import LinkedPeer, Output
-from uavlinkd.protocol.path import RELAY_HOST, Path
-from uavlinkd.protocol.relay_records import Candidates
-from uavlinkd.relay.client_link import RelayLink
+from uavlinkd.protocol.path import RELAY_HOST, Path, SocketAddress
+from uavlinkd.protocol.relay_records import Bound, Candidates
+from uavlinkd.relay.client_link import RelayHandles, RelayLink
 from uavlinkd.relay.direct_search import DirectSearch, OwnSocket, Place, own_sockets, places_of
+from uavlinkd.system.clock import monotonic
 from uavlinkd.system.guard import report
 
 SILENT_S: Final = 0.5
@@ -61,20 +63,27 @@ class _Silence:
         return True
 
 
-class Relays:
+class Relays(Feature):
     """All relays, ``by_name``. Look at :attr:`next_at` after each call."""
+
+    records = (Bound, Candidates)
 
     def __init__(
         self,
         node: Node,
+        host: FeatureHost,
         sockets: PeerSockets,
         links: Mapping[str, PeerLink],
         by_name: dict[str, RelayLink],
         log: FilteringBoundLogger,
     ) -> None:
         self.by_name = by_name
-        self.handles = sockets.handles
+        self.handles = RelayHandles()
+        """Those that relays assigned to this daemon."""
+        self.forward: Callable[[int, bytes, SocketAddress], None] | None = None
+        """Forwards data that is not of one of these relays, if this daemon is one itself."""
         self._node = node
+        self._host = host
         self._sockets = sockets
         self._links = links
         self._log = log
@@ -103,7 +112,7 @@ class Relays:
         link = None if config.peer is None else self._links[config.peer]
         relay = RelayLink(config, self._node, self.handles, self._on_handles, now, link)
         self.by_name[config.name] = relay
-        self._sockets.use_relays()
+        self._sockets.use_relays(self.handles.wrap)
         if link is None:
             self._sockets.follow(relay)
 
@@ -124,18 +133,16 @@ class Relays:
 
     # Time and events.
 
-    def handle_timeout(self, now: float) -> list[Output]:
+    def do_due(self, now: float) -> None:
         """Ask relays, bind peers, name candidates and ask those of peers. Call it at :attr:`next_at`."""
         if now >= self._look_at:
             self._look(now)
-        out: list[Output] = []
-        for part in self._parts():
+        for part in list(self._parts()):
             if now >= part.next_at:
                 try:
-                    out += part.do_due(now)
+                    self._host.perform(part.do_due(now))
                 except Exception as error:  # of one relay or search
                     report(error)
-        return out
 
     def on_event(self, event: o.Event, now: float) -> None:
         """An event of a relay, or of any other peer."""
@@ -147,6 +154,21 @@ class Relays:
                 search.on_event(event, now)
         elif (relay := self._relay_of(event.path)) is not None:  # ask it on the same socket, bind the peer again
             relay.ask(event.path)
+
+    def unwrap(self, socket: int, data: bytes, source: SocketAddress) -> WaitingDatagram | None:
+        """The datagram inside one of a relay or a member, with its path; None if it is handled or dropped here."""
+        inside = self.handles.unwrap(socket, data, source)
+        if isinstance(inside, tuple):
+            return inside
+        if self.forward is not None:
+            self.forward(socket, data, source)
+            return None
+        path = Path(socket, source)
+        self._host.drop_datagram(inside, path=path)
+        if inside is DropReason.RELAY_UNKNOWN_HANDLE:
+            self.on_unknown_handle(path, monotonic())
+            self._host.arm()
+        return None
 
     def on_unknown_handle(self, path: Path, now: float) -> None:
         """Data with a handle that is not known here came along a path, perhaps that of a relay."""

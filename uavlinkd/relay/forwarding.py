@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from uavlinkd.protocol.drops import DropReason, Reason
 from uavlinkd.protocol.path import Path, SocketAddress
-from uavlinkd.protocol.relay_records import INNER_STARTS, RELAYED
+from uavlinkd.protocol.relay_records import INNER_STARTS, RELAYED_HEADER_BYTES, RELAYED_START
 from uavlinkd.protocol.settings import PeerSettings
 from uavlinkd.relay.bindings import ConnectionEnd, MemberConnection
 
@@ -21,8 +21,6 @@ BURST_S = 0.3
 such a pause of the relay, or of the member: what it sent meanwhile comes at once."""
 BURST_BYTES = 1500
 """A member may send at least one datagram of this length at once."""
-_START = bytes((RELAYED,))
-_HEADER_BYTES = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,21 +110,21 @@ class Forwarding:
     def open(self, connection: MemberConnection, meters: tuple[Meter, Meter]) -> None:
         """Forward along a connection. ``meters``: those of its two members."""
         for sender, receiver, meter in zip(connection, connection[::-1], meters, strict=True):
-            self._routes[_key(sender)] = _Route(_START + _bytes(receiver.handle), receiver.path, meter)
+            self._routes[_key(sender)] = _Route(RELAYED_START + _bytes(receiver.handle), receiver.path, meter)
 
     def close(self, connection: MemberConnection) -> None:
         """Forward along a connection no more."""
         for sender, receiver in (connection, connection[::-1]):
             route = self._routes.get(_key(sender))
             # At an address that two members have had, one handle may have belonged to both.
-            if route is not None and route[:2] == (_START + _bytes(receiver.handle), receiver.path):
+            if route is not None and route[:2] == (RELAYED_START + _bytes(receiver.handle), receiver.path):
                 del self._routes[_key(sender)]
 
     def take(self, socket: int, data: bytes, source: SocketAddress) -> None:
         """Forward data that begins with 0x50, or drop it."""
         size = len(data)
-        route = self._routes.get((socket, source, data[1:_HEADER_BYTES]))
-        if size <= _HEADER_BYTES or data[_HEADER_BYTES] not in INNER_STARTS:
+        route = self._routes.get((socket, source, data[1:RELAYED_HEADER_BYTES]))
+        if size <= RELAYED_HEADER_BYTES or data[RELAYED_HEADER_BYTES] not in INNER_STARTS:
             self.dropped[DropReason.RELAY_MALFORMED] += 1
         elif route is None:
             self.dropped[DropReason.RELAY_UNKNOWN_HANDLE] += 1
@@ -138,7 +136,7 @@ class Forwarding:
         else:
             meter.datagrams += 1
             meter.bytes += size
-            self._send(route.header + data[_HEADER_BYTES:], route.path)
+            self._send(route.header + data[RELAYED_HEADER_BYTES:], route.path)
 
 
 def _key(end: ConnectionEnd) -> _Key:

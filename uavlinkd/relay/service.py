@@ -10,6 +10,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from uavlinkd.authority.trust import HeldCertificate
+from uavlinkd.daemon.features import Feature
 from uavlinkd.protocol import constants as c
 from uavlinkd.protocol import outputs as o
 from uavlinkd.protocol.crypto import Entropy
@@ -23,6 +24,7 @@ from uavlinkd.protocol.relay_records import Bind, Who, bounds_of
 from uavlinkd.relay.bindings import Bindings, Changes
 from uavlinkd.relay.forwarding import Forwarding, MemberSettings, Meter, RelayLimits, RelayReason
 from uavlinkd.relay.introductions import Introductions
+from uavlinkd.system.guard import run
 
 BINDS_PER_S = 32  # Binds of one member a second, each of up to 16 keys. Each may cause reports to other members.
 BINDS_BURST = 256  # So many at once, after a quiet while: a ground station with 1,000 vehicles, along four paths.
@@ -71,8 +73,10 @@ class RelayShell:
     on_event: Callable[[o.Event, float], None]  # receives the events of the members that are not peers
 
 
-class RelayService:
+class RelayService(Feature):
     """The members of a relay."""
+
+    records = (Bind,)
 
     def __init__(self, node: Node, limits: RelayLimits, shell: RelayShell) -> None:
         self._node = node
@@ -244,6 +248,11 @@ class RelayService:
     def is_due(self) -> bool:
         """Whether :meth:`settle` may have something to do."""
         return bool(self._due or self._asked or self._questions or self.introductions.is_due)
+
+    def on_read(self) -> None:
+        """Datagrams were read: settle what they caused."""
+        if self.is_due:
+            run(self.settle, self._shell.clock())
 
     def settle(self, now: float) -> None:
         """Bind along paths that are validated now, and send the members changes and certificates."""

@@ -7,22 +7,22 @@ carries.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Final
 
 from structlog.typing import FilteringBoundLogger
 
-from uavlinkd.config.model import NetworkConfig
+from uavlinkd.config.model import NetworkConfig, PeerAddress
+from uavlinkd.daemon.features import AddSender, PathKind, Reachable
 from uavlinkd.daemon.networks import NetworkBudget, NetworkLog, Receive, network_status
-from uavlinkd.daemon.peer_link import PeerLink
 from uavlinkd.io.sockets import Presence
 from uavlinkd.ops.line_limits import LineLimits
 from uavlinkd.protocol.constants import LINE_BYTES
 from uavlinkd.protocol.node import Node
 from uavlinkd.protocol.path import SERIAL_HOST, Path, SocketAddress
 from uavlinkd.protocol.path_measures import limit_at
-from uavlinkd.protocol.peer import Peer
+from uavlinkd.serial.serial_line import SerialLine
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.error_meanings import meaning_of
 from uavlinkd.system.stall import StallWatch
@@ -43,13 +43,17 @@ BACKED_OFF: Final = 0.25
 class SerialNetwork:
     """One serial network."""
 
-    def __init__(self, config: NetworkConfig, number: int, states: Node, stall: StallWatch, log: NetworkLog) -> None:
+    def __init__(
+        self, config: NetworkConfig, add: AddSender, states: Node, stall: StallWatch, log: NetworkLog
+    ) -> None:
         assert config.serial is not None, "a serial network has a device"
         self.config = config
         self.name = config.name
-        self.number = number
-        self.path = Path(number, (SERIAL_HOST, 0))
-        self.envelope_limit = limit_at(config.budget_bits_s)
+        envelope_limit = limit_at(config.budget_bits_s)
+        # A bucket holds one envelope, so that a modem never gets more at once.
+        self.budget = NetworkBudget(config.budget_bits_s, monotonic(), envelope_limit + LINE_BYTES)
+        self.number = add(self.send, self.budget, envelope_limit)
+        self.path = Path(self.number, (SERIAL_HOST, 0))
         self._receive: Receive = lambda *_: None
         self._states = states
         self._log = log
@@ -57,9 +61,6 @@ class SerialNetwork:
         self._full_s = 0
         """For so many seconds more the modem's send buffer counts as full."""
         self._seconds = deque[tuple[int, int, int]](maxlen=RECENT_S + 1)  # totals, one for each second
-        # Imported only if configured: a daemon on UDP starts faster and stays smaller.
-        from uavlinkd.serial.serial_line import SerialLine  # noqa: PLC0415
-
         self.line = SerialLine(
             config.name,
             config.serial,
@@ -153,66 +154,63 @@ class SerialNetwork:
         return network_status(self.config, self.presence, (), serial)
 
 
-class SerialNetworks:
+class SerialNetworks(PathKind):
     """All serial networks, by the numbers that follow those of the UDP sockets."""
 
     def __init__(
-        self,
-        configs: Iterable[NetworkConfig],
-        first_number: int,
-        states: Node,
-        stall: StallWatch,
-        log: FilteringBoundLogger,
+        self, configs: Iterable[NetworkConfig], states: Node, stall: StallWatch, log: FilteringBoundLogger
     ) -> None:
+        self.networks: list[SerialNetwork] = []
+        self._configs = configs
+        self._states = states
+        self._stall = stall
+        self._log = log
+
+    def open(self, add: AddSender) -> None:
+        """Reserve the numbers. The devices are opened later, whenever they are present."""
         limits = LineLimits()
-        self.networks = [
-            SerialNetwork(config, first_number + place, states, stall, NetworkLog(config.name, limits, log))
-            for place, config in enumerate(configs)
-        ]
-        self.of_number = {network.number: network for network in self.networks}
+        for config in self._configs:
+            log = NetworkLog(config.name, limits, self._log)
+            self.networks.append(SerialNetwork(config, add, self._states, self._stall, log))
 
-    def path_to(self, name: str) -> Path | None:
-        """The path along the serial network of this name."""
-        return next((network.path for network in self.networks if network.name == name), None)
-
-    def peer_at(self, links: Iterable[PeerLink]) -> dict[int, Peer | None]:
-        """The peer of the core at the other end of each line; None during a change."""
-        peers = {
-            written.network: link.peer for link in links for written in link.config.addresses if written.is_serial
-        }
-        return {network.number: peers.get(network.name) for network in self.networks}
-
-    def start(self, receive: Receive, on_change: Callable[[], None]) -> None:
-        """Open the devices, whenever they are present. ``on_change``: see :meth:`SerialNetwork.start`."""
+    def start(self, receive: Receive, on_change: Callable[[], None], on_room: Callable[[], None]) -> None:
+        """Open the devices. ``on_change``: see :meth:`SerialNetwork.start`."""
         for network in self.networks:
             network.start(receive, on_change)
 
-    def budgets(self, now: float) -> dict[int, NetworkBudget]:
-        """By the number of the socket. A bucket holds one envelope, so that a modem never gets more at once."""
-        return {
-            line.number: NetworkBudget(line.config.budget_bits_s, now, line.envelope_limit + LINE_BYTES)
-            for line in self.networks
+    def path_to(self, written: PeerAddress) -> Path | None:
+        """The path along the serial network that the address names."""
+        name = written.network if written.is_serial else None
+        return next((network.path for network in self.networks if network.name == name), None)
+
+    def network_name(self, number: int) -> str | None:
+        """The name of the serial network with this number."""
+        return next((network.name for network in self.networks if network.number == number), None)
+
+    def follow_links(self, links: Iterable[Reachable]) -> None:
+        """Report to the core which peer is at the other end of each line; None during a change."""
+        peers = {
+            written.network: link.peer for link in links for written in link.config.addresses if written.is_serial
         }
+        ends = {network.number: peers.get(network.name) for network in self.networks}
+        self._states.facts.set_point_to_point(ends)
 
-    def follow_rates(self, budgets: Mapping[int, NetworkBudget], now: float) -> dict[int, float]:
-        """Adapt the budgets to what the modems report. Call it once a second.
-
-        Returns the rates for the core, by the number of the socket, if one of them has changed.
-        """
-        has_changed = False
-        for line in self.networks:
-            budget, bits_s = budgets[line.number], line.rate_bits_s
-            budget.set_rate(bits_s, now)
-            has_changed |= budget.update_core(bits_s)
-        return {line.number: budgets[line.number].core_bits_s for line in self.networks} if has_changed else {}
+    def report_state(self) -> None:
+        """Report the devices that are not open."""
+        for network in self.networks:
+            network.report_state()
 
     def do_housekeeping(self) -> None:
-        """Note what the lines received. Call it once a second."""
+        """Note what the lines received, and adapt the budgets to what the modems report."""
+        now, has_changed = monotonic(), False
         for network in self.networks:
             network.do_housekeeping()
+            network.budget.set_rate(network.rate_bits_s, now)
+            has_changed |= network.budget.update_core(network.rate_bits_s)
+        if has_changed:
+            self._states.set_rates({network.number: network.budget.core_bits_s for network in self.networks}, now)
 
-    @property
-    def totals(self) -> dict[str, int]:
-        """The number of damaged pieces since the start, by its name in the log. Without such pieces: empty."""
-        noise = sum(network.line.decoder.line_noise for network in self.networks)
-        return {"line_noise": noise} if noise else {}
+    def close(self) -> None:
+        """Close the devices."""
+        for network in self.networks:
+            network.line.close()

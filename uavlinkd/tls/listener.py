@@ -22,6 +22,7 @@ from typing import Final
 
 from uavlinkd.config.model import HttpsServer
 from uavlinkd.config.tls_files import TlsFileError, load_tls
+from uavlinkd.daemon.features import AddSender, PathKind
 from uavlinkd.daemon.journal import DaemonJournal
 from uavlinkd.daemon.networks import Receive
 from uavlinkd.io.ports import failure_name
@@ -106,17 +107,18 @@ class _Connection:
         self._listener.on_lost(self, reason)
 
 
-class WebListener:
+class WebListener(PathKind):
     """``number``: that of the socket, for the core."""
 
-    def __init__(self, config: HttpsServer, number: int, node: Node, stall: StallWatch, drops: DaemonJournal) -> None:
-        """Listen. Raises BindError if the address or the certificate cannot be used."""
-        self.number = number
+    number: int
+
+    def __init__(self, config: HttpsServer, node: Node, stall: StallWatch, drops: DaemonJournal) -> None:
+        self._config = config
         self.refused = Counter[str]()
         """Connections that were not accepted, or ended before a member proved them, by reason."""
         self.lost = Counter[str]()
         """Connections of members that ended, by reason."""
-        self._tls = _tls_of(config)
+        self._tls: TlsFactory | None = None
         self._node = node
         self._stall = stall
         self._drops = drops
@@ -129,24 +131,29 @@ class WebListener:
         self._dropped = 0  # datagrams, of connections that ended
         self._accepted = TokenBucket(ACCEPTED_S, ACCEPTED_AT_ONCE, monotonic())
         self._handshakes = TokenBucket(HANDSHAKES_S, HANDSHAKES_AT_ONCE, monotonic())
-        self._newcomers = Newcomers(is_tls=self._tls is not None, refuse=self._refuse, on_ready=self._welcome)
         self._welcoming: asyncio.TimerHandle | None = None  # newcomers that are ready wait for tokens
         self._looked_at = 0.0
         self._resume: asyncio.TimerHandle | None = None
+
+    def open(self, add: AddSender) -> None:
+        """Listen. Raises BindError if the address or the certificate cannot be used."""
+        self._tls = _tls_of(self._config)
+        self._newcomers = Newcomers(is_tls=self._tls is not None, refuse=self._refuse, on_ready=self._welcome)
         try:
-            self._sock = tcp_listener(config.listen)
+            self._sock = tcp_listener(self._config.listen)
         except BindError as error:
             raise BindError(f"relay_server.https: {error}") from None
         self._sock.listen(_BACKLOG)
-        self._backlog = Backlog(stall, self._sock.fileno(), lambda: _BACKLOG + 1)
+        self._backlog = Backlog(self._stall, self._sock.fileno(), lambda: _BACKLOG + 1)
         _raise_file_limit()
-        node.facts.add_stream(number)
+        self.number = add(self.send)
+        self._node.facts.add_stream(self.number)
 
     @property
     def address(self) -> Address:
         return Address(*self._sock.getsockname()[:2])
 
-    def start(self, receive: Receive, on_change: Callable[[], None] = lambda: None) -> None:
+    def start(self, receive: Receive, on_change: Callable[[], None], on_room: Callable[[], None]) -> None:
         """Accept connections. ``on_change`` is called after the core lost a path."""
         self._receive, self._on_change = receive, on_change
         self._watch()

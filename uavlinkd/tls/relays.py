@@ -12,11 +12,12 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from math import inf
 from random import SystemRandom
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from structlog.typing import FilteringBoundLogger
 
 from uavlinkd.config.model import PeerAddress
+from uavlinkd.daemon.features import AddSender, PathKind, Reachable
 from uavlinkd.daemon.networks import NetworkBudget, Receive
 from uavlinkd.io.ports import failure_name
 from uavlinkd.mavlink.egress.bucket import Bucket
@@ -29,9 +30,8 @@ from uavlinkd.system.clock import monotonic
 from uavlinkd.system.error_meanings import CONNECTED
 from uavlinkd.system.stall import StallWatch
 from uavlinkd.system.tasks import keep_running
-
-if TYPE_CHECKING:
-    from uavlinkd.tls.stream import WebStream
+from uavlinkd.tls.connect import Connector
+from uavlinkd.tls.stream import WebStream
 
 WEB_NETWORK: Final = "TLS"
 """What people see as the network of a connection."""
@@ -102,18 +102,15 @@ class WebRelay:
     def __init__(
         self,
         written: PeerAddress,
-        number: int,
+        add: AddSender,
         node: Node,
         stall: StallWatch,
         log: FilteringBoundLogger,
         on_room: Callable[[], None] = lambda: None,
     ) -> None:
-        from uavlinkd.tls.connect import Connector  # noqa: PLC0415  only if configured
-
         self.written = written
-        self.number = number
-        self.path = Path(number, (str(written), 0))
-        self.budget = WebBudget(self._room)
+        self.number = add(self.send, WebBudget(self._room))
+        self.path = Path(self.number, (str(written), 0))
         self._connector = Connector(written.address.host, written.address.port, self.path.host, stall)
         self._error = ""
         self._node = node
@@ -132,7 +129,7 @@ class WebRelay:
         self._spread = 1.0
         self._unanswered = 0  # connections since the relay answered along one
         self._answer_by = self._answered_at = monotonic()
-        node.facts.add_stream(number)
+        node.facts.add_stream(self.number)
 
     @property
     def state(self) -> str:
@@ -302,56 +299,56 @@ class WebRelay:
             self._on_change()
 
 
-class WebRelays:
-    """All URLs of relays. ``add`` makes one with the number of a new socket, which it keeps while the daemon runs."""
+class WebRelays(PathKind):
+    """All URLs of relays. Each keeps the number of its socket while the daemon runs."""
 
-    def __init__(
-        self,
-        node: Node,
-        stall: StallWatch,
-        log: FilteringBoundLogger,
-        add: Callable[[Callable[[int], WebRelay]], WebRelay],
-    ) -> None:
+    def __init__(self, node: Node, stall: StallWatch, log: FilteringBoundLogger) -> None:
         self._relays: dict[PeerAddress, WebRelay] = {}
-        self._add = add
-        self._shell = node, stall, log, lambda: self.on_room()  # noqa: PLW0108  it is set later
-        self.on_room: Callable[[], None] = lambda: None
-        """Called when a connection takes frames again."""
-        self._receive: Receive = lambda *_: None
-        self._on_change: Callable[[], None] = lambda: None
+        self._shell = node, stall, log
+        self._add: AddSender
+        self._receive: Receive
+        self._on_change: Callable[[], None]
+        self._on_room: Callable[[], None]
 
-    def path_to(self, written: PeerAddress) -> Path:
+    def open(self, add: AddSender) -> None:
+        """Reserve the numbers with ``add``, later."""
+        self._add = add
+
+    def start(self, receive: Receive, on_change: Callable[[], None], on_room: Callable[[], None]) -> None:
+        """Where datagrams go from now on."""
+        self._receive, self._on_change, self._on_room = receive, on_change, on_room
+
+    def path_to(self, written: PeerAddress) -> Path | None:
         """The path to a URL."""
+        if not written.address.resource:
+            return None
         if written not in self._relays:
-            self._relays[written] = self._add(lambda number: WebRelay(written, number, *self._shell))
+            self._relays[written] = WebRelay(written, self._add, *self._shell, lambda: self._on_room())  # noqa: PLW0108  it is set later
         return self._relays[written].path
 
-    def has(self, number: int) -> bool:
-        """Whether a socket is one of these."""
-        return any(relay.number == number for relay in self._relays.values())
+    def network_name(self, number: int) -> str | None:
+        """``TLS`` for all of them."""
+        return WEB_NETWORK if any(relay.number == number for relay in self._relays.values()) else None
 
-    def start(self, receive: Receive, on_change: Callable[[], None]) -> None:
-        """Where datagrams go from now on. ``on_change`` is called after the core got another state of a path."""
-        self._receive, self._on_change = receive, on_change
-
-    def follow(self, peer: Peer, addresses: Iterable[PeerAddress]) -> None:
-        """Connect to these URLs of a relay, whenever it does not answer by UDP."""
-        addresses = list(addresses)
+    def follow(self, link: Reachable) -> None:
+        """Connect to the URLs of a relay, whenever it does not answer by UDP."""
+        addresses = link.config.addresses
         has_udp = any(not (written.address.resource or written.is_serial) for written in addresses)
         for relay in self._of(addresses):
-            relay.start(peer, self._receive, self._on_change, has_udp=has_udp)
+            relay.start(link.peer, self._receive, self._on_change, has_udp=has_udp)
 
-    def unfollow(self, addresses: Iterable[PeerAddress]) -> None:
-        """Do not connect to these any more."""
-        for relay in self._of(addresses):
+    def unfollow(self, link: Reachable) -> None:
+        """Do not connect to them any more."""
+        for relay in self._of(link.config.addresses):
             relay.stop()
 
     def close(self) -> None:
         """End all connections."""
-        self.unfollow(self._relays)
+        for relay in self._relays.values():
+            relay.stop()
 
     def report_state(self) -> None:
-        """Tell the core which connections there are. Call it after other paths were set."""
+        """Tell the core which connections there are."""
         for relay in self._relays.values():
             relay.report_state()
 
