@@ -12,7 +12,6 @@ from typing import Any
 from tests.compose import images
 from tests.compose.cluster import run, until
 from tests.fleet.vehicles import create
-from uavlinkd.fleet.manifest import FleetSettings
 from uavlinkd.ops.control import ControlError, ask
 from uavlinkd.system.addresses import Address
 
@@ -46,11 +45,16 @@ class Containers:
         self._logs = ""
 
     async def open(self) -> None:
-        settings = FleetSettings(
-            swarm=True, control_socket="/run/uavlinkd/control.sock", ground_station_url="udpin:127.0.0.1:14550"
-        )
         fleet = self._folder / "fleet"
-        create(fleet, settings, drones=3, stations=1, at=[Address("ground-station", 5790)])
+        create(
+            fleet,
+            drones=3,
+            stations=1,
+            at=[Address("ground-station", 5790)],
+            swarm=True,
+            urls={"stations": "udpin:127.0.0.1:14550"},
+            socket="/run/uavlinkd/control.sock",
+        )
         for path in (fleet, *fleet.rglob("*")):
             os.chown(path, USER, USER)
         for path in (fleet, *fleet.parents):

@@ -91,7 +91,7 @@ _AT_TOP_ROWS = [
     ("relay = true", "relay", "in [routing]"),
     ("tag_bits = 96", "tag_bits", "in [link] or in a [[peer]]"),
     (f'private_key = "{KEY["b"]}"', "private_key", "this file never contains a key"),
-    ('previous_private_key_file = "a.key"', "previous_private_key_file", "`uavlinkd fleet rotate NAME` writes"),
+    ('previous_private_key_file = "a.key"', "previous_private_key_file", "`uavlinkd enroll NAME` there makes"),
 ]
 _URLS, _SECOND = "endpoint[1].url (gcs)", "endpoint[0] (autopilot)"
 _PREVIOUS, _PSK = f'previous_public_key = "{KEY["vps"]}"', 'psk_file = "pair.psk"'

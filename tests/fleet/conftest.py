@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Callable
 
+import cryptography.hazmat.primitives.serialization  # noqa: F401  a module without a specification stays loaded
 import pytest
 
 from uavlinkd.cli import main

@@ -12,15 +12,15 @@ from pathlib import Path
 
 import pytest
 
-from tests.fleet.vehicles import create
+from tests.fleet.vehicles import create, join
 from tests.waiting import PATIENCE_S
+from uavlinkd.authority.certificates import MemberRole
 from uavlinkd.authority.enrolment import FleetError
 from uavlinkd.cli import main
 from uavlinkd.config.keys import KeyFileError
 from uavlinkd.fleet import operations
 from uavlinkd.fleet.authority_key import (
     AUTHORITY_FILE,
-    SUCCESSOR_FILE,
     load_key,
     paper_copy,
     passphrase_from,
@@ -32,7 +32,7 @@ from uavlinkd.protocol.crypto import Secret
 from uavlinkd.system.addresses import Address
 
 PASSPHRASE = "correct horse battery staple"
-INIT = ["fleet", "init", "--relay", "relay.example.org:5790"]
+INIT = ["fleet", "init"]
 
 
 @pytest.fixture
@@ -46,21 +46,19 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_passphrase_from_a_file(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """It opens both keys, and is in no output. A wrong one does not."""
+    """It opens the key, and is in no output. A wrong one does not."""
     assert main([*INIT, "--passphrase-file", str(file)]) == 0
     ask = passphrase_from(file)
-    private, successor = (load_key(Path("fleet", name), ask) for name in (AUTHORITY_FILE, SUCCESSOR_FILE))
-    assert private != successor
-    assert "for a later version. After a theft, create a new fleet." in capsys.readouterr().out
-    assert main(["fleet", "paper", "--passphrase-file", str(file)]) == 0
-    assert read_paper(capsys.readouterr().out) == private
-    assert main(["fleet", "add", "v7", "--passphrase-file", str(file)]) == 0
     assert PASSPHRASE not in "".join(capsys.readouterr())
+    assert main(["fleet", "paper", "--passphrase-file", str(file)]) == 0
+    said = capsys.readouterr()
+    assert read_paper(said.out) == load_key(Path("fleet", AUTHORITY_FILE), ask)
+    assert PASSPHRASE not in "".join(said)
     file.write_text("")
-    assert main(["fleet", "add", "v8", "--passphrase-file", str(file)]) == 2
+    assert main(["fleet", "paper", "--passphrase-file", str(file)]) == 2
     assert capsys.readouterr().err == f"{file} is empty: it must be that of fleet/authority.pem\n"
     file.write_text("wrong\n")
-    assert main(["fleet", "add", "v8", "--passphrase-file", str(file)]) == 1
+    assert main(["fleet", "paper", "--passphrase-file", str(file)]) == 1
     error = capsys.readouterr().err
     for part in (
         "fleet/authority.pem cannot be used",
@@ -98,10 +96,10 @@ def test_no_terminal_to_type_on(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_key_without_a_passphrase_is_named(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """For tests and demonstrations; the successor's has none either."""
+    """For tests and demonstrations."""
     assert main([*INIT, "--no-passphrase"]) == 0
     assert "has no passphrase: each copy of it can sign" in capsys.readouterr().err
-    assert main(["fleet", "add", "v7"]) == 0
+    assert main(["fleet", "paper"]) == 0
 
 
 @pytest.mark.long
@@ -121,8 +119,9 @@ def test_passphrase_typed_twice_on_a_terminal(tmp_path: Path) -> None:
         operations.restore(tmp_path / "fleet", private, None)
     (tmp_path / "fleet" / AUTHORITY_FILE).unlink()
     operations.restore(tmp_path / "fleet", private, None)
-    operations.add(tmp_path / "fleet", "v7", Identity(), passphrase_from(None))
-    assert read_manifest(tmp_path / "fleet").member("v7").ids == "1"
+    station = Identity(MemberRole.OPERATOR, None, (Address("10.13.0.254", 5790),))
+    join(tmp_path / "fleet", "gs", station)
+    assert read_manifest(tmp_path / "fleet").member("gs").ids == "255"
 
 
 def on_terminal(folder: Path, answers: tuple[str, ...], early: str) -> str:

@@ -133,10 +133,9 @@ class Terminal(io.StringIO):
 def test_former_key_that_cannot_be_deleted_is_an_error(
     place: Path, say: Say, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It names the file, and no file changes."""
+    """It names the file. The configuration has the new key already; the same line once more deletes the old one."""
     enrolled(say, "v7")
     line = say("fleet sign --replace v7", say("enroll v7"))
-    before = {path: path.read_bytes() for path in place.glob("v7*")}
     unlink = Path.unlink
 
     def refuse(path: Path, missing_ok: bool = False) -> None:
@@ -144,9 +143,12 @@ def test_former_key_that_cannot_be_deleted_is_an_error(
             raise PermissionError(1, "Operation not permitted", str(path))
         unlink(path, missing_ok)
 
-    monkeypatch.setattr(Path, "unlink", refuse)
-    assert say("enroll --finish", line) == "refused: v7.key: Operation not permitted\n"
-    assert {path: path.read_bytes() for path in place.glob("v7*")} == before
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", refuse)
+        assert say("enroll --finish", line) == "refused: v7.key: Operation not permitted\n"
+    assert load_config(place / "v7.toml", {}).public_key == read_manifest(place / "fleet").member("v7").public_key
+    assert "The former key, v7.key, was deleted." in say("enroll --finish", line)
+    assert [path.name for path in place.glob("v7*.key")] == ["v7.2.key"]
     assert not list(place.glob(".*"))
 
 
@@ -186,7 +188,8 @@ def test_lines_that_cannot_be_used_are_refused(
     assert "has the certificate of another key, named v8" in say("enroll --finish --config v7.toml", of_v8)
     assert "the line is of fleet" in say("enroll --finish", foreign)
     assert "is the request" in say("enroll --finish", say("enroll v7"))
-    (place / "v7.next.key").unlink()
+    assert "not a range" in say("fleet sign --ids 7-x", say("enroll v7"))
+    (place / "v7.2.key").unlink()
     assert "copy it again" in say("fleet sign", "uavlink-enroll-1 v7")
     assert "`uavlinkd enroll NAME`" in say("enroll")
     assert "options of `uavlinkd enroll --finish`" in say("enroll v9 --url udpin:127.0.0.1:14999")
@@ -229,14 +232,17 @@ def test_members_are_listed(place: Path, say: Say) -> None:
     assert 'has no "v8"' in say("fleet sign v8")
 
 
-def test_folder_for_a_card(place: Path, say: Say) -> None:
-    """`add` and `rotate` make the key, for those who carry folders."""
-    assert "Carry each" in say("fleet add v7 --id 7")
-    assert "scout" in say("fleet add scout --role observer")
-    assert "Now publish" in say("fleet rotate v7")
-    fleet = read_manifest(place / "fleet")
-    assert [(member.name, member.role) for member in fleet.current[1:]] == [
-        ("scout", MemberRole.OBSERVER),
-        ("v7", MemberRole.VEHICLE),
-    ]
-    assert "not a range" in say("fleet add v9 --ids 7-x")
+def test_files_of_a_service(place: Path, say: Say) -> None:
+    """Keys are in a folder of their own, which is made; the control socket is where the unit has it, or as said."""
+    options = "--config etc/v7.toml --keys etc/v7"
+    enrolled_line = say("fleet sign", say(f"enroll v7 {options}"))
+    say(f"enroll --finish {options}", enrolled_line)
+    table = tomllib.loads((place / "etc/v7.toml").read_text())
+    assert table["control_socket"] == "/run/uavlinkd/v7/control.sock"
+    assert ((place / "etc/v7").stat().st_mode & 0o777, [*(place / "etc/v7").iterdir()]) == (
+        0o700,
+        [place / "etc/v7/v7.key"],
+    )
+    enrolled(say, "v8", finish="--control-socket /run/v8.sock --url udpin:127.0.0.1:14999")
+    table = tomllib.loads((place / "v8.toml").read_text())
+    assert (table["control_socket"], table["endpoint"][0]["url"]) == ("/run/v8.sock", "udpin:127.0.0.1:14999")

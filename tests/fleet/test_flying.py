@@ -8,10 +8,9 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from tests.fleet.vehicles import NAMES, RELAY, Vehicles, flying, unasked
+from tests.fleet.vehicles import NAMES, RELAY, Vehicles, flying, join, renew, unasked
 from tests.waiting import until
 from uavlinkd.fleet import operations
-from uavlinkd.fleet.signing import Identity
 from uavlinkd.lab.sim.loopback_ports import free_port
 
 pytestmark = pytest.mark.long
@@ -46,7 +45,7 @@ async def test_revoked_member_is_cut_off(vehicles: Vehicles) -> None:
 
 async def test_key_is_replaced(vehicles: Vehicles) -> None:
     """The member that has the new key is linked; the files of others stay as they are."""
-    operations.add(vehicles.fleet, "drone1", Identity(), unasked, replaces=True)
+    join(vehicles.fleet, "drone1", replaces=True)
     await published(vehicles)
     vehicles.carry("drone1")
     await vehicles.stop("drone1")
@@ -55,10 +54,11 @@ async def test_key_is_replaced(vehicles: Vehicles) -> None:
 
 
 async def test_all_are_signed_again(vehicles: Vehicles) -> None:
-    """Each gets its new certificate from the relay, and no link ends. A file gets the relay's for its next start."""
+    """Each gets its new certificate from the relay, and no link ends. A line has the relay's for the next start."""
     operations.revoke(vehicles.fleet, "drone2", unasked, resign=True)
     await published(vehicles)
     await until(lambda: vehicles.up("drone1") == {"drone3"} and "drone2" not in vehicles.up(RELAY))
+    renew(vehicles.fleet, "drone1")
     vehicles.carry("drone1")
     await vehicles.stop("drone1")
     await vehicles.start("drone1")

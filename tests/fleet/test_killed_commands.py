@@ -83,7 +83,7 @@ def check(folder: Path) -> None:
     serials = [member.certificate.serial for member in fleet.members]
     assert len(set(serials)) == len(serials)
     assert max(serials) < fleet.next_serial
-    assert serials_in_files(folder) <= set(serials)
+    assert {serial for serial in serials_in_files(folder) if serial >= fleet.bulletin.least} <= set(serials)
     names = [member.name for member in fleet.current]
     assert len(set(names)) == len(names)
     assert not [path for path in folder.rglob(".*") if path.name.endswith((".new", ".old")) or path.is_dir()]
@@ -92,9 +92,6 @@ def check(folder: Path) -> None:
 PAPER = "paper"
 COMMANDS: list[tuple[str, list[str], str]] = [
     # The command; those before it, each of which reads the line of the one before; and what it reads.
-    ("fleet add v9 --id 9", [], ""),
-    ("fleet add r2 --role relay --address relay2.example.org:5790", [], ""),
-    ("fleet rotate drone1", [], ""),
     ("fleet revoke drone1", [], ""),
     ("fleet revoke drone1 --resign", [], ""),
     ("fleet sign --id 7", ["enroll v7"], "line"),
@@ -106,8 +103,7 @@ COMMANDS: list[tuple[str, list[str], str]] = [
         "line",
     ),
     ("fleet restore --no-passphrase", [], PAPER),
-    ("fleet init --out fleet2 --no-passphrase --relay r.example.org:5790 --drones 1", [], ""),
-    ("fleet backup copy.tar", [], ""),
+    ("fleet init --out fleet2 --no-passphrase", [], ""),
 ]
 
 
@@ -134,8 +130,7 @@ def test_killed_at_each_change_and_run_again(tmp_path: Path, command: str, befor
             break
         killed += 1
         status, output = stage.run(command, line)
-        is_done = status == 2 and command.startswith("fleet add")  # only old contents were left to delete
-        assert status == 0 or is_done, (killed, output)
+        assert status == 0, (killed, output)
         check(stage.folder)
         assert names(stage.folder) == names(whole.folder)
     assert killed >= 2

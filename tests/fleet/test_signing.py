@@ -19,7 +19,7 @@ from uavlinkd.authority.certificates import (
     is_published,
 )
 from uavlinkd.authority.enrolment import FleetError
-from uavlinkd.fleet.manifest import Fleet, FleetSettings
+from uavlinkd.fleet.manifest import Fleet
 from uavlinkd.fleet.signing import Identity, certify, merge, new_fleet, revoke
 from uavlinkd.protocol.crypto import Secret, SigningKey, x25519_public_key
 from uavlinkd.system.addresses import Address
@@ -42,7 +42,7 @@ def signed(fleet: Fleet, name: str, identity: Identity = ANY, **others: Any) -> 
 @pytest.fixture
 def fleet() -> Fleet:
     """A relay, a ground station and the vehicle v7."""
-    fleet = new_fleet(SIGNER, bytes(32), FleetSettings())
+    fleet = new_fleet(SIGNER)
     fleet = signed(fleet, "relay", Identity(MemberRole.RELAY, None, (AT,)))
     fleet = signed(fleet, "station", Identity(MemberRole.OPERATOR))
     return signed(fleet, "v7", Identity(MemberRole.VEHICLE, (7, 7)))
@@ -110,7 +110,7 @@ def test_impossible_members_are_refused(
 
 def test_member_without_a_contact_is_refused() -> None:
     """It would find no other one. With an address, an operator is the contact of the others, and relays."""
-    fleet = new_fleet(SIGNER, bytes(32), FleetSettings())
+    fleet = new_fleet(SIGNER)
     with pytest.raises(FleetError, match="would find no other member"):
         signed(fleet, "v7")
     fleet = signed(fleet, "station", Identity(MemberRole.OPERATOR, None, (AT,)))

@@ -7,17 +7,21 @@ import shutil
 import signal
 import sys
 import tempfile
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import asynccontextmanager
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from tests.waiting import until
 from uavlinkd.authority.certificates import MemberRole
+from uavlinkd.authority.enrolment import parse_request
 from uavlinkd.config.load import load_config
 from uavlinkd.config.model import Config
-from uavlinkd.fleet import operations
-from uavlinkd.fleet.manifest import FleetSettings, read_manifest
+from uavlinkd.fleet import enrolling, operations
+from uavlinkd.fleet.enrolling import MemberFiles
+from uavlinkd.fleet.manifest import read_manifest
+from uavlinkd.fleet.signing import Identity
 from uavlinkd.lab.child_processes import end_with_parent
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.ops.control import ControlError, ask
@@ -27,6 +31,7 @@ from uavlinkd.system.base64_text import to_base64
 
 NAMES = ("drone1", "drone2", "drone3")
 RELAY = "relay"
+ANY = Identity()
 END_S = 120.0
 """A daemon ends within a fraction of this."""
 
@@ -41,21 +46,56 @@ def unasked(what: str) -> Secret:
     raise AssertionError(what)
 
 
+def join(
+    folder: Path,
+    name: str,
+    identity: Identity = ANY,
+    *,
+    replaces: bool = False,
+    url: str | None = None,
+    socket: str | None = None,
+) -> None:
+    """Enroll a member. Its files are in a folder beside the manifest, where an operator would not have them."""
+    place = MemberFiles(folder / name / f"{name}.toml")
+    line, _ = enrolling.request(name, place)
+    _, fleet = operations.sign(folder, parse_request(line), identity, unasked, replaces=replaces)
+    enrolling.finish(operations.line_of(fleet, name), place.config, None, url, (), socket)
+
+
+def renew(folder: Path, *names: str) -> None:
+    """Use the lines that `fleet sign NAME` prints, as the commands ask after a change of contacts."""
+    fleet = read_manifest(folder)
+    for name in names:
+        config = folder / name / f"{name}.toml"
+        enrolling.finish(operations.line_of(fleet, name), config, None, None, (), None)
+
+
 def create(
     folder: Path,
-    settings: FleetSettings | None = None,
     *,
     relays: Sequence[Address] = (),
     at: Sequence[Address] = (),
+    swarm: bool = False,
+    urls: Mapping[str, str] = MappingProxyType({}),
+    socket: str | None = None,
     **counts: int,
 ) -> None:
     """A fleet of so many ``drones``, ``stations`` and ``observers``, with a key that is not encrypted.
 
-    ``at``: addresses of the first ground stations.
+    ``at``: addresses of the first ground stations. ``urls``: templates by kind of member, with its ``{n}``.
     """
-    roles = {"drones": MemberRole.VEHICLE, "stations": MemberRole.OPERATOR, "observers": MemberRole.OBSERVER}
-    members = {role: counts.get(name, 0) for name, role in roles.items()}
-    operations.init(folder, settings or FleetSettings(), members, (relays, at), None)
+    operations.init(folder, "x25519", None, swarm=swarm)
+    kinds: tuple[tuple[str, MemberRole, str, Sequence[Address], int], ...] = (
+        ("relays", MemberRole.RELAY, "relay", relays, len(relays)),
+        ("stations", MemberRole.OPERATOR, "ground-station", at, counts.get("stations", 0)),
+        ("drones", MemberRole.VEHICLE, "drone", (), counts.get("drones", 0)),
+        ("observers", MemberRole.OBSERVER, "observer", (), counts.get("observers", 0)),
+    )
+    for kind, role, name, addresses, count in kinds:
+        for number in range(1, count + 1):
+            full = name if count == 1 and role is not MemberRole.VEHICLE else f"{name}{number}"
+            url = urls[kind].replace("{n}", str(number)) if kind in urls else None
+            join(folder, full, Identity(role, None, tuple(addresses[number - 1 : number])), url=url, socket=socket)
 
 
 class Vehicles:
@@ -64,8 +104,8 @@ class Vehicles:
     def __init__(self, folder: Path, drones: int) -> None:
         self._folder = folder
         self.fleet = folder / "fleet"
-        settings = FleetSettings(swarm=True, drone_url=f"udpin:127.0.14.{{n}}:{free_port()}")
-        create(self.fleet, settings, drones=drones, relays=[Address("127.0.0.1", free_port())])
+        urls = {"drones": f"udpin:127.0.14.{{n}}:{free_port()}"}
+        create(self.fleet, drones=drones, relays=[Address("127.0.0.1", free_port())], swarm=True, urls=urls)
         self._processes: dict[str, asyncio.subprocess.Process] = {}
 
     @property

@@ -35,8 +35,7 @@ def _fleet(*arguments: str) -> Callable[[Scene], Awaitable[None]]:
 
     async def make(scene: Scene) -> None:
         folder = str(scene.stage.folder / f"fleet{scene.row}")
-        fleet = ("fleet", "init", "--relay", "relay.example.org:5790", "--drones", "2", "--no-passphrase")
-        said(*fleet, "--out", folder)
+        said("fleet", "init", "--no-passphrase", "--out", folder)
         scene.command = said("fleet", *arguments, "--out", folder)
 
     return make
@@ -61,6 +60,6 @@ FILE_ROWS = (
     Mistake("43", _windows, check=r"public key"),
     Mistake("55", _wireguard, check=r"is a WireGuard file.*start from configs/drone0\.toml"),
     Mistake("56a", _fleet("init", "--no-passphrase"), command=r"exists already: choose the name"),
-    Mistake("56e", _fleet("init", "--relay", "vps"), command=r"--relay: has no port"),
-    Mistake("56k", _fleet("revoke", "drone9"), command=r'has no "drone9": its members are'),
+    Mistake("56e", _fleet("sign", "v7", "--address", "vps"), command=r"--address: has no port"),
+    Mistake("56k", _fleet("revoke", "drone9"), command=r'has no "drone9": its members are none'),
 )

@@ -261,7 +261,7 @@ async def reload_listen(scene: Scene) -> None:
 
 
 async def without_restart(scene: Scene) -> None:
-    """`here` has its files from `fleet rotate`; `there` still runs with its old key."""
+    """`here` has the new key of `there`, which still runs with its old one."""
     scene.introduce()
     await _linked(scene)
     _peer(scene.here)["public_key"] = keys.public_key_text(keys.generate_private_key())

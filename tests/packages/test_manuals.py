@@ -38,7 +38,7 @@ LINES = pytest.mark.parametrize(
     [
         ("uavlinkd st", "status"),
         ("uavlinkd status --so", "--socket"),
-        ("uavlinkd fleet ro", "rotate"),
+        ("uavlinkd fleet pub", "publish"),
         ("uavlinkd evaluate ti", "timing"),
         ("uavlinkd check --config LIC", "LICENSE"),
         ("uavlink-mitm relay --li", "--list"),

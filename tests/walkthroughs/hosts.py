@@ -33,10 +33,12 @@ class Network:
         self.tools = folder / "tools"
         self.tools.mkdir()
         self._add_tool("sudo", 'exec "$@"')
-        # No ssh runs on the hosts: a copy into the other host's folder takes its place.
+        # No ssh runs on the hosts: a copy into the other host's folder takes its place, and a command there.
         self._add_tool(
             "scp", f'shift; for last; do :; done; exec cp -pr "$1" {shlex.quote(str(folder))}/"${{last%:}}"/'
         )
+        pid = f'"$(cat {shlex.quote(str(folder))}/$host.pid)"'
+        self._add_tool("ssh", f'host=$1; shift; exec nsenter --target={pid} --mount --net sh -euc "cd {HOME}; $*"')
         self.switch = Host(self, "switch")
         self.switch.run("ip link add air type bridge && ip link set air up")
 
@@ -87,6 +89,7 @@ class Host:
         assert self._holder.stdout.readline() == b"ready\n"
         self._device = device
         self.pid = self._holder.pid
+        (network.folder / f"{name}.pid").write_text(str(self.pid))
 
     def close(self) -> None:
         """End the daemons as a shutdown does, then everything else."""

@@ -106,7 +106,7 @@ class Walk:
     def _type(self, host: Host | Container, command: str) -> None:
         if " fleet " in command:  # there is no terminal
             host.run("umask 077 && echo any passphrase >passphrase")
-            command += " --passphrase-file passphrase"
+            command = re.sub(r"( fleet \w+)", r"\1 --passphrase-file passphrase", command)
         if isinstance(host, Host) and command.startswith("uavlinkd run "):
             host.start(command)
         elif "uavlinkd status" in command or "uavlinkd reload" in command:  # the daemon may be starting
@@ -209,7 +209,7 @@ def test_fleet(walk: Walk) -> None:
     walk.follow(blocks[before:])
 
     converse(walk, {1: autopilots[1]}, station)
-    status = laptop.run("uavlinkd status --config fleet/ground-station/ground-station.toml")
+    status = laptop.run("uavlinkd status --config gs.toml")
     assert "drone1" in status
     assert "drone2" not in status
 

@@ -31,11 +31,11 @@ from uavlinkd.system.base64_text import from_base64, to_base64
 from uavlinkd.system.terminal import UsageError
 
 WORD = "uavlink-enroll-1"
-VERSION = 1
+VERSION = 2
 CHECK_BYTES = 4
 MOST_CONTACTS = 3
 LONGEST_LINE = 4096  # More characters than three contacts need. A terminal accepts no longer line.
-_HEAD = struct.Struct(f">BBBB{KEY_BYTES}s{KEY_BYTES}s{CERTIFICATE_BYTES}sH")
+_HEAD = struct.Struct(f">BBBB{KEY_BYTES}s{CERTIFICATE_BYTES}sH")
 _CONTACT = struct.Struct(f">{KEY_BYTES}s{CERTIFICATE_BYTES}sB")
 _MOST_ADDRESS = 255  # its length is one byte
 _CUT = "the line is not a whole line of `uavlinkd fleet sign`: it was cut or changed; copy it again, or send a file"
@@ -121,13 +121,12 @@ class Reply(NamedTuple):
     relays: bool  # whether it passes datagrams between members
     addresses: tuple[str, ...]  # Where others reach it. Without one it need not listen.
     authority: bytes
-    successor: bytes  # SHA-256 of the key that may follow the authority's
     certificate: bytes
     bulletin: bytes
     contacts: tuple[Contact, ...]
 
     def line(self) -> str:
-        head = (VERSION, self.suite.number, role_bits(self.calls), self.relays, self.authority, self.successor)
+        head = (VERSION, self.suite.number, role_bits(self.calls), self.relays, self.authority)
         data = _HEAD.pack(*head, self.certificate, len(self.bulletin)) + self.bulletin + _encoded(self.addresses)
         data += bytes([len(self.contacts)]) + b"".join(contact.encode() for contact in self.contacts)
         return to_base64(data + sha256(data)[:CHECK_BYTES]).rstrip("=")
@@ -153,7 +152,7 @@ def parse_reply(line: str) -> Reply:
 
 
 def _parsed(data: bytes) -> Reply:
-    _, suite, calls, relays, authority, successor, certificate, size = _HEAD.unpack_from(data)
+    _, suite, calls, relays, authority, certificate, size = _HEAD.unpack_from(data)
     parse_certificate(certificate)
     addresses, at = _addresses(data, _HEAD.size + size)
     count, at = data[at], at + 1
@@ -163,7 +162,7 @@ def _parsed(data: bytes) -> Reply:
         texts, at = _addresses(data, at + _CONTACT.size)
         contacts.append(Contact(key, signed, texts, bool(flag)))
     bulletin = data[_HEAD.size : _HEAD.size + size]
-    parts = (authority, successor, certificate, bulletin, tuple(contacts))
+    parts = (authority, certificate, bulletin, tuple(contacts))
     reply = Reply(SUITES[suite], roles_in(calls), bool(relays), addresses, *parts)
     is_same = base64.b64decode(reply.line() + "==")[:-CHECK_BYTES] == data  # one spelling of each reply
     if not is_same or count > MOST_CONTACTS or not all(contact.addresses for contact in contacts):

@@ -18,7 +18,7 @@ from uavlinkd.authority.certificates import parse_certificate
 from uavlinkd.authority.trust import BulletinVerdict, Trust, is_same_member
 from uavlinkd.protocol.crypto import sha256
 from uavlinkd.protocol.drops import Drop
-from uavlinkd.system.folders import sync_folder, write_new
+from uavlinkd.system.folders import replace_file
 
 _TITLE = b"uavlinkd fleet state 1"
 _MOST_BYTES = 65536  # of the file. The longest one has 260 members of 182 bytes.
@@ -65,19 +65,8 @@ def read(path: Path, trust: Trust, contacts: Mapping[bytes, bytes] = MappingProx
 
 
 def write(path: Path, state: FleetState) -> None:
-    """Replace the file: after a power cut it has the old content or the new one, and when this returns, the new one.
-
-    Raises OSError: then the file has the old content, or perhaps will have it after a power cut.
-    """
-    new = path.with_name(f".{path.name}.new")
-    try:
-        write_new(new, _encode(state))
-        new.replace(path)
-    except OSError:
-        with suppress(OSError):
-            new.unlink()  # the disk may be full
-        raise
-    sync_folder(path.parent)
+    """Write the file as :func:`~uavlinkd.system.folders.replace_file` does."""
+    replace_file(path, _encode(state))
 
 
 def _encode(state: FleetState) -> bytes:

@@ -248,9 +248,10 @@ _REMOVED = {
     **dict.fromkeys(
         ("previous_public_key", "previous_private_key_file"),
         "to change a key, write the new public key into the other ends' files, restart the daemon whose key it is,"
-        " and reload the others at the same time; in a fleet, `uavlinkd fleet rotate NAME` writes the files",
+        " and reload the others at the same time; in a fleet, `uavlinkd enroll NAME` there makes one",
     ),
     **dict.fromkeys(("deny_in", "deny_out"), INSTEAD_OF_DENIAL),
+    "successor": "delete the line: nothing used it",
     "recording": "run `uavlinkd record URL FILE` beside the daemon",
     "mac_key_bits": "delete the line: every HMAC key has 256 bits, and a longer one was no stronger",
     **dict.fromkeys(

@@ -320,9 +320,6 @@ class RelayServerSection(Section):
 
 class FleetSection(Section):
     authority: AuthorityKey = key(_signed(AuthorityKey, "the public key of an authority"), example=_SIGNED)
-    successor: bytes | None = key(
-        _signed(lambda data: data if len(data) == c.KEY_BYTES else None, "a hash of 32 bytes"), None, _SIGNED
-    )
     certificate: HeldCertificate = key(CERTIFICATE, example=_SIGNED)
     bulletin: bytes = key(_signed(lambda data: data if parse_bulletin(data) else None, "a bulletin"), example=_SIGNED)
     call: list[str] | None = key(each(FRAME_ROLE), None, '["operator"]')

@@ -20,7 +20,6 @@ from uavlinkd.protocol.constants import KEY_BYTES
 from uavlinkd.protocol.crypto import Secret, read_signing_key, sha256
 
 AUTHORITY_FILE = "authority.pem"
-SUCCESSOR_FILE = "successor.pem"
 _LIMIT = 4096
 _CHECK_BYTES = 3  # of a paper copy, which so has 56 characters without padding
 _GROUP = 4

@@ -9,7 +9,7 @@ from pathlib import Path
 from uavlinkd.system.terminal import OK, add_json, without_echo
 
 _ROLES = ("vehicle", "operator", "observer", "relay")
-_TYPED = frozenset({"init", "add", "rotate", "revoke", "remove", "publish", "paper"})
+_TYPED = frozenset({"init", "revoke", "remove", "publish", "paper"})
 """Actions that read a passphrase from the terminal, and nothing else."""
 
 
@@ -32,51 +32,31 @@ def add_fleet(fleet: argparse.ArgumentParser) -> None:
             )
         return action
 
-    init = add("init", "create a fleet: its authority, and folders for the members that are asked for")
+    init = add("init", "create a fleet: the folder with its authority")
     init.add_argument("--no-passphrase", action="store_true", help="for tests: each copy of authority.pem can sign")
-    text = "a relay with this public address, up to three; a wss:// URL behind it is one more of the same relay"
-    _add_list(init, "--relay", "HOST:PORT", text)
-    counts = {
-        "drones": "drone1 to droneN, with system ids from 1 up",
-        "ground-stations": "system ids from 255 down",
-        "observers": "members that only receive",
-    }
-    for name, text in counts.items():
-        init.add_argument(f"--{name}", type=int, default=0, metavar="N", help=f"{text} (default: 0)")
-    text = "where vehicles reach a ground station (may be repeated); without a relay, the first one is one too"
-    _add_list(init, "--station-address", "HOST:PORT", text)
     init.add_argument("--swarm", action="store_true", help="vehicles connect to each other too")
     init.add_argument("--suite", default="x25519", metavar="NAME", help="key exchange (default: %(default)s)")
-    templates = {
-        "control-socket": ("{name}.sock", "FILE", ""),
-        "drone-url": ("udpin:127.0.0.1:14550", "URL", "of the autopilot; "),
-        "ground-station-url": ("udpout:127.0.0.1:14550", "URL", "of each ground control station, observers' too; "),
-    }
-    for name, (default, metavar, text) in templates.items():
-        help_ = f"{text}may contain {{n}} or {{name}} (default: %(default)s)"
-        init.add_argument(f"--{name}", default=default, metavar=metavar, help=help_)
 
     sign = add("sign", "read the line of `uavlinkd enroll NAME`, and print the one for `uavlinkd enroll --finish`")
     sign.add_argument("name", nargs="?", metavar="NAME", help="print the line of this member once more")
     sign.add_argument(
         "--replace", metavar="NAME", help="the line is of this member: replace its key, and revoke the old one"
     )
-    new = add("add", "make a folder for a new member, with its key and configuration")
-    for action in (sign, new):
-        action.add_argument("--role", choices=_ROLES, help="(default: vehicle)")
-        ids = action.add_mutually_exclusive_group()
-        ids.add_argument("--id", type=int, metavar="N", help="MAVLink system id (default: the next free one)")
-        ids.add_argument("--ids", metavar="A-B", help="a range of them")
-        _add_list(action, "--address", "HOST:PORT", "where members reach it from the start")
+    sign.add_argument("--role", choices=_ROLES, help="(default: vehicle)")
+    ids = sign.add_mutually_exclusive_group()
+    ids.add_argument("--id", type=int, metavar="N", help="MAVLink system id (default: the next free one)")
+    ids.add_argument("--ids", metavar="A-B", help="a range of them")
+    text = "where members reach it from the start; a relay's wss:// URL, behind its HOST:PORT, is one more"
+    _add_list(sign, "--address", "HOST:PORT", text)
     revoke = add("revoke", "sign a bulletin that refuses a member")
     remove = add("remove", "revoke a member, and publish the bulletin")
-    for action in (new, revoke, remove, add("rotate", "make a new key for a member, and revoke the old one")):
+    for action in (revoke, remove):
         action.add_argument("name", metavar="NAME")
     revoke.add_argument("--resign", action="store_true", help="sign all others again, which empties the bulletin")
     publish = add("publish", "hand the bulletin and the members to a running daemon, which passes the bulletin on")
     publish.add_argument("--merge", action="store_true", help="the fleet has a newer bulletin: sign the union")
     members = add("members", "print what a running daemon knows of its fleet, for `restore`", signs=False)
-    for action in (sign, new, publish, remove, members):
+    for action in (sign, publish, remove, members):
         daemon = action.add_mutually_exclusive_group()
         daemon.add_argument("--config", metavar="FILE", type=Path, help="the daemon's configuration")
         daemon.add_argument("--socket", metavar="PATH", type=Path, help="the daemon's control socket")
@@ -86,8 +66,6 @@ def add_fleet(fleet: argparse.ArgumentParser) -> None:
     restore.add_argument("--no-passphrase", action="store_true", help="as of init")
     text = "without the folder: a member's configuration, or what `fleet members` printed there (may be repeated)"
     restore.add_argument("--member", action="append", default=[], metavar="FILE", type=Path, help=text)
-    backup = add("backup", "copy the manifest and the authority's keys into a tar file", signs=False)
-    backup.add_argument("file", metavar="FILE", type=Path)
 
 
 def _add_list(parser: argparse.ArgumentParser, name: str, metavar: str, text: str) -> None:
@@ -105,6 +83,7 @@ def add_enroll(enroll: argparse.ArgumentParser) -> None:
     enroll.add_argument("--config", metavar="FILE", type=Path, help="the configuration (default: NAME.toml)")
     enroll.add_argument("--keys", metavar="DIR", type=Path, help="for a service: the folder of its keys")
     enroll.add_argument("--url", metavar="URL", help="endpoint of a new configuration")
+    enroll.add_argument("--control-socket", metavar="FILE", help="of a new configuration (default: NAME.sock)")
     _add_list(enroll, "--listen", "IP:PORT", "where members reach it (default: as signed)")
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,16 +20,15 @@ from uavlinkd.authority.enrolment import (
     verify_reply,
 )
 from uavlinkd.config import keys
-from uavlinkd.config.load import read_toml
-from uavlinkd.fleet.files import config_file, key_file, listen_on, new_table, with_fleet, written
-from uavlinkd.fleet.manifest import FleetSettings
-from uavlinkd.fleet.transaction import aside_of, changing, recover
+from uavlinkd.config.load import load_config, read_toml
+from uavlinkd.config.model import ConfigError
+from uavlinkd.fleet.files import listen_on, new_table, with_fleet, written
+from uavlinkd.fleet.manifest import file_errors
 from uavlinkd.mavlink.dialect import SYSTEM_ID
 from uavlinkd.protocol.crypto import x25519_public_key
 from uavlinkd.protocol.drops import Drop
 from uavlinkd.system.base64_text import from_base64
-
-_NEXT = ".next.key"  # no name of a member has a dot
+from uavlinkd.system.folders import sync_folder, write_new
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,20 +57,32 @@ def request(name: str, place: MemberFiles) -> tuple[str, Path]:
     """
     check_name(name)
     table = place.table()
-    own = str(table.get("private_key_file", key_file(name)))
-    path = place.key(_other(own) if "fleet" in table else own)
+    own = str(table.get("private_key_file", f"{name}.key"))
+    path = place.key(_numbered(own, 1) if "fleet" in table else own)
     if not os.path.lexists(path):
+        with file_errors():
+            path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         keys.write_secret_file(path, keys.generate_private_key())
     public = x25519_public_key(keys.read_secret_file(path).reveal())
     return Request(name, public).line(), path
 
 
-def _other(own: str) -> str:
-    """The name of the key file that is not used at present."""
-    return f"{own.removesuffix(_NEXT)}.key" if own.endswith(_NEXT) else own.removesuffix(".key") + _NEXT
+def _numbered(file: str, step: int) -> str:
+    """The name of the next key file, or of the one before: ``v7.key``, ``v7.2.key``, ``v7.3.key`` and so on.
+
+    The name of a key is not used again. So a command that was killed leaves no former key for the next request.
+    """
+    stem = file.removesuffix(".key")
+    head, dot, last = stem.rpartition(".")
+    first, number = (head, int(last)) if dot and last.isdecimal() else (stem, 1)
+    if number + step < 1:
+        return file
+    return f"{first}.{number + step}.key" if number + step > 1 else f"{first}.key"
 
 
-def finish(line: str, config: Path | None, folder: Path | None, url: str | None, listen: Sequence[str]) -> list[str]:
+def finish(
+    line: str, config: Path | None, folder: Path | None, url: str | None, listen: Sequence[str], socket: str | None
+) -> list[str]:
     """Write what the line of `uavlinkd fleet sign` says into the configuration, which is created if it is missing.
 
     Nothing is written unless every signature verifies and a daemon would accept the file. The former key is deleted.
@@ -79,46 +90,53 @@ def finish(line: str, config: Path | None, folder: Path | None, url: str | None,
     """
     reply = parse_reply(line)
     certificate = parse_certificate(reply.certificate)
-    place = MemberFiles(config or Path(config_file(certificate.name)), folder)
+    name = certificate.name
+    place = MemberFiles(config or Path(f"{name}.toml"), folder)
     table = place.table()
     _check_present(table.get("fleet"), reply, certificate, place.config)
-    own = str(table.get("private_key_file", key_file(certificate.name)))
-    former = place.key(own)
-    path, contacts = _verified(reply, certificate.name, [place.key(_other(own)), former])
-    name = own if path == former else _other(own)  # it may be in another folder
+    own = str(table.get("private_key_file", f"{name}.key"))
+    key, contacts = _verified(reply, name, place, (_numbered(own, 1), own))
     listen = listen or ([] if "listen" in table else listen_on(reply))
-    replaced = place.key(_other(own))
-    if (aside := aside_of(replaced)).exists():  # a command was killed when the configuration had the new key
-        replaced.unlink(missing_ok=True)
-        aside.unlink()
-    recover((place.config, former))
-    with changing() as changes:
-        if table:
-            if url is not None and url not in _urls(table):
-                raise FleetError(f"{place.config} exists: write the url into its [[endpoint]], and leave --url out")
-            table |= {"private_key_file": name, **({"listen": list(listen)} if listen else {})}
-        else:
-            settings = FleetSettings(
-                control_socket="{name}.sock" if folder is None else "/run/uavlinkd/{name}/control.sock"
-            )
-            if url is not None:
-                settings = replace(settings, drone_url=url, ground_station_url=url)
-            table = new_table(reply, settings, name, listen)
-        has_former = path != former and former.exists()
-        if has_former:
-            changes.keep(former)
-        changes.write(place.config, written(with_fleet(table, reply)), place.environ())
-        if has_former:
-            former.unlink(missing_ok=True)
-    fingerprint = fingerprint_of(reply.authority)
+    former = own if own != key else _numbered(key, -1)
+    is_replaced = "fleet" in table and former != key and place.key(former).exists()
+    if table:
+        if url is not None and url not in _urls(table):
+            raise FleetError(f"{place.config} exists: write the url into its [[endpoint]], and leave --url out")
+        table |= {"private_key_file": key, **({"listen": list(listen)} if listen else {})}
+    else:
+        socket = socket or (f"{name}.sock" if folder is None else f"/run/uavlinkd/{name}/control.sock")
+        table = new_table(reply, key, socket, url, listen)
+    _write(place, written(with_fleet(table, reply)))
+    if is_replaced:
+        with file_errors():
+            place.key(former).unlink()
     ids = f"the id of the ground control station, to system id {ids_of(certificate)}"
     return [
-        f"{certificate.name} is a member of fleet {fingerprint}: compare this with the line of `fleet sign`.",
+        f"{name} is a member of fleet {fingerprint_of(reply.authority)}: compare this with the line of `fleet sign`.",
         f"{place.config}: {certificate.role.name.lower()}, contacts {', '.join(contacts) or 'none'}",
         *([f"Set {SYSTEM_ID} of the autopilot, or {ids}."] if ids_of(certificate) else []),
         f"Then: uavlinkd run --config {place.config}; if the daemon runs already, restart it.",
-        *([f"The former key, {former}, was deleted."] if has_former else []),
+        *([f"The former key, {place.key(former)}, was deleted."] if is_replaced else []),
     ]
+
+
+def _write(place: MemberFiles, text: str) -> None:
+    """Replace the configuration as a whole, if a daemon would accept it."""
+    new = place.config.with_name(f".{place.config.name}.new")
+    with file_errors():
+        place.config.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        try:
+            write_new(new, text.encode())
+            load_config(new, place.environ())
+            new.replace(place.config)
+            sync_folder(place.config.parent)
+        except ConfigError as error:
+            problems = "\n".join(f"{problem.key}: {problem.message}" for problem in error.problems)
+            raise FleetError(
+                f"the new {place.config.name} is not valid, so nothing was changed:\n{problems}"
+            ) from None
+        finally:
+            new.unlink(missing_ok=True)
 
 
 def _urls(table: dict[str, Any]) -> list[Any]:
@@ -150,17 +168,18 @@ def _check_present(fleet: Any, reply: Reply, certificate: Certificate, config: P
         )
 
 
-def _verified(reply: Reply, name: str, paths: list[Path]) -> tuple[Path, list[str]]:
+def _verified(reply: Reply, name: str, place: MemberFiles, files: Sequence[str]) -> tuple[str, list[str]]:
     """The key file whose key was certified for the member of this name, and the names of the contacts."""
     reason = (
-        f"the line is for {name}, and there is no {paths[-1]}: run `uavlinkd enroll NAME` here, and sign its line"
+        f"the line is for {name}, and there is no {place.key(files[-1])}: run `uavlinkd enroll NAME` here, and sign"
+        " its line"
     )
-    for path in paths:
-        if path.exists():
+    for file in files:
+        if (path := place.key(file)).exists():
             try:
                 trust = verify_reply(reply, x25519_public_key(keys.read_secret_file(path).reveal()))
             except FleetError as error:
                 reason = str(error)
             else:
-                return path, [held.certificate.name for held in trust.held.values()]
+                return file, [held.certificate.name for held in trust.held.values()]
     raise FleetError(reason)

@@ -9,7 +9,7 @@ from typing import Any
 
 from uavlinkd.authority.certificates import MemberRole, parse_certificate
 from uavlinkd.authority.enrolment import Contact, FleetError, Reply, ids_of
-from uavlinkd.fleet.manifest import Fleet, FleetSettings, Member, fill, toml_text
+from uavlinkd.fleet.manifest import Fleet, Member, toml_text
 from uavlinkd.protocol.drops import Drop
 from uavlinkd.protocol.path import WEB_HOST
 from uavlinkd.protocol.suites import SUITES_BY_NAME
@@ -19,23 +19,14 @@ from uavlinkd.system.base64_text import from_base64, to_base64
 Table = dict[str, Any]
 
 
-def config_file(name: str) -> str:
-    return f"{name}.toml"
-
-
-def key_file(name: str) -> str:
-    return f"{name}.key"
-
-
 def reply_for(fleet: Fleet, member: Member) -> Reply:
     """What a member needs beside its private key."""
     return Reply(
-        SUITES_BY_NAME[fleet.settings.suite],
-        fleet.settings.calls(member.role),
+        SUITES_BY_NAME[fleet.suite],
+        fleet.calls(member.role),
         member.relays,
         tuple(map(str, member.addresses)),
         fleet.authority.public,
-        fleet.successor,
         member.signed,
         fleet.published,
         tuple(
@@ -65,22 +56,23 @@ def listen_on(reply: Reply) -> list[str]:
     return list(dict.fromkeys(listen))
 
 
-def new_table(reply: Reply, settings: FleetSettings, private_key_file: str, listen: Sequence[str]) -> Table:
-    """A new configuration without the fleet's facts. In ``settings``, only the templates count."""
+def new_table(
+    reply: Reply, private_key_file: str, control_socket: str, url: str | None, listen: Sequence[str]
+) -> Table:
+    """A new configuration without the fleet's facts. ``url``: of the autopilot, or of the ground control software."""
     certificate = parse_certificate(reply.certificate)
-    name, role, first = certificate.name, certificate.role, certificate.system_ids[0]
-    is_vehicle = role is MemberRole.VEHICLE
+    role, is_vehicle = certificate.role, certificate.role is MemberRole.VEHICLE
     table: Table = {
-        "name": name,
+        "name": certificate.name,
         "private_key_file": private_key_file,
         "listen": list(listen),
-        "control_socket": fill(settings.control_socket, first, name),
+        "control_socket": control_socket,
         "link": {"suites": [reply.suite.name]},
     }
     if role is not MemberRole.RELAY:
         endpoint = {
             "name": "autopilot" if is_vehicle else "ground-control",
-            "url": fill(settings.drone_url if is_vehicle else settings.ground_station_url, first, name),
+            "url": url or ("udpin:127.0.0.1:14550" if is_vehicle else "udpout:127.0.0.1:14550"),
             "system_ids": list(certificate.systems),
             **({"role": "observer"} if role is MemberRole.OBSERVER else {}),
         }
@@ -107,7 +99,6 @@ def with_fleet(table: Table, reply: Reply) -> Table:
         added["relay_server"] = relay_server
     facts = {
         "authority": to_base64(reply.authority),
-        "successor": to_base64(reply.successor),
         "certificate": to_base64(reply.certificate),
         "bulletin": to_base64(reply.bulletin),
     }

@@ -1,6 +1,6 @@
 """The fleet's manifest: its authority, bulletin and members. It contains no secret and may be in a public repository.
 
-Every command writes ``fleet.toml`` before it hands out what it signed, so that no serial is used twice. What cannot
+A command writes ``fleet.toml`` before it prints what it signed, so that no serial is used twice. A value that cannot
 be is refused with a FleetError, which says why.
 """
 
@@ -9,8 +9,9 @@ from __future__ import annotations
 import json
 import re
 import tomllib
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -49,9 +50,13 @@ def no_fleet(folder: Path) -> FleetError:
     )
 
 
-def fill(template: str, number: int, name: str) -> str:
-    """Replace ``{n}`` and ``{name}``. ``str.format`` would give access to attributes."""
-    return template.replace("{n}", str(number)).replace("{name}", name)
+@contextmanager
+def file_errors() -> Iterator[None]:
+    """Raise FleetFileError in place of OSError."""
+    try:
+        yield
+    except OSError as error:
+        raise FleetFileError(f"{error.filename}: {error.strerror}") from None
 
 
 def parse_addresses(option: str, texts: list[str]) -> tuple[Address, ...]:
@@ -87,33 +92,22 @@ class Member:
 
 
 @dataclass(frozen=True, slots=True)
-class FleetSettings:
-    """The settings of all members. In templates, ``{n}`` is the first system id and ``{name}`` the member's name."""
+class Fleet:
+    """A fleet. ``members`` is in the order of their first certificates, and includes revoked ones."""
 
+    authority: AuthorityKey
+    bulletin: Bulletin
+    published: bytes  # the bytes of the bulletin
     suite: str = "x25519"
     swarm: bool = False  # whether vehicles connect to vehicles
-    control_socket: str = "{name}.sock"
-    drone_url: str = "udpin:127.0.0.1:14550"
-    ground_station_url: str = "udpout:127.0.0.1:14550"
+    next_serial: int = 1
+    members: tuple[Member, ...] = ()
 
     def calls(self, role: MemberRole) -> frozenset[MemberRole]:
         """The roles to whose members a member connects."""
         if role is not MemberRole.VEHICLE:
             return frozenset()
         return frozenset({MemberRole.OPERATOR, MemberRole.VEHICLE} if self.swarm else {MemberRole.OPERATOR})
-
-
-@dataclass(frozen=True, slots=True)
-class Fleet:
-    """A fleet. ``members`` is in the order of their first certificates, and includes revoked ones."""
-
-    authority: AuthorityKey
-    successor: bytes  # SHA-256 of the public key that may follow the authority's
-    bulletin: Bulletin
-    published: bytes  # the bytes of the bulletin
-    next_serial: int = 1
-    settings: FleetSettings = field(default_factory=FleetSettings)
-    members: tuple[Member, ...] = ()
 
     def is_revoked(self, member: Member) -> bool:
         return self.bulletin.refuses(member.certificate.serial)
@@ -150,16 +144,21 @@ class Fleet:
         """The members that one has in its configuration."""
         return [member for member in self.reachable if member.name != name][:MOST_CONTACTS]
 
+    def with_other_contacts(self, before: Fleet) -> list[str]:
+        """The names of members that had other contacts ``before``: their files need a new line."""
+        names = {member.name for member in self.current} & {member.name for member in before.current}
+        return sorted(name for name in names if self.contacts_of(name) != before.contacts_of(name))
+
 
 def write_manifest(fleet: Fleet) -> str:
     facts = {
         "authority": to_base64(fleet.authority.public),
-        "successor": to_base64(fleet.successor),
         "bulletin": to_base64(fleet.published),
         "next_serial": fleet.next_serial,
+        "suite": fleet.suite,
+        "swarm": fleet.swarm,
     }
-    settings = {key.name: getattr(fleet.settings, key.name) for key in fields(FleetSettings)}
-    table = {"fleet": facts | settings, "member": list(map(_table_of, fleet.members))}
+    table = {"fleet": facts, "member": list(map(_table_of, fleet.members))}
     return f"# {_HEAD}\n\n{toml_text(table)}"
 
 
@@ -231,18 +230,17 @@ def _fleet(table: dict[str, Any]) -> Fleet:
             "is of an earlier version, without an authority. Its members work as before, and their files are edited"
             " by hand; or create a new fleet in another folder"
         )
-    authority, published = AuthorityKey(from_base64(facts.pop("authority"))), from_base64(facts.pop("bulletin"))
+    authority, published = AuthorityKey(from_base64(facts["authority"])), from_base64(facts["bulletin"])
     if (bulletin := verified_bulletin(published, authority)) is None:
         raise ValueError("not a bulletin of this fleet")
-    successor, next_serial = from_base64(facts.pop("successor")), facts.pop("next_serial")
+    suite, swarm, next_serial = facts["suite"], facts["swarm"], facts["next_serial"]
     members = tuple(_member(section, authority) for section in table.pop("member", []))
     serials = {member.certificate.serial for member in members}
     is_ascending = type(next_serial) is int and all(serial < next_serial for serial in {0, *serials})
-    if set(table) != {"fleet"} or len(serials) != len(members) or not is_ascending:
+    if set(table) != {"fleet"} or len(serials) != len(members) or not is_ascending or type(swarm) is not bool:
         raise ValueError("unknown sections, or a serial that is not unique")
-    settings = FleetSettings(**facts)
-    check_settings(settings)
-    return Fleet(authority, successor, bulletin, published, next_serial, settings, members)
+    check_suite(suite)
+    return Fleet(authority, bulletin, published, suite, swarm, next_serial, members)
 
 
 def _member(section: dict[str, Any], authority: AuthorityKey) -> Member:
@@ -255,9 +253,6 @@ def _member(section: dict[str, Any], authority: AuthorityKey) -> Member:
     return member
 
 
-def check_settings(settings: FleetSettings) -> None:
-    for setting in fields(FleetSettings):
-        if not isinstance(getattr(settings, setting.name), bool if setting.name == "swarm" else str):
-            raise FleetError(f"{setting.name} has a value of the wrong type")
-    if settings.suite not in SUITES_BY_NAME:
-        raise FleetError(f'the suite "{settings.suite}" does not exist: use one of {", ".join(SUITES_BY_NAME)}')
+def check_suite(suite: str) -> None:
+    if suite not in SUITES_BY_NAME:
+        raise FleetError(f'the suite "{suite}" does not exist: use one of {", ".join(SUITES_BY_NAME)}')

@@ -21,7 +21,7 @@ from uavlinkd.authority.certificates import (
 )
 from uavlinkd.authority.enrolment import FleetError
 from uavlinkd.config.load import read_toml
-from uavlinkd.fleet.manifest import Fleet, FleetSettings, Member, check_settings, parse_addresses
+from uavlinkd.fleet.manifest import Fleet, Member, check_suite, parse_addresses
 from uavlinkd.protocol.crypto import AuthorityKey
 from uavlinkd.protocol.drops import Drop
 from uavlinkd.system.base64_text import from_base64
@@ -55,11 +55,9 @@ def _recovered(sources: list[dict[str, Any]]) -> Fleet:
     (text,) = {source["fleet"]["authority"] for source in sources}
     authority = AuthorityKey(from_base64(text))
     members, serials = dict[int, Member](), list[int]()
-    successor, published, bulletin = bytes(32), b"", None
-    settings = FleetSettings()
+    published, bulletin, suite, swarm = b"", None, "x25519", False
     for source in sources:
         facts = source["fleet"]
-        successor = from_base64(facts["successor"]) if "successor" in facts else successor
         data = from_base64(facts["bulletin"])
         if (each := verified_bulletin(data, authority)) is None:
             raise ValueError("not signed")
@@ -68,18 +66,17 @@ def _recovered(sources: list[dict[str, Any]]) -> Fleet:
         if "certificate" in facts:  # its key is in another file
             serials.append(parse_certificate(from_base64(facts["certificate"])).serial)
         if "link" in source:
-            suites = source["link"].get("suites") or [settings.suite]
-            settings = FleetSettings(suite=suites[0], swarm="vehicle" in facts.get("call", ()))
+            suite, swarm = (source["link"].get("suites") or [suite])[0], "vehicle" in facts.get("call", ())
         for contact in source.get("contact", ()):
             member = _member(contact, authority)
             if member.addresses or member.certificate.serial not in members:
                 members[member.certificate.serial] = member
     assert bulletin is not None
-    check_settings(settings)
+    check_suite(suite)
     serials += [*members, bulletin.least, *bulletin.revoked]
     next_serial = min(max(serials) + SERIALS_LEFT_OUT, LAST_SERIAL)
     known = tuple(members[serial] for serial in sorted(members))
-    return Fleet(authority, successor, bulletin, published, next_serial, settings, known)
+    return Fleet(authority, bulletin, published, suite, swarm, next_serial, known)
 
 
 def _member(contact: dict[str, Any], authority: AuthorityKey) -> Member:

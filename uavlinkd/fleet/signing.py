@@ -20,7 +20,7 @@ from uavlinkd.authority.certificates import (
 )
 from uavlinkd.authority.enrolment import FleetError, check_name
 from uavlinkd.config.keys import is_canonical_public_key
-from uavlinkd.fleet.manifest import Fleet, FleetSettings, Member
+from uavlinkd.fleet.manifest import Fleet, Member
 from uavlinkd.protocol.crypto import AuthorityKey, SigningKey, is_usable_public_key
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.base64_text import from_base64
@@ -47,10 +47,9 @@ class Identity(NamedTuple):
         )
 
 
-def new_fleet(signer: SigningKey, successor: bytes, settings: FleetSettings) -> Fleet:
+def new_fleet(signer: SigningKey, suite: str = "x25519", *, swarm: bool = False) -> Fleet:
     bulletin = Bulletin(fleet_id_of(signer.public), 1, 1, ())
-    signed = _published(signer, bulletin)
-    return Fleet(AuthorityKey(signer.public), successor, bulletin, signed, settings=settings)
+    return Fleet(AuthorityKey(signer.public), bulletin, _published(signer, bulletin), suite, swarm)
 
 
 def certify(
@@ -95,8 +94,8 @@ def certify(
     fleet = replace(fleet, members=(*kept, member), next_serial=fleet.next_serial + 1)
     if not addresses and not fleet.contacts_of(name):
         raise FleetError(
-            f"{name} would find no other member: a relay is needed (init --relay HOST:PORT, or add --role relay), or"
-            " an operator with an address that vehicles reach (init --station-address, or --address)"
+            f"{name} would find no other member: first sign a relay (--role relay --address HOST:PORT), or an"
+            " operator with an address that vehicles reach (--role operator --address HOST:PORT)"
         )
     return fleet
 

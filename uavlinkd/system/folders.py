@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from pathlib import Path
 
 _CAN_SYNC = hasattr(os, "geteuid")  # Windows cannot open a folder
@@ -26,3 +27,19 @@ def sync_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def replace_file(path: Path, data: bytes) -> None:
+    """Replace a file: after a power cut it has the old content or the new one, and when this returns, the new one.
+
+    Raises OSError: then the file has the old content, or perhaps will have it after a power cut.
+    """
+    new = path.with_name(f".{path.name}.new")
+    try:
+        write_new(new, data)
+        new.replace(path)
+    except OSError:
+        with suppress(OSError):
+            new.unlink()  # the disk may be full
+        raise
+    sync_folder(path.parent)
