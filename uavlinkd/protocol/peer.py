@@ -1,7 +1,7 @@
-"""The state of the link with one peer.
+"""The state of the link with one peer: its keys, its paths, its frames, and its liveness.
 
-Functions change it, in modules by topic: :mod:`.send`, :mod:`.receive`, :mod:`.freshness`, :mod:`.establish` and
-:mod:`.timeouts`. Each function returns what the shell has to do.
+Functions change it, in modules by topic: :mod:`.send`, :mod:`.receive`, :mod:`.freshness`, :mod:`.establish`,
+:mod:`.probing` and :mod:`.timeouts`. Each function returns what the shell has to do.
 """
 
 from __future__ import annotations
@@ -87,65 +87,73 @@ class Peer:
         self.settings = settings
         self.name = settings.name
         self.durations = timers = settings.link.timers
-        self.silence_s = min(timers.echo_after_s, timers.handshake_after_s, timers.lost_after_s)
-        """A silence is acted on after this, or later."""
-        self.verify_interval_s = settings.link.verify_interval_s
-        """Of the sessions that are made from now on."""
+        self.traffic = Traffic()
+        self.reports = OwnReports()
+        self.claims = Claims()
+
+        # Keys.
         self.indices = shared.indices
         self.entropy = shared.entropy
-        self.screen = shared.screen
-        """Tells frames that may be old from those that must be new."""
-        self.timers = TimerTable()
-        self.traffic = Traffic()
-        self.losses = MissingEnvelopes()
         self.initiator = Initiator(settings, identity, shared.indices, shared.entropy, shared.facts, now)
         self.sessions = Sessions(shared.indices, self.name, has_smaller_key=identity.public < settings.public_key)
-        self.echo_requests = EchoRequests(shared.entropy)
+        self.established_at: float | None = None
+        self.offered_at = -c.NEVER
+        """When the features changed that this side offers."""
+        self.provisional_until = c.NEVER
+        """When it is removed: until its first envelope, if it is known by a certificate that it showed."""
+        self.hinted_at = -c.NEVER
+        self.remembered: deque[bytes] = deque()
+        """Ephemerals of its initiations, the oldest first."""
         self.answers = TokenBucket(*c.ANSWERS, now)
         """Responses that it may get without a cookie."""
         self.answers_while_up = TokenBucket(*c.ANSWERS_WHILE_UP, now)
         self.cookied_answers = TokenBucket(c.COOKIED_ANSWERS_PER_S, c.COOKIED_ANSWERS_PER_S, now)
         """Responses that it may get with cookies, at all addresses together."""
-        self.candidate_questions = TokenBucket(c.CANDIDATE_QUESTIONS_PER_S, c.CANDIDATE_QUESTIONS, now)
-        """Questions to addresses that it named and that never answered."""
         self.group_work = TokenBucket(*c.GROUP_WORK_PER_PEER, now)
         """CPU time for the groups of its suites that it may cause from anywhere."""
         self.proven_group_work = TokenBucket(*c.GROUP_WORK_PER_PEER, now)
-        """The same in addition, where it proves to be at its own address."""
-        self.remembered: deque[bytes] = deque()
-        """Ephemerals of its initiations, the oldest first."""
-        self.recent: list[tuple[float, bytes]] = []
-        """Critical envelopes, and when they were sent, if a path leads through a relay: a new path may carry them."""
+        """CPU time that it may cause in addition where it proves to be at its own address."""
+
+        # Paths.
         self.paths = PathSet(settings.link.redundancy, settings.link.idle_probe_s, shared.known, shared.facts)
         """Where the peer is, or may be."""
-        self.early: EarlyFrames | None = None
-        """Its frames that wait for others along a slower path; None before it has several paths."""
         self.paths.reports_single = bool(settings.link.features & c.FEATURE_RECORDS)
-        self.handshake_s = 0.0
-        """How long the last response took; 0 after a question was answered since."""
-        self.set_waits()
-        self.is_up = False
-        self.provisional_until = c.NEVER
-        """When it is removed: until its first envelope, if it is known by a certificate that it showed."""
-        self.offered_at = -c.NEVER
-        """When the features changed that this side offers."""
-        self.established_at: float | None = None
-        self.received_at: float | None = None
-        """When an envelope or response that is known to be new arrived last."""
-        self.round_trip_s: float | None = None
+        self.losses = MissingEnvelopes()
+        self.candidate_questions = TokenBucket(c.CANDIDATE_QUESTIONS_PER_S, c.CANDIDATE_QUESTIONS, now)
+        """Questions to addresses that it named and that never answered."""
+
+        # Frames.
+        self.screen = shared.screen
+        """Tells frames that may be old from those that must be new."""
+        self.verify_interval_s = settings.link.verify_interval_s
+        """How often freshness is verified in the sessions that are made from now on."""
         self.unverified_since: float | None = None
         """Since when frames that must be new are held, because no answers arrive; None while they are verified."""
+        self.early: EarlyFrames | None = None
+        """Its frames that wait for others along a slower path; None before it has several paths."""
+        self.recent: list[tuple[float, bytes]] = []
+        """Critical envelopes, and when they were sent, if a path leads through a relay: a new path may carry them."""
+
+        # Liveness.
+        self.timers = TimerTable()
+        self.is_up = False
+        self.received_at: float | None = None
+        """When an envelope or response that is known to be new arrived last."""
         self.sent_at = now
         """When an envelope was sent last."""
         self.unanswered_since: float | None = None
         """When the first envelope was sent since one was received; None if none was."""
+        self.echo_requests = EchoRequests(shared.entropy)
         self.asked_at = -c.NEVER
         """When an echo request was sent last."""
         self.echo_at = c.NEVER
         """Ask for an echo then, if still nothing was received."""
-        self.hinted_at = -c.NEVER
-        self.reports = OwnReports()
-        self.claims = Claims()
+        self.round_trip_s: float | None = None
+        self.handshake_s = 0.0
+        """How long the last response took; 0 after a question was answered since."""
+        self.silence_s = min(timers.echo_after_s, timers.handshake_after_s, timers.lost_after_s)
+        """A silence is acted on after this, or later."""
+        self.set_waits()
 
     @property
     def path(self) -> Path | None:

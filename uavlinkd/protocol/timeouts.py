@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 from uavlinkd.protocol import freshness, probing
 from uavlinkd.protocol.constants import NEVER
 from uavlinkd.protocol.establish import initiate
@@ -9,28 +11,6 @@ from uavlinkd.protocol.outputs import Output, PathSuspected
 from uavlinkd.protocol.peer import Peer
 from uavlinkd.protocol.send import ask_for_echo
 from uavlinkd.protocol.timers import Timer
-
-
-def handle_timeout(peer: Peer, now: float) -> list[Output]:
-    """Do what is due at ``now``."""
-    out: list[Output] = []
-    for timer in peer.timers.expired(now):
-        match timer:
-            case Timer.EXPIRY:
-                out += _expire(peer, now)
-            case Timer.FRESHNESS:
-                out += freshness.handle_timeout(peer, now)
-            case Timer.PATHS:
-                out += probing.handle_timeout(peer, now)
-            case Timer.SILENCE:
-                out += _handle_silence(peer, now)
-            case Timer.INITIATE:
-                out += _initiate(peer, now)
-            case Timer.PROBE:
-                out += _probe(peer, now)
-            case Timer.KEEPALIVE:  # pragma: no branch  # the last one
-                out += _keep_alive(peer, now)
-    return out
 
 
 def _expire(peer: Peer, now: float) -> list[Output]:
@@ -83,16 +63,15 @@ def _initiate(peer: Peer, now: float) -> list[Output]:
 
 def _probe(peer: Peer, now: float) -> list[Output]:
     session = peer.sending_session()
-    return (
-        [] if session is None or peer.paths.best is None else ask_for_echo(peer, session, now, peer.paths.echo_route)
-    )
+    if session is None or peer.paths.best is None:
+        return []
+    return ask_for_echo(peer, session, now, peer.paths.echo_route)
 
 
 def _keep_alive(peer: Peer, now: float) -> list[Output]:
-    session = peer.sending_session()
-    if session is None or peer.paths.best is None:
+    if peer.sending_session() is None or peer.paths.best is None:
         return []  # the next session sets the timer
-    out = ask_for_echo(peer, session, now, peer.paths.echo_route) if now >= _keepalive_at(peer) else []
+    out = _probe(peer, now) if now >= _keepalive_at(peer) else []
     peer.timers.set(Timer.KEEPALIVE, _keepalive_at(peer))
     return out
 
@@ -104,3 +83,19 @@ def _keepalive_at(peer: Peer) -> float:
     """
     is_idle = peer.timers.deadlines[Timer.PROBE] == NEVER
     return (peer.asked_at if is_idle else peer.sent_at) + peer.durations.keepalive_s
+
+
+_HANDLERS: Final = {
+    Timer.EXPIRY: _expire,
+    Timer.FRESHNESS: freshness.handle_timeout,
+    Timer.PATHS: probing.handle_timeout,
+    Timer.SILENCE: _handle_silence,
+    Timer.INITIATE: _initiate,
+    Timer.PROBE: _probe,
+    Timer.KEEPALIVE: _keep_alive,
+}
+
+
+def handle_timeout(peer: Peer, now: float) -> list[Output]:
+    """Do what is due at ``now``. Each handler sets its timer again."""
+    return [output for timer in peer.timers.expired(now) for output in _HANDLERS[timer](peer, now)]
