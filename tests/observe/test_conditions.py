@@ -14,7 +14,7 @@ from tests.protocol.harness import Named
 from uavlinkd.config.model import ConfigError, Problem
 from uavlinkd.daemon import daemon
 from uavlinkd.daemon.journal import DaemonJournal
-from uavlinkd.observe.conditions import HOUR_S, QUIET_S, Conditions, OpenCondition, Phase
+from uavlinkd.observe.conditions import HOUR_S, QUIET_S, Conditions, Limit, OpenCondition, Phase
 from uavlinkd.observe.event_log import ENDED_PROBLEMS, ENDPOINT_DELAY_S, FINDING_DELAY_S, EventLog
 from uavlinkd.observe.finding import Finding, Severity, Subject
 from uavlinkd.ops import line_limits
@@ -30,14 +30,10 @@ Key = tuple[str, str]
 class Written:
     """Conditions that record their lines: phase, key, count, duration, omitted lines."""
 
-    def __init__(self, limits: LineLimits | None = None, kind: str = "drop", *, counts_events: bool = False) -> None:
+    def __init__(self) -> None:
         self.lines: list[tuple[Phase, Key, int, float, int]] = []
         self.conditions = Conditions[Key](
-            kind,
-            limits or LineLimits(),
-            self._write,
-            lambda key: (key[1], key[0] == "bad_tag"),
-            counts_events=counts_events,
+            LineLimits(), self._write, lambda key: Limit("drop", key[1], key[0] == "bad_tag")
         )
 
     def _write(self, key: Key, phase: Phase, condition: OpenCondition, omitted: dict[str, int]) -> None:
@@ -151,22 +147,6 @@ def test_last_lines_are_written_when_the_daemon_stops() -> None:
     written.conditions.close()
     assert written.phases() == LINES_BURST * [ENDED] + 2 * [BEGAN]
     assert {line[2] for line in written.lines} == {7}
-
-
-@pytest.mark.parametrize("reason", ["bad_tag", "malformed"])
-def test_flood_is_not_hidden_by_a_condition_that_is_open_already(reason: str) -> None:
-    """One in 30 s for eight hours, then 1,000/s for six: a line for each growth by ten, for security."""
-    written = Written(counts_events=True)
-    key = (reason, "b")
-    written.run(key, begin=0, end=8 * HOUR_S, step=30)
-    assert written.phases() == [BEGAN] + 3 * [CONTINUED]
-    written.lines.clear()
-    for second in range(6 * int(HOUR_S)):
-        written.conditions.note(key, 8 * HOUR_S + second, 1000)
-        written.conditions.check(8 * HOUR_S + second)
-        if second == 30 and reason == "bad_tag":
-            assert written.phases() == [CONTINUED], "the flood has a line soon"
-    assert len(written.lines) <= (6 if reason == "bad_tag" else 0)
 
 
 # Events in the log: findings, and the limit on lines.

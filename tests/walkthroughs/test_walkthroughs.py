@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing
@@ -209,9 +210,8 @@ def test_fleet(walk: Walk) -> None:
     walk.follow(blocks[before:])
 
     converse(walk, {1: autopilots[1]}, station)
-    status = laptop.run("uavlinkd status --config gs.toml")
-    assert "drone1" in status
-    assert "drone2" not in status
+    status = laptop.run("uavlinkd status --json --config gs.toml")
+    assert list(json.loads(status)["peers"]) == ["drone1"]
 
 
 def test_vehicle_behind_nat(walk: Walk) -> None:

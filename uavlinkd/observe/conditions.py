@@ -1,8 +1,7 @@
 """Conditions in the log: one line at the beginning, fewer and fewer while it lasts, and one at the end.
 
-A condition is a kind of drop, a link problem, or a finding. It is open from its first occurrence
-until it did not occur for its quiet time. A condition that soon begins again has a longer quiet time, so a problem
-that comes and goes all day causes a few lines, not two each time.
+A condition is a kind of drop or a finding. It is open from its first occurrence until it did not occur for its quiet
+time.
 """
 
 from __future__ import annotations
@@ -10,23 +9,16 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from enum import Enum
-from typing import Generic, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 from uavlinkd.ops.line_limits import LineLimits
 
 HOUR_S = 3600.0
 """A condition that lasts has a line after an hour, then after two more, four more and so on, up to a day."""
 LONGEST_INTERVAL_S = 24 * HOUR_S
-GROWTH = 10
-"""A security condition has an early line if it occurred this many times as often since its last line as that line
-added. So a few datagrams, which keep it open, cannot hide a flood."""
-GROWTH_FROM = 1000
-"""Occurrences since its last line that are worth an early one."""
-EARLY_S = 600.0
-"""No early line comes sooner after the last one."""
 QUIET_S = 60.0
 """A condition has ended when it did not occur for this long. If it begins again within :data:`HOUR_S`, this time is
-doubled, up to :data:`HOUR_S`."""
+doubled, up to :data:`HOUR_S`: a problem that comes and goes all day causes a few lines, not two each time."""
 
 K = TypeVar("K", bound=Hashable)
 
@@ -37,6 +29,16 @@ class Phase(Enum):
     BEGAN = "began"
     CONTINUED = "continued"
     ENDED = "ended"
+
+
+class Limit(NamedTuple):
+    """The limit that applies to a condition's lines: the kind of line, and the peer or endpoint."""
+
+    kind: str
+    name: str
+    is_security: bool
+    """Security lines have a kind of their own, so everyday lines cannot use up their limit. The first line of each
+    security condition since the start needs no limit."""
 
 
 @dataclass(slots=True)
@@ -53,17 +55,8 @@ class OpenCondition:
     """All occurrences since it began."""
     is_logged: bool = False
     """Whether its first line was written."""
-    counted: int = 0
-    """The count of its previous line."""
-    gained: int = 0
-    """What the previous line added to the count."""
     interval_s: float = HOUR_S
     """From its previous line to the next one."""
-
-    def note_line(self, now: float) -> None:
-        """A line is written now."""
-        self.gained, self.counted = self.count - self.counted, self.count
-        self.line_at = now + self.interval_s
 
     @property
     def duration_s(self) -> float:
@@ -75,26 +68,18 @@ class Conditions(Generic[K]):
     """The open conditions of one kind, by key. Keys come from closed lists and the configuration: memory is bounded.
 
     ``write`` gets a line that is within the limits: key, phase, condition, and the field of omitted lines.
-    ``limit_of`` returns the peer or endpoint whose limit applies, and whether it is that of security lines. The first
-    line of a security condition since the start of the daemon is never omitted. ``counts_events``: counts are of what
-    occurred, not of looks at what lasts.
     """
 
     def __init__(
         self,
-        kind: str,
         limits: LineLimits,
         write: Callable[[K, Phase, OpenCondition, dict[str, int]], None],
-        limit_of: Callable[[K], tuple[str, bool]],
-        *,
-        counts_events: bool = False,
+        limit_of: Callable[[K], Limit],
         quiet_s: float = QUIET_S,
     ) -> None:
-        self._kind = kind
         self._limits = limits
         self._write = write
         self._limit_of = limit_of
-        self._counts_events = counts_events
         self._quiet_s = quiet_s
         self._open: dict[K, OpenCondition] = {}
         self._ended: dict[K, tuple[float, float]] = {}  # when, and with which quiet time
@@ -109,8 +94,7 @@ class Conditions(Generic[K]):
 
     def note(self, key: K, now: float, count: int = 1) -> None:
         """The condition occurs now: ``count`` times, or still."""
-        condition = self._open.get(key)
-        if condition is not None:
+        if (condition := self._open.get(key)) is not None:
             condition.count += count
             condition.seen_at = now
             return
@@ -127,12 +111,9 @@ class Conditions(Generic[K]):
                 self._end(key, condition, now)
             elif not condition.is_logged:
                 self._begin(key, condition, now)
-            elif (now >= condition.line_at or self._is_flood(key, condition, now)) and (
-                omitted := self._take(key, now)
-            ) is not None:
-                if now >= condition.line_at:
-                    condition.interval_s = min(LONGEST_INTERVAL_S, 2 * condition.interval_s)
-                condition.note_line(now)
+            elif now >= condition.line_at and (omitted := self._take(key, now)) is not None:
+                condition.interval_s = min(LONGEST_INTERVAL_S, 2 * condition.interval_s)
+                condition.line_at = now + condition.interval_s
                 self._write(key, Phase.CONTINUED, condition, omitted)
 
     def close(self, is_closed: Callable[[K], bool] = lambda _: True) -> None:
@@ -140,31 +121,24 @@ class Conditions(Generic[K]):
         for key in [key for key in self._open if is_closed(key)]:
             condition = self._open.pop(key)
             phase = Phase.ENDED if condition.is_logged else Phase.BEGAN
-            self._write(key, phase, condition, self._limits.pop_omitted(self._kind, self._limit_of(key)[0]))
+            self._write(key, phase, condition, self._limits.pop_omitted(*self._line(key)))
         for key in [key for key in self._known if is_closed(key)]:
             self._known.remove(key)
             self._ended.pop(key, None)
 
     def _begin(self, key: K, condition: OpenCondition, now: float) -> None:
-        if key not in self._known and self._limit_of(key)[1]:
-            omitted: dict[str, int] | None = self._limits.pop_omitted(self._kind, self._limit_of(key)[0])
-        else:
-            omitted = self._take(key, now)
+        omitted = self._take(key, now)
+        if omitted is None and key not in self._known and self._limit_of(key).is_security:
+            omitted = self._limits.pop_omitted(*self._line(key))
         if omitted is not None:
             self._known.add(key)
             condition.is_logged = True
-            condition.note_line(now)
+            condition.line_at = now + condition.interval_s
             self._write(key, Phase.BEGAN, condition, omitted)
-
-    def _is_flood(self, key: K, one: OpenCondition, now: float) -> bool:
-        """Whether a security condition occurs far more often than its previous line says."""
-        is_early = now < one.line_at - one.interval_s + EARLY_S
-        has_grown = one.count - one.counted >= max(GROWTH_FROM, GROWTH * one.gained)
-        return self._counts_events and not is_early and has_grown and self._limit_of(key)[1]
 
     def _end(self, key: K, condition: OpenCondition, now: float) -> None:
         if not condition.is_logged:
-            self._limits.omit(self._kind, self._limit_of(key)[0])
+            self._limits.omit(*self._line(key))
         elif (omitted := self._take(key, now)) is not None:
             self._write(key, Phase.ENDED, condition, omitted)
         else:  # the line waits until the limit permits it
@@ -172,6 +146,10 @@ class Conditions(Generic[K]):
         del self._open[key]
         self._ended[key] = now, condition.quiet_s
 
+    def _line(self, key: K) -> tuple[str, str]:
+        """The kind of line, and the name whose limit applies."""
+        limit = self._limit_of(key)
+        return f"security {limit.kind}" if limit.is_security else limit.kind, limit.name
+
     def _take(self, key: K, now: float) -> dict[str, int] | None:
-        name, is_security = self._limit_of(key)
-        return self._limits.take(self._kind, name, now, is_security=is_security)
+        return self._limits.take(*self._line(key), now)

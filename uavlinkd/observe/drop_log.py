@@ -13,7 +13,7 @@ from uavlinkd.daemon.journal import DaemonJournal, Fact, Key
 from uavlinkd.mavlink.dialect import name_of
 from uavlinkd.mavlink.headers import Header
 from uavlinkd.mavlink.policy.gate import Refusal
-from uavlinkd.observe.conditions import Conditions, OpenCondition, Phase
+from uavlinkd.observe.conditions import Conditions, Limit, OpenCondition, Phase
 from uavlinkd.ops.line_limits import LineLimits
 from uavlinkd.ops.log import shown
 from uavlinkd.protocol.constants import PROTOCOL_VERSION
@@ -67,11 +67,9 @@ class DropLog:
         self._limits = limits or LineLimits()
         self._kinds: dict[Key, _Kind] = {}
         self._conditions = Conditions[Key](
-            "drop",
             self._limits,
             self._write,
-            lambda key: (key[2], self._kinds[key].attention is Attention.SECURITY),
-            counts_events=True,
+            lambda key: Limit("drop", key[2], self._kinds[key].attention is Attention.SECURITY),
         )
 
     def plain_totals(self) -> dict[str, int]:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 
 from structlog.typing import FilteringBoundLogger
 
-from uavlinkd.observe.conditions import Conditions, OpenCondition, Phase
+from uavlinkd.observe.conditions import Conditions, Limit, OpenCondition, Phase
 from uavlinkd.observe.finding import Finding, Severity, Subject
 from uavlinkd.ops.line_limits import LineLimits
 from uavlinkd.ops.log import shown
@@ -47,19 +47,18 @@ class EventLog:
         self._present: dict[_FindingKey, float] = {}  # since when
         self._ended = deque[tuple[Finding, float, float]](maxlen=ENDED_PROBLEMS)  # when they began and ended
         self._finding_conditions = Conditions[_FindingKey](
-            "finding",
             self._limits,
             self._write_finding,
-            lambda key: (key[2], self._findings[key].severity is Severity.SECURITY),
-            quiet_s=FINDING_QUIET_S,
+            lambda key: Limit("finding", key[2], self._findings[key].severity is Severity.SECURITY),
+            FINDING_QUIET_S,
         )
 
     def check(self, now: float) -> None:
         """Write the lines that are due. Call it about once a second."""
-        for state in list(self._omitted_states.values()):
-            if self._limits.are_used_up("peer", now):
-                break
-            self._write_event(state, now)
+        for name, state in list(self._omitted_states.items()):
+            if (omitted := self._limits.take("peer", name, now)) is not None:
+                del self._omitted_states[name]
+                self._write_event(state, omitted)
         self._finding_conditions.check(now)
 
     def close(self) -> None:
@@ -76,26 +75,22 @@ class EventLog:
 
     def write(self, event: o.Event, now: float) -> None:
         """Write an event, within the limit of its peer. ``now`` is monotonic seconds."""
-        if isinstance(event, o.SessionEstablished) and event.rekey:
-            omitted = self._limits.take("debug", event.peer.name, now)
-            if omitted is not None:
-                self._log.debug("session_established", peer=event.peer.name, **_session_facts(event), **omitted)
-            return
-        self._write_event(event, now)
-
-    def _write_event(self, event: o.Event, now: float) -> None:
         name = event.peer.name
-        omitted, earlier = self._limits.take("peer", name, now), self._omitted_states.pop(name, None)
+        is_debug = isinstance(event, o.SessionEstablished) and event.rekey
+        kind = "debug" if is_debug else "peer"
+        omitted = self._limits.take(kind, name, now)
         if omitted is None:
-            if earlier is not event and (earlier is not None or not isinstance(event, _State)):
-                self._limits.omit("peer", name)
-            # A state is written later, so that the log ends with the state of the link.
-            if (state := event if isinstance(event, _State) else earlier) is not None:
-                self._omitted_states[name] = state
+            if not isinstance(event, _State) or name in self._omitted_states:
+                self._limits.omit(kind, name)
+            if isinstance(event, _State):  # it is written later: the log ends with the state of the link
+                self._omitted_states[name] = event
             return
-        if earlier is not None and earlier is not event:
+        if not is_debug and self._omitted_states.pop(name, None) is not None:
             omitted["omitted_before"] = omitted.get("omitted_before", 0) + 1
-        log = self._log.bind(peer=name, **omitted)
+        self._write_event(event, omitted)
+
+    def _write_event(self, event: o.Event, omitted: Mapping[str, int]) -> None:
+        log = self._log.bind(peer=event.peer.name, **omitted)
         match event:
             case o.PeerUp():
                 log.info("peer_up")
@@ -112,6 +107,8 @@ class EventLog:
                     log.info("path_usable")
                 elif reason != "closed":  # which `relay_disconnected` explains, often on purpose
                     log.warning("path_down")
+            case o.SessionEstablished(rekey=True):
+                log.debug("session_established", **_session_facts(event))
             case o.SessionEstablished():
                 log.info("session_established", **_session_facts(event))
 

@@ -19,29 +19,22 @@ TOTAL_BURST = 1000
 class LineLimits:
     """The limits on lines that others can cause: of each peer or endpoint, and in total.
 
-    Each kind of line has its own limits, and security lines have separate ones, which everyday lines cannot use up.
-    The next line of a name has the count of its omitted lines.
+    Each kind of line has its own limits. The next line of a name has the count of its omitted lines.
     """
 
     def __init__(self) -> None:
-        self._limits: dict[tuple[str, str | None, bool], TokenBucket] = {}  # by kind, name (None: all), and security
+        self._limits: dict[tuple[str, str | None], TokenBucket] = {}  # by kind and name; None: all
         self._omitted: Counter[tuple[str, str]] = Counter()
 
-    def take(self, kind: str, name: str, now: float, *, is_security: bool = False) -> dict[str, int] | None:
+    def take(self, kind: str, name: str, now: float) -> dict[str, int] | None:
         """The field with the count of omitted lines; None if this line exceeds a limit."""
-        limit = self._limit((kind, name, is_security), LINES_PER_S, LINES_BURST, now)
-        total = self._limit((kind, None, is_security), TOTAL_LINES_PER_S, TOTAL_BURST, now)
+        limit = self._limits.get((kind, name)) or TokenBucket(LINES_PER_S, LINES_BURST, now)
+        total = self._limits.get((kind, None)) or TokenBucket(TOTAL_LINES_PER_S, TOTAL_BURST, now)
+        self._limits |= {(kind, name): limit, (kind, None): total}
         if not (limit.has(now) and total.take(now)):
             return None
         limit.take(now)
         return self.pop_omitted(kind, name)
-
-    def are_used_up(self, kind: str, now: float) -> bool:
-        """Whether no name may have a line of this kind now, except a security line."""
-        return not self._limit((kind, None, False), TOTAL_LINES_PER_S, TOTAL_BURST, now).has(now)
-
-    def _limit(self, key: tuple[str, str | None, bool], rate: float, burst: int, now: float) -> TokenBucket:
-        return self._limits.get(key) or self._limits.setdefault(key, TokenBucket(rate, burst, now))
 
     def pop_omitted(self, kind: str, name: str) -> dict[str, int]:
         """The field with the count of omitted lines, for a line that is written in any case."""
