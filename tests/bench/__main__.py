@@ -14,7 +14,7 @@ from typing import Final
 from tests.bench.contenders import Contender, all_contenders
 from tests.bench.frames import FrameSet, load_frames
 from tests.bench.measure import DISTURBED_MOST, EVEN_S, NO_LOSS
-from tests.bench.run import QUICK, SCALES, Plan, Run, laboratory
+from tests.bench.run import QUICK, Plan, Run, laboratory
 from tests.bench.traffic import TrafficError
 from tests.namespaces import NamespaceError, why_not
 from uavlinkd.lab.child_processes import interrupted_by_signals
@@ -25,9 +25,6 @@ PAGE: Final = "RESULTS.md"
 SHOWN: Final[Mapping[str, Sequence[str]]] = {
     "rate": ("cpu_left_us", "cpu_right_us", "loss", "latencies_s", "rss_left", "rss_right", "wire_bytes_per_frame"),
     "highest": ("highest",),
-    "peers": ("cpu_right_us", "loss"),
-    "memory": ("rss",),
-    "start": ("ready_s", "cpu_s", "rss"),
 }
 """By the kind of a record, the values of which the page has the medians."""
 LATENCIES: Final = (0.5, 0.99, 0.999)
@@ -85,7 +82,7 @@ RECORDS = "records"
 def main(arguments: Sequence[str] | None = None) -> int:
     """Exit status: 0 done, 1 failed, 2 the command line is wrong."""
     contenders = {contender.name: contender for contender in all_contenders()}
-    names = [*contenders, *SCALES]
+    names = [*contenders]
     parser = argparse.ArgumentParser(prog="python -m tests.bench", description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("bench-results"), help="where records and table go")
     parser.add_argument("--rounds", type=int, help=f"how often each is measured, in turn ({Plan().rounds})")
@@ -103,8 +100,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return FAILED
     wanted = options.only or names
     chosen = [contender for name, contender in contenders.items() if name in wanted]
-    scales = [name for name in SCALES if name in wanted]
-    return _run(plan, options.out, chosen, scales, _command(options))
+    return _run(plan, options.out, chosen, _command(options))
 
 
 def _command(options: argparse.Namespace) -> str:
@@ -116,12 +112,12 @@ def _command(options: argparse.Namespace) -> str:
     return " ".join(words)
 
 
-def _run(plan: Plan, out: Path, contenders: Sequence[Contender], scales: Sequence[str], command: str) -> int:
+def _run(plan: Plan, out: Path, contenders: Sequence[Contender], command: str) -> int:
     frames = load_frames()
     facts = {**machine_facts(), **_facts(plan, frames, contenders), "command": command}
     try:
         with interrupted_by_signals(), laboratory(frames) as bench, RecordWriter(out, RECORDS, facts) as writer:
-            Run(plan, bench, writer, lambda line: print(line, flush=True)).all(contenders, scales)
+            Run(plan, bench, writer, lambda line: print(line, flush=True)).all(contenders)
     except KeyboardInterrupt:
         print(f"interrupted: what was measured until then is in {out}", file=sys.stderr)
         with suppress(EvaluationError):  # nothing was measured yet

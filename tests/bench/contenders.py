@@ -112,6 +112,6 @@ def until(condition: Callable[[], bool], what: str, timeout_s: float = 20.0) -> 
 
 def all_contenders() -> Sequence[Contender]:
     from tests.bench.daemons import DAEMONS
-    from tests.bench.tunnels import ROUTERS, TUNNELS
+    from tests.bench.tunnels import TUNNELS
 
-    return (Relay("relay-uvloop"), *DAEMONS, *TUNNELS, *ROUTERS)
+    return (Relay("relay-uvloop"), *DAEMONS, *TUNNELS)

@@ -47,8 +47,6 @@ class Bench:
 
     cable: Cable
     traffic: Traffic
-    frames: Path
-    """Those that are sent, for another sender."""
 
 
 def used(running: Running) -> Used:

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from tests.bench import scale
 from tests.bench.cable import Cable
 from tests.bench.contenders import Contender, NotMeasuredError, Running, last_words
 from tests.bench.frames import FrameSet, write_frames
@@ -33,20 +32,11 @@ class Plan:
     """One try of the search for the highest rate; 0: it is not searched."""
     packed: int = 8
     """Frames a datagram, in the second search."""
-    peers: tuple[tuple[int, float], ...] = ((2, 50.0), (2, 5_000.0), (200, 50.0))
-    """How many peers of one daemon, and how many frames a second each sends."""
-    peers_s: float = 5.0
-    memory: tuple[int, ...] = (1, 10, 100)
-    """With how many peers the memory is looked at."""
-    starts: int = 3
-    """In each round."""
 
 
 PATIENCE = 20
 """A contender has so many times 0.6 s to carry its first frame."""
-QUICK = Plan(rounds=1, seconds=(2.0, 2.0), step_s=0.0, peers_s=2.0)
-SCALES = ("peers", "memory", "start")
-"""Measurements of uavlinkd alone."""
+QUICK = Plan(rounds=1, seconds=(2.0, 2.0), step_s=0.0)
 
 
 @contextmanager
@@ -56,7 +46,7 @@ def laboratory(frames: FrameSet) -> Iterator[Bench]:
         path = Path(folder) / "frames"
         write_frames(path, frames.frames)
         sink = Worker(cable.right, "sink", str(SINK_PORT))
-        yield Bench(cable, Traffic(Worker(cable.left, "generator", str(path)), sink), path)
+        yield Bench(cable, Traffic(Worker(cable.left, "generator", str(path)), sink))
 
 
 @contextmanager
@@ -86,7 +76,7 @@ class Run:
         self._writer = writer
         self._say = say
 
-    def all(self, contenders: Sequence[Contender], scales: Sequence[str]) -> None:
+    def all(self, contenders: Sequence[Contender]) -> None:
         """Measure all of them in each round. A contender that is not installed is reported once and left out."""
         left = {contender.name: contender for contender in contenders}
         for number in range(self._plan.rounds):
@@ -94,7 +84,6 @@ class Run:
                 self._say(f"round {number + 1} of {self._plan.rounds}: {name}")
                 if not self._contender(left[name], number):
                     del left[name]
-            self._scales(scales, number)
 
     def _contender(self, contender: Contender, number: int) -> bool:
         """Measure one; returns whether to try it in the next round."""
@@ -104,21 +93,6 @@ class Run:
         except NotMeasuredError as error:
             self._failed("contender", {"contender": contender.name, "round": number}, str(error))
         return contender.why_not() is None
-
-    def _scales(self, scales: Sequence[str], number: int) -> None:
-        plan, bench = self._plan, self._bench
-        for name in scales:
-            self._say(f"round {number + 1} of {plan.rounds}: uavlinkd, {name}")
-            if name == "peers":
-                for peers, rate in plan.peers:
-                    point: dict[str, Value] = {"round": number, "peers": peers, "rate_each": rate}
-                    self.record(name, point, partial(scale.with_peers, bench, peers, rate, plan.peers_s))
-            elif name == "memory":
-                for peers in plan.memory:
-                    self.record(name, {"round": number, "peers": peers}, partial(scale.memory, bench, peers))
-            else:
-                for turn in range(plan.starts):
-                    self.record(name, {"round": number, "turn": turn}, scale.start)
 
     def _measure(self, name: str, number: int, running: Running) -> None:
         plan, bench = self._plan, self._bench
@@ -145,10 +119,7 @@ class Run:
         self._say(f"  not measured: {reason}")
 
 
-_SHOWN = (
-    *("rate", "loss", "cpu_left_us", "cpu_right_us", "wire_bytes_per_frame", "highest", "late_p99_s"),
-    *("ready_s", "rss"),
-)
+_SHOWN = ("rate", "loss", "cpu_left_us", "cpu_right_us", "wire_bytes_per_frame", "highest", "late_p99_s")
 
 
 def _short(value: Value) -> str:

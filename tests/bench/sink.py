@@ -30,7 +30,7 @@ class Count:
     """The frames received."""
 
     def __init__(self, system: int) -> None:
-        self._system = system  # 0: any
+        self._system = system
         self.reset()
 
     def reset(self) -> None:
@@ -48,7 +48,7 @@ class Count:
                 return
             is_mavlink2 = datagram[offset] == PROBE_START[0]
             system = datagram[offset + (5 if is_mavlink2 else 3)]
-            if self._system not in (0, system):
+            if self._system != system:
                 self.others += 1
             else:
                 self.frames += 1
@@ -62,12 +62,12 @@ class Count:
 
 
 def main() -> None:
-    """``sink PORT [SYSTEM]``: listen there on all addresses; SYSTEM is whose frames are counted, 0 for all."""
+    """``sink PORT``: listen there on all addresses."""
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     sock.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, BUFFER_BYTES)
     sock.bind(("0.0.0.0", int(sys.argv[1])))
     sock.setblocking(False)
-    count = Count(int(sys.argv[2]) if len(sys.argv) > 2 else SYSTEM)
+    count = Count(SYSTEM)
     poll = select.poll()
     poll.register(sock, select.POLLIN)
     poll.register(0, select.POLLIN)

@@ -15,7 +15,6 @@ from typing import cast
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from tests.bench import scale
 from tests.bench.cable import Cable
 from tests.bench.contenders import Contender, NotMeasuredError, Running, all_contenders
 from tests.bench.frames import PROBE_EVERY, SYSTEM, is_probe, load_frames, probe, said_by
@@ -69,28 +68,6 @@ def test_frames_arrive_and_figures_are_plausible(bench: Bench, name: str) -> Non
     assert isinstance(latencies, list)
     assert 0 < len(latencies) <= 1_000 // PROBE_EVERY
     assert 0 < min(latencies) <= max(latencies) < 60
-
-
-def test_many_peers_into_one_daemon(bench: Bench) -> None:
-    """All are linked, each sends its part, and only the daemon is measured."""
-    values = scale.with_peers(bench, 3, 100, 1.0)
-    assert values["sent"] == 300
-    assert isinstance(values["received"], int)
-    assert 150 < values["received"] <= 315
-    assert isinstance(values["cpu_right_us"], float)
-    assert 1 < values["cpu_right_us"] < 50_000
-    assert "cpu_left_us" not in values
-
-
-def test_start_is_from_exec_to_ready() -> None:
-    """The daemon reports that it is ready, and has used some time and memory by then."""
-    values = scale.start()
-    assert isinstance(values["ready_s"], float)
-    assert isinstance(values["cpu_s"], float)
-    assert isinstance(values["rss"], int)
-    assert 0.02 < values["cpu_s"] < 30
-    assert 0.02 < values["ready_s"] < scale.READY_S
-    assert 5e6 < values["rss"] < 200e6
 
 
 def test_contender_that_carries_nothing_is_not_measured(
@@ -148,7 +125,7 @@ class Leaky:
 @pytest.mark.parametrize("capacity", [0, 700, 1_999, 3_000, 26_000, 190_000])
 def test_search_finds_the_highest_rate(capacity: float) -> None:
     """Within its 5 %, from below, for any capacity."""
-    bench = Bench(cast(Cable, None), cast(Traffic, Leaky(capacity, 0)), Path())
+    bench = Bench(cast(Cable, None), cast(Traffic, Leaky(capacity, 0)))
     values = highest_rate(bench, Running([], []), 1.0)
     assert isinstance(values["highest"], float | int)
     assert capacity / 1.06 <= values["highest"] <= capacity * 1.01
@@ -156,7 +133,7 @@ def test_search_finds_the_highest_rate(capacity: float) -> None:
 
 def test_search_is_not_deceived_by_buffers() -> None:
     """What waits in a buffer at the end of an attempt would be lost in a longer one."""
-    bench = Bench(cast(Cable, None), cast(Traffic, Leaky(10_000, 1_000_000)), Path())
+    bench = Bench(cast(Cable, None), cast(Traffic, Leaky(10_000, 1_000_000)))
     values = highest_rate(bench, Running([], []), 1.0)
     assert isinstance(values["highest"], float | int)
     assert 9_500 < values["highest"] < 11_200

@@ -1,90 +1,24 @@
-"""VPNs and MAVLink routers: MAVProxy, and a typical script that signs frames with pymavlink.
-
-VPNs have keys made for the run: the generator sends straight to the right host's tunnel address.
-"""
+"""VPNs with keys made for the run: the generator sends straight to the right host's tunnel address."""
 
 from __future__ import annotations
 
-import datetime
 import os
 import subprocess
-import sys
 from abc import abstractmethod
-from collections.abc import Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import Final
 
 from tests.bench.cable import Cable, Host
 from tests.bench.contenders import (
-    INTO_PORT,
     LINK_PORT,
     Contender,
     NotMeasuredError,
     Running,
     command_version,
     needs_command,
-    needs_module,
     until,
 )
-from tests.bench.traffic import REPOSITORY, SINK_PORT
-
-
-class Router(Contender):
-    """A router of a Python package."""
-
-    def __init__(self, name: str, package: str) -> None:
-        super().__init__(name)
-        self._package = package
-
-    def why_not(self) -> str | None:
-        return needs_module(self._package)
-
-    def version(self) -> str | None:
-        return version(self._package)
-
-
-class Mavproxy(Router):
-    """MAVProxy on both hosts, without console, map and modules; it logs as it always does."""
-
-    def start(self, cable: Cable, folder: Path) -> Running:
-        right = self._side(cable.right, folder / "right", f"0.0.0.0:{LINK_PORT}", f"127.0.0.1:{SINK_PORT}")
-        left = self._side(cable.left, folder / "left", f"127.0.0.1:{INTO_PORT}", f"{cable.right.address}:{LINK_PORT}")
-        return Running([left], [right])
-
-    @staticmethod
-    def _side(host: Host, folder: Path, into: str, out: str) -> subprocess.Popen[bytes]:
-        folder.mkdir()
-        script = Path(sys.executable).with_name("mavproxy.py")
-        options = ("--daemon", "--non-interactive", "--streamrate=-1", "--default-modules=", "--mav20")
-        return host.start(
-            [sys.executable, str(script), f"--master=udpin:{into}", f"--out=udpout:{out}", *options],
-            folder=folder,
-            log=folder / "mavproxy.log",
-            environ={"HOME": str(folder)},
-        )
-
-
-class PymavlinkSigning(Router):
-    """The relays of :mod:`tests.bench.signing`: the left one signs, the right one accepts only signed frames."""
-
-    def start(self, cable: Cable, folder: Path) -> Running:
-        key = folder / "signing.key"
-        key.touch(0o600)
-        key.write_bytes(os.urandom(32))
-        verify = (f"udpin:0.0.0.0:{LINK_PORT}", f"udpout:127.0.0.1:{SINK_PORT}")
-        sign = (f"udpin:127.0.0.1:{INTO_PORT}", f"udpout:{cable.right.address}:{LINK_PORT}")
-        right = self._side(cable.right, "verify", verify, key, folder / "right.log")
-        return Running([self._side(cable.left, "sign", sign, key, folder / "left.log")], [right])
-
-    @staticmethod
-    def _side(host: Host, what: str, urls: Sequence[str], key: Path, log: Path) -> subprocess.Popen[bytes]:
-        command = [sys.executable, "-m", "tests.bench.signing", what, *urls, str(key)]
-        return host.start(command, folder=REPOSITORY, log=log, environ={"MAVLINK20": "1"})
-
-
-ROUTERS: Final = (Mavproxy("mavproxy", "MAVProxy"), PymavlinkSigning("pymavlink-signing", "pymavlink"))
-
+from tests.bench.traffic import SINK_PORT
 
 LEFT_TUNNEL: Final = "10.214.0.1"
 RIGHT_TUNNEL: Final = "10.214.0.2"
@@ -183,55 +117,6 @@ class Nebula(Tunnel):
         )
 
 
-class Openvpn(Tunnel):
-    """OpenVPN over UDP, point to point, each side knowing the other's certificate."""
-
-    def _start(self, cable: Cable, folder: Path) -> tuple[subprocess.Popen[bytes], subprocess.Popen[bytes]]:
-        prints = {side: _certificate(folder, side) for side in ("left", "right")}
-        common = [
-            *("--dev", "tun", "--proto", "udp", "--topology", "p2p", "--verb", "3", "--disable-dco"),
-            *("--data-ciphers", "AES-256-GCM", "--keepalive", "10", "60", "--port", str(LINK_PORT)),
-        ]
-        right = [
-            *("openvpn", *common, "--tls-server", "--dh", "none", "--cert", "right.crt", "--key", "right.key"),
-            *("--peer-fingerprint", prints["left"], "--ifconfig", RIGHT_TUNNEL, LEFT_TUNNEL),
-        ]
-        left = [
-            *("openvpn", *common, "--tls-client", "--cert", "left.crt", "--key", "left.key"),
-            *("--peer-fingerprint", prints["right"], "--ifconfig", LEFT_TUNNEL, RIGHT_TUNNEL),
-            *("--remote", cable.right.address, str(LINK_PORT)),
-        ]
-        serving = cable.right.start(right, folder=folder, log=folder / "right.log")
-        return cable.left.start(left, folder=folder, log=folder / "left.log"), serving
-
-
-def _certificate(folder: Path, side: str) -> str:
-    """A key and a certificate signed by itself; its fingerprint as OpenVPN writes it."""
-    from cryptography import x509
-    from cryptography.hazmat.primitives import hashes, serialization
-    from cryptography.hazmat.primitives.asymmetric import ec
-
-    key = ec.generate_private_key(ec.SECP256R1())
-    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, side)])
-    now = datetime.datetime.now(datetime.UTC)
-    certificate = (
-        x509.CertificateBuilder()
-        .subject_name(name)
-        .issuer_name(name)
-        .public_key(key.public_key())
-        .serial_number(x509.random_serial_number())
-        .not_valid_before(now - datetime.timedelta(days=1))
-        .not_valid_after(now + datetime.timedelta(days=1))
-        .sign(key, hashes.SHA256())
-    )
-    (folder / f"{side}.crt").write_bytes(certificate.public_bytes(serialization.Encoding.PEM))
-    secret = folder / f"{side}.key"
-    secret.touch(0o600)
-    form = serialization.PrivateFormat.PKCS8
-    secret.write_bytes(key.private_bytes(serialization.Encoding.PEM, form, serialization.NoEncryption()))
-    return certificate.fingerprint(hashes.SHA256()).hex(":").upper()
-
-
 def _until_device(host: Host, device: str, process: subprocess.Popen[bytes]) -> None:
     def is_there() -> bool:
         if process.poll() is not None:
@@ -252,5 +137,4 @@ def _output(*command: str, given: str = "") -> str:
 TUNNELS: Final = (
     WireguardGo("wireguard-go", "wg"),
     Nebula("nebula", "nebula-cert", version_option="-version"),
-    Openvpn("openvpn"),
 )
