@@ -33,7 +33,7 @@ SLOWEST = (
 """Folders, the slowest tests first."""
 ALONE = ("pressure", "faults", "processes", "daemon", "tls")
 """Folders whose tests measure delays, losses and processor time of real daemons: marked ``alone``."""
-LONG_ALL = ("natlab", "faults", "modem", "compose", "bench", "pressure", "walkthroughs", "wireshark")
+LONG_ALL = ("natlab", "faults", "compose", "bench", "pressure", "walkthroughs", "wireshark")
 """Folders of machines, routers, containers, other software: all is ``long``, and imported only if selected."""
 LONG = (*LONG_ALL, "processes")
 """Folders whose tests are marked ``long``, except those with the marker ``short``."""

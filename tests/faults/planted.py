@@ -1,7 +1,6 @@
 """Exceptions planted in a running daemon with three peers: what each costs, and whom.
 
-``python -m tests.faults.planted`` plants them one after another, without and with a flood, and writes ``RESULTS.md``
-beside this file.
+``python -m tests.faults.planted`` plants them one after another, without and with a flood, and prints a row for each.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 from time import monotonic
 from typing import Final
 
@@ -45,7 +43,6 @@ CALLED: Final = "v2"
 """The station initiates to this vehicle; the others initiate to the station."""
 CALLER: Final = "v3"
 RUN: Final = "import runpy; runpy.run_module('tests.faults.plants', run_name='__main__')"
-RESULTS: Final = Path(__file__).with_name("RESULTS.md")
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,7 +172,7 @@ class Outcome:
         return self.hits >= 1 and (bool(self.end) or (is_whole and not self.place.stops))
 
     def row(self) -> str:
-        """The row of the table."""
+        """The row of a table."""
         place = self.place
         times = f", {place.times} times" if place.times > 1 else ""
         where = f"| {place.event} of `{place.function}` in `{place.file}`{times} | {place.who or 'all'} |"
@@ -412,41 +409,9 @@ async def measure(places: Sequence[Place], *, floods: bool) -> list[Outcome]:
     return outcomes
 
 
-def table(outcomes: Sequence[Outcome]) -> str:
-    """The rows of the exceptions that cost something, with their head, and the count of the others."""
-    costly = [one for one in outcomes if one.end or one.lost or one.lost_others or one.place.trigger == "restart"]
-    head = "| place | whose | lost, its own | lost, all others | all pass again after |\n|---|---|--:|--:|--:|"
-    rest = [one.back_s for one in outcomes if one not in costly]
-    others = (
-        f"At {len(rest)} other places no frame was lost, and all passed again within {max(rest, default=0.0):.2f} s."
-    )
-    return "\n".join([head, *(outcome.row() for outcome in costly), "", others])
-
-
-TEXT: Final = """# Planted exceptions
-
-A ground station (a daemon that is the relay of its fleet, records, and has UDP and TCP clients) with three vehicles:
-50 frames/s in both directions of each link, new keys every 2 s. While it runs, an exception is planted at one place
-after another, when a function is entered, or when it returns, so that what it did remains and its result is lost.
-*Lost*: frames from 0.6 s before the exception until all links had settled. An exception before the first datagram of
-a read costs all datagrams of that read.
-
-`python -m tests.faults.planted` writes this file. `tests/faults/test_planted.py` fails if another link loses a frame,
-or a link needs more than 5 s.
-
-## Without a flood
-
-{quiet}
-
-## Under a flood of 2,000 datagrams/s
-
-{flooded}
-"""
-
-
 async def _main() -> None:
-    quiet, flooded = await measure(PLACES, floods=False), await measure(PLACES, floods=True)
-    RESULTS.write_text(TEXT.format(quiet=table(quiet), flooded=table(flooded)))
+    for floods in (False, True):
+        await measure(PLACES, floods=floods)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from tests.namespaces import udp_socket_in
-from tests.processes.frames import frame
+from tests.processes.frames import frame, frames_in
 from tests.processes.losses import lost_to_waiting
 from tests.processes.process import DaemonProcess, Status
 from tests.processes.udp import Sockaddr, open_socket
@@ -45,11 +45,15 @@ class Voice:
         self.copies = 0
         self._sock = sock
         self._into = into
-        self._system = system
+        self.system = system
         self._hears = hears
 
     def frame(self, number: int) -> bytes:
-        return frame(number, self._system)
+        return frame(number, self.system)
+
+    def sent_between(self, since: float, before: float) -> list[int]:
+        """The numbers of the frames that were sent in this time."""
+        return [number for number, at in self.sent_at.items() if since <= at < before]
 
     async def speak(self) -> None:
         """Say the next frame, and the next, without end, and listen."""
@@ -83,9 +87,7 @@ class Voice:
         now = monotonic()
         with suppress(OSError):
             while True:
-                data = self._sock.recv(65536)
-                for start in range(0, len(data), len(self.frame(0))):
-                    raw = data[start : start + len(self.frame(0))]
+                for raw in frames_in(self._sock.recv(65536)):
                     if raw[_SYSTEM_AT] == self._hears:  # the rest is nothing that is kept account of
                         self.copies += raw in self.received_at
                         self.received_at.setdefault(raw, now)
@@ -139,8 +141,7 @@ class Talk:
         return sum(
             speaker.frame(number) not in hearer.received_at
             for speaker, hearer in (self.voices, self.voices[::-1])
-            for number, at in speaker.sent_at.items()
-            if since <= at < before
+            for number in speaker.sent_between(since, before)
         )
 
     async def check_lost_none(self, since: float, before: float, a: DaemonProcess, b: DaemonProcess) -> None:
@@ -161,8 +162,7 @@ class CriticalVoice(Voice):
     """A client whose frames go along every usable path: STATUSTEXT."""
 
     def frame(self, number: int) -> bytes:
-        """Its frame with this number. All have the same length."""
-        return pack(mavlink.MAVLink_statustext_message(6, b"%050d" % (number + 1)), self._system, seq=number)
+        return pack(mavlink.MAVLink_statustext_message(6, b"%050d" % (number + 1)), self.system, seq=number)
 
 
 def prepare(

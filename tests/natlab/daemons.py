@@ -12,6 +12,7 @@ from typing import Final
 from tests.faults.talk import Talk, Voice, prepare
 from tests.natlab.laboratory import Place
 from tests.natlab.pairs import Pair
+from tests.processes import fleet
 from tests.processes.harness import Stage
 from tests.processes.process import DaemonProcess, Status
 from tests.processes.tls import listen_for_tls
@@ -71,10 +72,8 @@ async def connect_all(
 
 def make_relay(stage: Stage, public: Place) -> DaemonProcess:
     relay = stage.daemon(RELAY, _addresses(public, public.address, public.ipv6, PORT))
-    relay.command = "relay"
     relay.launcher = public.host.launcher
-    del relay.config["endpoint"], relay.config["peer"]
-    relay.config["member"] = []
+    fleet.make_relay(relay)
     return relay
 
 
@@ -134,7 +133,7 @@ async def _connect(ends: Ends, direct_limit_s: float) -> Outcome:
             max(0.0, first_at - reached_at),
             None if direct_at is None else max(0.0, direct_at - reached_at),
             "" if direct_at is None else peer["path"],
-            sum(first_at <= at < end for voice in ends.talk.voices for at in voice.sent_at.values()),
+            sum(len(voice.sent_between(first_at, end)) for voice in ends.talk.voices),
             ends.talk.lost(first_at, end),
         )
     finally:

@@ -73,7 +73,7 @@ class Scene:
         since, before = began - 0.5, monotonic() + COUNTED_S
         await asyncio.sleep(COUNTED_S)
         await self.talk.back(before)
-        sent = sum(since <= at < before for voice in self.talk.voices for at in voice.sent_at.values())
+        sent = sum(len(voice.sent_between(since, before)) for voice in self.talk.voices)
         return Outcome(back_s, sent, self.talk.lost(since, before))
 
 

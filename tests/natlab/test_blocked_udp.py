@@ -14,7 +14,7 @@ import pytest
 from tests.namespaces import need_namespaces, udp_socket_in
 from tests.natlab.daemons import PORT
 from tests.natlab.laboratory import Laboratory
-from tests.processes.fleet import beat
+from tests.processes.fleet import beat, make_relay
 from tests.processes.frames import heartbeat
 from tests.processes.harness import Stage
 from tests.processes.process import DaemonProcess, Status
@@ -43,32 +43,22 @@ class Scene:
 
 
 @asynccontextmanager
-async def scene(relays: int, ports: int = 1) -> AsyncIterator[Scene]:
+async def scene(relays: int) -> AsyncIterator[Scene]:
     """The relays run, the two others do not."""
     need_namespaces("nft")
     with Laboratory() as laboratory:
         async with Stage() as stage:
 
-            def daemon(name: str, ports: int = 1) -> DaemonProcess:
+            def daemon(name: str) -> DaemonProcess:
                 place = laboratory.public()
-                made = stage.daemon(name, [f"{place.address}:{PORT + port}" for port in range(ports)])
+                made = stage.daemon(name, [f"{place.address}:{PORT}"])
                 made.launcher = place.host.launcher
                 return made
 
             drone, station = daemon("drone"), daemon("station")
-            made = [daemon(f"vps{number}", ports) for number in range(relays)]
+            made = [daemon(f"vps{number}") for number in range(relays)]
             for relay in made:
-                relay.command = "relay"
-                del relay.config["endpoint"], relay.config["peer"]
-                relay.config["member"] = []
-                for member in (drone, station):
-                    section = {
-                        "name": relay.name,
-                        "public_key": relay.public_key,
-                        "addresses": relay.config["listen"],
-                    }
-                    member.config.setdefault("relay", []).append(section)
-                    relay.config["member"].append({"name": member.name, "public_key": member.public_key})
+                make_relay(relay, drone, station)
             psk = stage.psk()
             addresses = ([], []) if relays else ([station.address], [drone.address])
             drone.add_peer(station, addresses[0], psk)
@@ -94,40 +84,38 @@ async def netcheck(daemon: DaemonProcess) -> str:
 
 
 @pytest.mark.parametrize(
-    ("relays", "ports", "rules", "cause", "text", "shown"),
+    ("relays", "rules", "text", "shown"),
     [
         (
-            *(2, 1, ["ip saddr {D} meta l4proto udp"], "relay_not_answering"),
+            *(2, ["ip saddr {D} meta l4proto udp"]),
             "a firewall drops UDP here or there",
             "UDP vps0: does not answer no answer at 11.0.3.2:5790 UDP vps1: does not answer",
         ),
         (
-            *(1, 1, ["ip saddr {D} meta l4proto udp"], "relay_not_answering"),
+            *(1, ["ip saddr {D} meta l4proto udp"]),
             "a firewall drops UDP here or there",
             "UDP vps0: does not answer no answer at 11.0.3.2:5790",
         ),
         (
-            *(2, 1, ["ip daddr {R} meta l4proto udp"], "relay_not_answering"),
+            *(2, ["ip daddr {R} meta l4proto udp"]),
             "the relay vps0 does not answer at 11.0.3.2:5790: it is off, its address is wrong",
             "UDP vps0: does not answer no answer at 11.0.3.2:5790 UDP vps1: answers",
         ),
         (
-            *(1, 1, ["ip saddr {R} ip daddr {D}"], "relay_not_answering"),
+            *(1, ["ip saddr {R} ip daddr {D}"]),
             "a firewall drops UDP here or there",
             "UDP vps0: does not answer",
         ),
     ],
     ids=["no UDP", "no UDP, one relay", "this relay", "the way back"],
 )
-async def test_what_is_blocked_at_the_start(
-    relays: int, ports: int, rules: list[str], cause: str, text: str, shown: str
-) -> None:
+async def test_what_is_blocked_at_the_start(relays: int, rules: list[str], text: str, shown: str) -> None:
     """`status` names the case, `netcheck` what does not answer."""
-    async with scene(relays, ports) as there:
+    async with scene(relays) as there:
         there.drop(rules)
         for member in (there.drone, there.station):
             await member.start()
-        assert text in await said(there.drone, cause)
+        assert text in await said(there.drone, "relay_not_answering")
         assert shown in await netcheck(there.drone)
         if "saddr {D}" in rules[0]:
             assert "cannot reach the relay (UDP blocked there)" in await said(there.station, "not_bound")

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
+
 import pytest
 
-from tests.natlab import daemons, latency
+from tests.natlab import daemons
 from tests.natlab.laboratory import Laboratory, need_laboratory
 from tests.natlab.pairs import make_pairs
+from tests.natlab.tls_faults import FAILURES, NO_UDP, OUTAGES, fail
 from tests.waiting import Stopwatch
 
 pytestmark = [pytest.mark.alone, pytest.mark.usefixtures("_needs")]
@@ -34,26 +37,22 @@ async def test_pairs_without_udp_are_linked_by_tls() -> None:
         assert (outcome.lost, outcome.sent > 0) == (0, True), pair.title
 
 
-@pytest.mark.long
-@pytest.mark.parametrize(
-    "fault", ["the network drops all for 3 s", "the interface is down for 3 s", "the relay is absent for 1.4 s"]
-)
-async def test_silence_is_little_longer_than_the_outage(fault: str) -> None:
-    """A pilot's failsafe trips after 5 s."""
+@pytest.mark.parametrize("fault", FAILURES)
+async def test_no_command_is_lost(fault: str) -> None:
+    """Lost states are those of the time in which the member did not know that its path had failed."""
     watch = Stopwatch()
-    outcome = await latency.fail(fault, latency.Line())
-    print(outcome)
-    assert outcome.gap_s < outcome.away_s + 1.0 + watch.contended_s
-
-
-@pytest.mark.parametrize("fault", ["UDP goes and returns", "the connection is reset"])
-async def test_no_command_is_lost(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of the states only those of the time in which the member did not know that its path had failed."""
-    monkeypatch.setattr(latency, "AWAY_S", 6.0)
-    watch = Stopwatch()
-    outcome = await latency.fail(fault, latency.Line())
+    outcome = await fail(*FAILURES[fault])
     print(outcome)
     assert outcome.gap_s < BACK_S + watch.contended_s
     if outcome.gap_s < 1.9:  # a longer gap is that of a machine with other work: older commands are not sent again
         assert outcome.commands_lost == 0
     assert outcome.lost - outcome.commands_lost < 2 * RATE * (outcome.gap_s + 0.2)
+
+
+async def test_silence_is_little_longer_than_the_outage() -> None:
+    """A pilot's failsafe trips after 5 s. The faults happen at the same time: mostly they wait."""
+    watch = Stopwatch()
+    outcomes = await asyncio.gather(*(fail(outage, NO_UDP) for outage in OUTAGES.values()))
+    for what, outcome in zip(OUTAGES, outcomes, strict=True):
+        print(what, outcome)
+        assert outcome.gap_s < outcome.away_s + 1.0 + watch.contended_s, what

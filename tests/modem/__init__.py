@@ -1,1 +1,0 @@
-"""A member by certificate behind an emulated telemetry modem."""
