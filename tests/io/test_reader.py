@@ -178,14 +178,14 @@ def test_a_handler_may_stop_the_reader(pair: Pair, is_busy: bool) -> None:
 
 def test_datagrams_gather_where_they_may(pair: Pair) -> None:
     """Each wake-up starts a timer, which reads everything. Without the permission the next one is read at once."""
-    pair.reader.gather_s = 0.2
+    pair.reader.gather(0.2)
     for _ in range(2):
         pair.send(b"a")
         assert pair.wake_up() == []
         pair.send(b"b")
         assert pair.fire() == [b"a", b"b"]
     assert pair.waited == [0.2, 0.2]
-    pair.reader.gather_s = 0.0
+    pair.reader.gather(0.0)
     pair.now += 2 * BUSY_S
     pair.send(b"c")
     assert pair.wake_up() == [b"c"]

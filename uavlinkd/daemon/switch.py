@@ -58,8 +58,6 @@ class Switch:
         self.ports: dict[Port, KnownPort] = {}
         """All that there are."""
         self._unused = count()
-        self.edition = -1
-        """That of the router's results in the flows."""
         self._senders: dict[int, int] = {}
         """By system: how many ports may send its frames."""
 
@@ -89,8 +87,7 @@ class Switch:
 
     def refresh(self, now: float) -> None:
         """Forget the flows: other ports may be the right ones now."""
-        if now >= self.router.refresh_at:
-            self.router.refresh(now)
+        self.router.refresh(now)
         self._forget_flows()
 
     def route(self, frame: Frame, source: Port, now: float) -> tuple[Port, ...]:
@@ -104,8 +101,8 @@ class Switch:
             return ()
         ports = self.router.route(frame, source, now)
         if ports:
-            if self.router.edition != self.edition:
-                self._forget_flows()
+            if now >= self.router.valid_until:
+                self.refresh(now)
             if len(known.flows) >= MAX_FLOWS:
                 del known.flows[next(iter(known.flows))]
             gates = (incoming, *(self.ports[port].policy.outgoing for port in ports))
@@ -147,7 +144,6 @@ class Switch:
     def _forget_flows(self) -> None:
         for known in self.ports.values():
             known.flows.clear()
-        self.edition = self.router.edition
 
 
 def _set_outgoing(port: Port, policy: Policy) -> None:

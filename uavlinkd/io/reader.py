@@ -57,7 +57,7 @@ class Reader:
     """
 
     __slots__ = (
-        *("_deliver", "_done_at", "_found_several", "_is_burst", "_is_watched", "_loop", "_on_failure", "_pause_s"),
+        *("_burst_until", "_busy_until", "_calm_in", "_deliver", "_is_watched", "_loop", "_on_failure", "_pause_s"),
         *("_sock", "_stall", "_timer", "_waiting", "backlog", "gather_s"),
     )
 
@@ -78,10 +78,11 @@ class Reader:
         self._loop = asyncio.get_running_loop()
         self._is_watched = False  # by the loop
         self._timer: asyncio.TimerHandle | None = None  # reads the socket next, and not the loop
-        self.gather_s = 0.0  # datagrams are read so long after the first of them arrived; 0: at once
-        self._done_at = -inf  # when the last batch had been delivered
-        self._is_burst = False  # the last read was soon after the one before it
-        self._found_several = False  # the last read found more than one datagram
+        self.gather_s = 0.0
+        """How long after the first datagram the others are read too; 0: at once. :meth:`gather` sets it."""
+        self._busy_until = -inf  # a datagram before then comes soon after the last batch
+        self._burst_until = inf  # as _busy_until, if the last read was soon after the one before it
+        self._calm_in: int | None = stall.epoch  # the epoch, if one datagram is to be expected, and none from before a pause
         self._waiting = array("i", [0])
 
     def start(self) -> None:
@@ -97,6 +98,10 @@ class Reader:
         elif self._is_watched:
             self._unwatch()
 
+    def gather(self, seconds: float) -> None:
+        """Read once for all datagrams that arrive within ``seconds``, and not for each of them."""
+        self.gather_s, self._calm_in = seconds, None
+
     def renew(self) -> None:
         """Have the loop watch the socket again: libuv stops watching a socket that has an error pending."""
         if self._is_watched:
@@ -106,46 +111,45 @@ class Reader:
     def _on_readable(self) -> None:
         now = monotonic()
         stall = self._stall
-        is_quiet = now - self._done_at >= BUSY_S
-        has_paused = now - stall.turned_at > STALL_S or self.backlog.left
-        if not is_quiet or self._found_several or self.gather_s or has_paused:
-            self._on_several(now, is_quiet=is_quiet)
+        epoch = stall.epoch
+        if now < self._busy_until or epoch != self._calm_in or now - stall.turned_at > STALL_S:
+            self._on_several(now)
             return
         # At most rates a datagram comes alone. Each call costs, so this case has none of its own.
         stall.turned_at = now
-        self._is_burst = False
         try:
             size, source = self._sock.recvfrom_into(_buffer)
         except OSError as error:
             self._is_drained(error)
             self.renew()
             return
-        self._deliver([(bytes(_buffer[:size]), source)], now, stall.epoch, 0.0)
+        self._deliver([(bytes(_buffer[:size]), source)], now, epoch, 0.0)
         self.backlog.read_at = now
-        self._done_at = monotonic()
+        self._busy_until = monotonic() + BUSY_S
 
-    def _on_several(self, now: float, *, is_quiet: bool) -> None:
+    def _on_several(self, now: float) -> None:
         """Several datagrams may be there, or may soon be."""
         if self.gather_s:
             self._pause(self.gather_s)
-        elif is_quiet:
-            self._is_burst = False
+        elif now >= self._busy_until:
             self.read(now, drains=False)
-        elif self._is_burst and self._pause_s:
+        elif self._burst_until == self._busy_until and self._pause_s:
             self._pause(self._pause_s)
         else:
-            self._is_burst = True
             self.read(now)
+            self._burst_until = self._busy_until
 
     def _pause(self, seconds: float) -> None:
         self._unwatch()
         self._timer = self._loop.call_later(seconds, self._on_timer, seconds)
 
     def _on_timer(self, waited_s: float) -> None:
-        count = 0
+        count, is_burst = 0, self._burst_until == self._busy_until
         try:
             count = self.read(monotonic(), waited_s)
         finally:
+            if is_burst:
+                self._burst_until = self._busy_until
             if self._timer is not None:  # the handler of the datagrams did not stop this reader
                 self._timer = None
                 if count < 2 or self.gather_s:
@@ -174,10 +178,12 @@ class Reader:
         elif drains or self._has_more_than_one(datagrams):
             self._drain(datagrams)
         count = len(datagrams)
-        self._found_several = count > 1
+        is_calm = count < 2 and not self.gather_s and not self.backlog.left
+        self._calm_in = self._stall.epoch if is_calm else None
         self._deliver(datagrams, now, epoch, waited_s)
         # Behind a full batch, more datagrams have gathered already. New ones must not wait behind stale ones.
-        self._done_at = -inf if epoch == STALE or count == DATAGRAMS_PER_WAKE_UP else monotonic()
+        is_full = epoch == STALE or count == DATAGRAMS_PER_WAKE_UP
+        self._busy_until = -inf if is_full else monotonic() + BUSY_S
         return count
 
     def _has_more_than_one(self, datagrams: Datagrams) -> bool:

@@ -124,38 +124,44 @@ class UdpEndpoint(Endpoint):
 
     def gather(self, seconds: float) -> None:
         """Read once for all datagrams that arrive within ``seconds``, and not for each of them."""
-        self._reader.gather_s = seconds
+        self._reader.gather(seconds)
 
     def take(self, datagrams: Datagrams, now: float, epoch: int, waited_s: float = 0.0) -> None:
         """Deliver the frames of each client, in their order."""
         ports, streams = self._ports, self._streams
-        received: dict[SocketAddress, list[Frame]] = {}
-        stale: set[SocketAddress] | None = None
+        received: dict[UdpPort | SocketAddress, list[Frame]] = {}
+        stale: set[UdpPort | SocketAddress] | None = None
         for datagram, address in datagrams:
-            if address not in ports and not self._is_welcome(address):
+            sender = ports.get(address, address)
+            if sender is address and not self._is_welcome(address):
                 continue
             self.bytes_received += len(datagram)
-            frames = received.get(address)
+            frames = received.get(sender)
             if frames is None:
-                frames = received[address] = []
+                frames = received[sender] = []
             try:
-                fault = None
-                if not (is_stream := address in streams):
+                if streams and address in streams:
+                    is_fresh = self._feed(datagram, address, frames, now, epoch)
+                else:
                     end, fault = parse_frames(datagram, 0, frames, self.counters, is_expected=True)
-                if (is_stream or fault is not None) and not self._feed(
-                    datagram if is_stream else datagram[end:], address, frames, now, epoch
-                ):
-                    stale = (stale or set()) | {address}
+                    is_fresh = fault is None or self._feed(datagram[end:], address, frames, now, epoch)
+                if not is_fresh:
+                    stale = (stale or set()) | {sender}
             except Exception as error:  # a fault costs this datagram
                 report(error)
-        for address, frames in received.items():
+        for sender, frames in received.items():
+            if not frames:
+                continue
             try:
-                port = ports.get(address)
-                if frames and (port is None or port in self._silent):
-                    port = self._admitted(address, now)
-                if port is not None and frames:
+                if isinstance(sender, UdpPort):
+                    port = sender if not sender.is_closed else self._admitted(sender.address, now)
+                else:
+                    port = self._admitted(sender, now)
+                if port is not None:
+                    if self._silent:
+                        self._wake(port)
                     port.received_at = now
-                    self._on_frames(port, frames, now, STALE if stale and address in stale else epoch, waited_s)
+                    self._on_frames(port, frames, now, STALE if stale and sender in stale else epoch, waited_s)
             except Exception as error:  # of this client
                 report(error)
 
@@ -170,12 +176,14 @@ class UdpEndpoint(Endpoint):
         return stream.is_fresh
 
     def _admitted(self, address: SocketAddress, now: float) -> UdpPort | None:
-        """The client at an address: a new one, or one that was silent."""
-        port = self._ports.get(address) or self._admit(address, now)
-        if port is not None and port in self._silent:
+        """The client at an address, perhaps a new one."""
+        return self._ports.get(address) or self._admit(address, now)
+
+    def _wake(self, port: UdpPort) -> None:
+        """A client sent a frame: it is not silent any more."""
+        if port in self._silent:
             self._silent.remove(port)
             self.handler.on_port_active(port)
-        return port
 
     def _hold(self, stream: StreamSplitter, address: SocketAddress) -> None:
         """Keep an unfinished frame. Senders that are not clients cannot displace those of clients."""
@@ -217,6 +225,7 @@ class UdpEndpoint(Endpoint):
                 del self._streams[address]
             port = self._admitted(address, now) if frames else None
             if port is not None:
+                self._wake(port)
                 port.received_at = now
                 self._on_frames(port, frames, now, epoch if stream.is_fresh else STALE, 0.0)
 
@@ -391,7 +400,7 @@ class UdpClient(UdpEndpoint):
             gather_s = self._reader.gather_s
             self._close_socket()
             self._use(sock)
-            self._reader.gather_s = gather_s
+            self._reader.gather(gather_s)
             self._reader.start()
         return True
 

@@ -53,6 +53,10 @@ MAX_GAP_S: Final = 0.5
 _START = re.compile(rb"[\xfd\xfe]")
 _HEADER: Final = Struct("<BBBBBBHB")
 """Length, incompat_flags, compat_flags, sequence, system, component, message id in 16 and 8 bits."""
+_head: Final = Struct("<BBBxx5s").unpack_from
+"""The first byte, length, incompat_flags, and the bytes from system to message id of MAVLink 2."""
+_ZEROS: Final = bytes(10)
+_checksum: Final = Struct("<H").unpack_from
 
 CHECKSUM_STEP: Final = tuple(mcrf4xx(bytes([byte]), 0) for byte in range(256))
 """The effect of one more byte on a checksum: new = (old >> 8) ^ CHECKSUM_STEP[(old ^ byte) & 0xFF]."""
@@ -145,54 +149,36 @@ def parse_frames(
     size, before = len(data), len(frames)
     fault: FrameFault | None = None
     while position < size:
-        start = data[position]
-        if start == MAVLINK2:
-            if size - position < MIN_FRAME_BYTES:
-                # If the flags are there already, they must lead to the same result now as later.
-                is_unknown = size - position > 2 and data[position + 2] > 1
-                fault = FrameFault.UNKNOWN_FLAGS if is_unknown else FrameFault.TRUNCATED
-                break
-            flags = data[position + 2]
-            if flags > 1:
-                fault = FrameFault.UNKNOWN_FLAGS
-                break
-            length = data[position + 1]
+        # What is missing at the end counts as 0: no frame is complete there.
+        is_whole = size - position >= 10
+        start, length, flags, key = _head(data, position) if is_whole else _head(data[position:] + _ZEROS)
+        if start == MAVLINK2 and flags < 2:
             payload_at = position + 10
             checksum_at = payload_at + length
             end = checksum_at + 15 if flags else checksum_at + 2
-            if end > size:
-                fault = FrameFault.TRUNCATED
-                break
-            key = data[position + 5 : payload_at]
-            message = sender_messages.get(key) or add_sender_message(key)
         elif start == MAVLINK1:
-            if size - position < MIN_FRAME_BYTES:
-                fault = FrameFault.TRUNCATED
-                break
-            length = data[position + 1]
             payload_at = position + 6
             checksum_at = payload_at + length
             end = checksum_at + 2
-            if end > size:
-                fault = FrameFault.TRUNCATED
-                break
             key = data[position + 3 : payload_at]
-            row = MESSAGES.get(key[2])
+            row = MESSAGES.get(key[2]) if end <= size else None
             if row is not None and length < row[2]:
                 key += OTHER_DEFINITION  # MAVLink 1 cuts nothing from payloads
-            message = sender_messages.get(key) or add_sender_message(key)
         else:
-            fault = FrameFault.NOT_MAVLINK
+            fault = FrameFault.UNKNOWN_FLAGS if start == MAVLINK2 else FrameFault.NOT_MAVLINK
+            break
+        if end > size:
+            fault = FrameFault.TRUNCATED
             break
 
-        definition, header, unknown = message
-        checksum = mcrf4xx(data[position + 1 : checksum_at])
-        step = (data[checksum_at] | data[checksum_at + 1] << 8) ^ (checksum >> 8)
-        if definition is None or step != CHECKSUM_STEP[(checksum ^ definition[1]) & 0xFF]:
-            if not is_expected or step not in CHECKSUM_STEPS:
+        extra, header, other = message = sender_messages.get(key) or add_sender_message(key)
+        (checksum,) = _checksum(data, checksum_at)
+        if extra is None or mcrf4xx(data[position + 1 : checksum_at] + extra) != checksum:
+            without = mcrf4xx(data[position + 1 : checksum_at])
+            if not is_expected or checksum ^ without >> 8 not in CHECKSUM_STEPS:
                 fault = FrameFault.BAD_CRC
                 break
-            header = unknown
+            header = other
             counters.unknown += 1
         elif header is None:
             header = targeted_header(key, message, data[payload_at:checksum_at])

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple, final
 
-from uavlinkd.mavlink.dialect import KINDS, MESSAGES, UNKNOWN, MessageKind, Row
+from uavlinkd.mavlink.dialect import KINDS, MESSAGES, UNKNOWN, MessageKind
 
 MAX_SENDER_MESSAGES: Final = 2048  # messages of one sender each whose headers are kept
 MAX_TARGETED_HEADERS: Final = 8192
@@ -46,11 +46,12 @@ class Header:
 class SenderMessage(NamedTuple):
     """The facts that depend on sender and message id alone."""
 
-    definition: Row | None
-    """The row of :data:`.dialect.MESSAGES`; None if the dialect does not define the message."""
+    extra: bytes | None
+    """The byte CRC_EXTRA of the definition; None if the dialect does not define the message."""
     known: Header | None
     """The header of a frame by this definition; None if its payload holds a target or a command."""
-    unknown: Header  # the header of a frame by another definition
+    other: Header
+    """The header of a frame by another definition."""
 
 
 OTHER_DEFINITION: Final = b"?"
@@ -68,19 +69,20 @@ def add_sender_message(key: bytes) -> SenderMessage:
     system, component = key[0], key[1]
     msgid = key[2] if is_mavlink1 else int.from_bytes(key[2:5], "little")
     definition = None if len(key) in (4, 6) else MESSAGES.get(msgid)
-    unknown = Header(msgid, system, component, is_known=False, is_mavlink1=is_mavlink1)
+    extra = None if definition is None else bytes((definition[1],))
+    other = Header(msgid, system, component, is_known=False, is_mavlink1=is_mavlink1)
     has_target = definition is None or definition[4] is not None or definition[6] is not None
-    known = None if has_target else replace(unknown, is_known=True)
+    known = None if has_target else replace(other, is_known=True)
     if len(sender_messages) >= MAX_SENDER_MESSAGES:
         del sender_messages[next(iter(sender_messages))]
-    message = sender_messages[key] = SenderMessage(definition, known, unknown)
+    message = sender_messages[key] = SenderMessage(extra, known, other)
     return message
 
 
 def targeted_header(key: bytes, message: SenderMessage, payload: bytes) -> Header:
     """The header of a frame whose payload holds a target or a command."""
-    assert message.definition is not None, "without a definition the payload cannot be read"
-    _, _, _, _, target_system_at, target_component_at, command_at = message.definition
+    like = message.other
+    _, _, _, _, target_system_at, target_component_at, command_at = MESSAGES[like.msgid]
     length = len(payload)
     target_system = target_component = 0
     if target_system_at is not None and target_system_at < length:
@@ -94,7 +96,6 @@ def targeted_header(key: bytes, message: SenderMessage, payload: bytes) -> Heade
     facts = key, target_system, target_component, command
     header = targeted_headers.get(facts)
     if header is None:
-        like = message.unknown
         header = replace(
             like, target_system=target_system, target_component=target_component, command=command, is_known=True
         )

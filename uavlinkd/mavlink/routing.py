@@ -28,6 +28,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Hashable
 from enum import StrEnum
+from math import inf
 from typing import Final, Generic, TypeVar
 
 from uavlinkd.mavlink.frames import Frame
@@ -65,10 +66,10 @@ class Router(Generic[P]):
         self._ports_of: dict[int, dict[int, set[P]]] = {}  # the reverse: by system and component
         self._routes: dict[P, Hashable] = {}
         self.sendings = Sendings(self._routes, self._received_at)
-        self.refresh_at = float("-inf")
-        """When :meth:`refresh` is due."""
-        self.edition = 0
-        """Grows whenever a result of :meth:`route` may have changed."""
+        self._forget_at = -inf
+        """When silent addresses are to be forgotten."""
+        self.valid_until = -inf
+        """Until when results of :meth:`route` stay the same: :meth:`refresh` is due then, or now if one has changed."""
 
     @property
     def unrouted(self) -> Counter[Unrouted]:
@@ -83,7 +84,7 @@ class Router(Generic[P]):
         self._is_peer[port] = is_peer
         self._routes[port] = port if is_peer else endpoint
         self._received_at.setdefault(port, {})
-        self.edition += 1
+        self.valid_until = -inf
 
     def remove_port(self, port: P) -> None:
         self._is_peer.pop(port, None)
@@ -92,7 +93,7 @@ class Router(Generic[P]):
         self._silent.discard(port)
         for address in self._received_at.pop(port, {}):
             self._unlink(port, address)
-        self.edition += 1
+        self.valid_until = -inf
 
     def set_silent(self, port: P, *, is_silent: bool) -> None:
         """A silent local client gets frames with a target and frames of peers, but no others: it may have gone."""
@@ -100,7 +101,7 @@ class Router(Generic[P]):
             self._silent.add(port)
         else:
             self._silent.discard(port)
-        self.edition += 1
+        self.valid_until = -inf
 
     def forget_systems(self, port: P, which: Callable[[int], bool]) -> None:
         """Forget the systems behind a port for which ``which`` is true."""
@@ -108,16 +109,18 @@ class Router(Generic[P]):
         for address in [address for address in received_at if which(address[0])]:
             del received_at[address]
             self._unlink(port, address)
-        self.edition += 1
+        self.valid_until = -inf
 
     def refresh(self, now: float) -> None:
-        """Forget the addresses that have been silent for long. Due at :attr:`refresh_at`.
+        """Forget the addresses that have been silent for long. Due at :attr:`valid_until`.
 
-        As long as :attr:`edition` stays the same, the ports that :meth:`route` returned for a frame are valid for all
-        frames from that source with its header that are new (:meth:`.Sendings.is_new`).
+        Until it is due again, the ports that :meth:`route` returned for a frame are valid for all frames from that
+        source with its header that are new (:meth:`.Sendings.is_new`).
         """
-        self.refresh_at = now + ROUTE_LIFETIME_S / LIFETIME_PARTS
-        self.edition += 1
+        if now < self._forget_at:
+            self.valid_until = self._forget_at
+            return
+        self.valid_until = self._forget_at = now + ROUTE_LIFETIME_S / LIFETIME_PARTS
         for port, received_at in self._received_at.items():
             for address in [a for a, at in received_at.items() if now - at >= ROUTE_LIFETIME_S]:
                 del received_at[address]
@@ -129,8 +132,9 @@ class Router(Generic[P]):
         Raises KeyError if the source is not a port that was added.
         """
         received_at = self._received_at[source]
-        if now >= self.refresh_at:
+        if now >= self._forget_at:
             self.refresh(now)
+            self.valid_until = -inf
         header = frame.header
         ports = self._ports_for(source, header.target_system, header.target_component)
         if not self.sendings.is_new(frame, source, ports, now):
@@ -159,7 +163,7 @@ class Router(Generic[P]):
             self._unlink(port, least_recent)
         system, component = address
         self._ports_of.setdefault(system, {}).setdefault(component, set()).add(port)
-        self.edition += 1
+        self.valid_until = -inf
 
     def _unlink(self, port: P, address: SystemComponent) -> None:
         system, component = address
