@@ -19,4 +19,5 @@ if TYPE_CHECKING:
 def lone_line(switch: Switch, stall: StallWatch, drops: DaemonJournal) -> Line:
     """A line that forwards between clients."""
     node = cast("Node", SimpleNamespace(schedule=Schedule()))
-    return Line(switch, stall, drops, node, {}, cast("PeerSockets", None))
+    sockets = cast("PeerSockets", SimpleNamespace(senders=[]))
+    return Line(switch, stall, drops, node, {}, sockets)

@@ -86,7 +86,7 @@ class Scene:
             node=node,
             stall=self.stall,
             link_of={self.peer: self.link},
-            peer_sockets=SimpleNamespace(budgets={}),
+            peer_sockets=SimpleNamespace(budgets={}, senders=[]),
             features=[],
             config=SimpleNamespace(fleet=None),
             journal=drops,

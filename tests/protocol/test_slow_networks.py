@@ -282,7 +282,7 @@ def test_stream_that_is_too_long_for_the_slow_path_is_not_copied_there() -> None
     radios = two_radios({SIK: LIMIT})
     radios.radios[LTE].is_dead = True
     radios.run(0.35, 0.1, radios.sender(radios.a))
-    assert len(radios.a.peer.paths.stream_route) == 2
+    assert len(radios.a.peer.paths.routes[Class.STREAM]) == 2
     lengths = sent_lengths(radios, Class.STREAM, [FRAME] * 20)
     assert (len(lengths[LTE]), lengths[SIK]) == (1, [])
     lengths = sent_lengths(radios, Class.STREAM, [LONG_FRAME])

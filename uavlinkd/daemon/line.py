@@ -77,7 +77,7 @@ class Line:
         self._node = node
         self._schedule = node.schedule
         self._links = links
-        self._sockets = sockets
+        self._sockets, self._senders = sockets, sockets.senders
         self.unwrap = lambda socket, data, source: (data, self.path_of(socket, source))  # no relay is configured
         self._paths: dict[tuple[int, SocketAddress], Path] = {}
         self._frames: dict[PeerLink, list[Frame]] = {}  # delivered, but not forwarded yet
@@ -121,11 +121,11 @@ class Line:
         for output in outputs:
             try:
                 if isinstance(output, Transmit):
-                    datagram, path, _ = output
+                    datagram, (socket, address), _ = output
                     try:
-                        self._sockets.senders[path.socket](datagram, path.address)
+                        self._senders[socket](datagram, address)
                     except OSError as error:
-                        self._sockets.on_send_error(path.socket, datagram, path.address, error)
+                        self._sockets.on_send_error(socket, datagram, address, error)
                 elif isinstance(output, Deliver):
                     peer, payload, order = output
                     link = self._links.get(peer)
@@ -179,29 +179,28 @@ class Line:
         stall, at = self._stall, monotonic()
         if at - stall.turned_at > STALL_S:  # the process may have paused after it read them
             stall.turn(at)
-        else:
-            stall.turned_at = at
         if epoch != stall.epoch:
             stall.dropped[owner_of(source)] += len(frames)
             self._drops.add("frames_dropped", ShellReason.STALE, owner_of(source), len(frames), now)
             return
         switch = self.switch
-        if now >= switch.router.refresh_at or switch.router.edition != switch.edition:
+        if now >= switch.router.valid_until:
             switch.refresh(now)
         known = switch.ports[source]
-        routes, sendings = known.flows, switch.router.sendings
+        flows, sendings = known.flows, switch.router.sendings
         batches: dict[Port, list[Frame]] = {}
         for frame in frames:
             try:
-                route = routes.get(frame.header)
-                if route is None:
+                raw, header = frame
+                flow = flows.get(header)
+                if flow is None:
                     ports = switch.route(frame, source, now)
                 else:
-                    ports, comes_once, is_conditional = route
+                    ports, comes_once, is_conditional = flow
                     if is_conditional:
-                        ports = switch.judge(frame, source, route, now)
+                        ports = switch.judge(frame, source, flow, now)
                     elif not comes_once:
-                        raw, seen = frame.raw, sendings.seen
+                        seen = sendings.seen
                         is_known = raw in seen or raw in sendings.seen_before
                         if is_known or now >= sendings.half_ends_at or len(seen) >= MAX_FRAMES_REMEMBERED:
                             if not sendings.is_new(frame, source, ports, now):
@@ -219,13 +218,12 @@ class Line:
                     batches[port] = [frame]
         for port, batch in batches.items():
             try:
-                if isinstance(port, PeerLink) and not (
-                    port.peer.paths.is_multiple or port.output.egress is not None or port.output.repair.is_on
-                ):
+                if isinstance(port, PeerLink) and port.output.is_plain and not port.peer.paths.is_multiple:
                     peer = port.peer
                     port.frames_sent += len(batch)
                     out = send_frames(peer, list(map(RAW, batch)), now, STREAM)
-                    if peer.timers.next_at < peer.timers.scheduled_at:  # as Node.send() does, without a call
+                    timers = peer.timers
+                    if timers.next_at < timers.scheduled_at:  # as Node.send() does, without a call
                         self._schedule.update(peer)
                     self.perform(out)
                 else:

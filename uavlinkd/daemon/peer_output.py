@@ -61,6 +61,8 @@ class PeerOutput:
         self.copies = Copies(budgets, now)
         self.repair = Repair()
         """Whether critical envelopes are repeated."""
+        self.is_plain = self.egress is None
+        """Whether frames leave at once, none is repeated, and no budget is charged."""
         self._charged = 0, 0  # datagrams and bytes that the budget was charged for
         self._networks: list[Bucket | None] = []
         self._critical_limit = CRITICAL_ENVELOPE_LIMIT  # of the payload; set for each session
@@ -130,6 +132,10 @@ class PeerOutput:
         self.egress = PeerEgress(settings, now) if settings.is_needed else None
         self._networks = []
         self._charged = self._sent()
+        self._note_plain()
+
+    def _note_plain(self) -> None:
+        self.is_plain = self.egress is None and not self.repair.is_on
 
     def follow(self, now: float) -> None:
         """A session began, or other paths are used: envelopes have another size, frames wait for other networks."""
@@ -157,6 +163,7 @@ class PeerOutput:
         self._networks = networks
         if self.egress is None and networks[0] is not None:
             self.egress = PeerEgress(self._settings, now)
+            self._note_plain()
         if self.egress is not None:
             self.egress.set_networks(networks, now)
 
@@ -170,11 +177,13 @@ class PeerOutput:
         peer = self._peer
         is_allowed = peer.is_up and peer.settings.link.redundancy is not Redundancy.NONE
         self.repair.update(peer.paths.routes[Class.CRITICAL], now, is_allowed=is_allowed)
+        self._note_plain()
 
     def clear(self, now: float) -> None:
         """Drop what waits: the peer is lost."""
         self.copies.clear()
         self.repair.end()
+        self._note_plain()
         if self.egress is not None:
             self.egress.queue.clear(now)
 

@@ -228,7 +228,7 @@ class PeerSockets:
 
     def _choose_senders(self) -> None:
         """A socket without a budget, and without relays, is called directly."""
-        self.senders = [
+        self.senders[:] = [
             partial(self._send_charged, slot.number)
             if self._wrap is not None or slot.number in self.budgets
             else slot.send

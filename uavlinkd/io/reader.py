@@ -82,7 +82,8 @@ class Reader:
         """How long after the first datagram the others are read too; 0: at once. :meth:`gather` sets it."""
         self._busy_until = -inf  # a datagram before then comes soon after the last batch
         self._burst_until = inf  # as _busy_until, if the last read was soon after the one before it
-        self._calm_in: int | None = stall.epoch  # the epoch, if one datagram is to be expected, and none from before a pause
+        self._calm_in: int | None = stall.epoch
+        """The epoch, if a datagram is to be expected alone, and none from before a pause."""
         self._waiting = array("i", [0])
 
     def start(self) -> None:

@@ -69,7 +69,7 @@ class Router(Generic[P]):
         self._forget_at = -inf
         """When silent addresses are to be forgotten."""
         self.valid_until = -inf
-        """Until when results of :meth:`route` stay the same: :meth:`refresh` is due then, or now if one has changed."""
+        """Until when results of :meth:`route` stay the same: then, or in the past, :meth:`refresh` is due."""
 
     @property
     def unrouted(self) -> Counter[Unrouted]:

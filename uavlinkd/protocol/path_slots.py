@@ -4,10 +4,23 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
+from typing import NamedTuple
 
 from uavlinkd.protocol import constants as c
 from uavlinkd.protocol.path import Path, SocketAddress, SocketFacts
 from uavlinkd.protocol.path_state import PathState
+from uavlinkd.protocol.session import Session
+
+
+class Outlet(NamedTuple):
+    """How the next frame of a stream leaves along the only path: decided once, for as long as nothing changes."""
+
+    session: Session
+    route: tuple[PathState, ...]
+    limit: int
+    """The longest payload, in bytes."""
+    until: float
+    """When the session is too old."""
 
 
 class PathSlots:
@@ -24,6 +37,8 @@ class PathSlots:
         """The slots in use: the configured paths first, then the oldest."""
         self.best: PathState | None = None
         """Where frames go; a path that failed stays the best while there is no other."""
+        self.outlet: Outlet | None = None
+        """None where :func:`.send_frames` must decide: about classes, questions, long frames, the probe's timer."""
         self.unproven = 0
         """Learned paths that were given up because they answered nothing; it only grows."""
         self.candidates: tuple[Path, ...] = ()
@@ -64,7 +79,7 @@ class PathSlots:
             hosts[path.socket, path.host] += 1
             if hosts[path.socket, path.host] <= c.PATHS_PER_HOST and len(wanted) < c.CONFIGURED_PATHS:
                 wanted.append(path)
-        before = self.by_path
+        before, self.outlet = self.by_path, None
         if any(path.is_relayed and path not in before for path in wanted):  # the peer may have another address
             for state in before.values():
                 least_s = c.PROBE_INTERVAL_S if state.is_metered and state is not self.best else c.PROBE_FAST_S
@@ -112,12 +127,13 @@ class PathSlots:
         state = self._new(path, now, is_configured=False, others=self.by_path)
         if (asked := self._asked.pop(path, None)) is not None:
             state.take_questions(asked)
-        self.by_path[path] = state
+        self.by_path[path], self.outlet = state, None
         return state
 
     def remove(self, state: PathState) -> None:
         """Free a slot."""
         del self.by_path[state.path]
+        self.outlet = None
         self._drop(state)
         if state is self.best:
             self.best = None

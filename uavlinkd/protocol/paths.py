@@ -127,8 +127,6 @@ class PathSet(PathSlots):
         """The longest envelope that frames of each class share, in bytes. A longer one holds a single frame."""
         self.echo_route: Route = ()
         """Of echo requests that are repeated if they are lost, and of their replies."""
-        self.stream_route: Route = ()
-        """That of stream: a frame needs no look-up."""
         self.next_at = c.NEVER
         """When :meth:`update` has something to do, or a question is due."""
         self.active_at = -c.NEVER
@@ -269,10 +267,9 @@ class PathSet(PathSlots):
         return max(state.since, state.answered_at) + c.FORMER_PATH_S  # at 50 % loss a path answers, but stays down
 
     def _set_routes(self, now: float) -> None:
-        best = self.best
+        best, self.outlet = self.best, None
         if best is None:
-            self.routes, self.is_multiple = _NO_ROUTES, self.has_relayed
-            self.stream_route = self.echo_route = ()
+            self.routes, self.is_multiple, self.echo_route = _NO_ROUTES, self.has_relayed, ()
             return
         others = [
             state for state in self.by_path.values() if state is not best and state.is_validated and not state.is_off
@@ -292,7 +289,6 @@ class PathSet(PathSlots):
             is_late = best.reason != "loss"
             answering = [state for state in others if state.works or state.is_recovering]
             stream = (best, *(state for state in answering if is_late or not state.is_metered))
-        self.stream_route = stream
         self.echo_route = alone if best.condition is PathCondition.USABLE else critical
         self.routes = {Class.CRITICAL: critical, Class.STREAM: stream, Class.BULK: alone}
         self.longest = {cls: self._longest(route, cls) for cls, route in self.routes.items()}

@@ -11,6 +11,7 @@ from uavlinkd.protocol.drops import DropReason
 from uavlinkd.protocol.outputs import Output, Transmit, new_tuple
 from uavlinkd.protocol.path import FREE, Path
 from uavlinkd.protocol.path_measures import NO_REPEATS
+from uavlinkd.protocol.path_slots import Outlet
 from uavlinkd.protocol.path_state import PathState
 from uavlinkd.protocol.paths import Route
 from uavlinkd.protocol.peer import Peer
@@ -19,20 +20,29 @@ from uavlinkd.protocol.settings import Class
 from uavlinkd.protocol.timers import Timer
 from uavlinkd.protocol.wire import QUESTION_BYTES
 
+STREAM, CRITICAL, PROBE, SILENCE = Class.STREAM, Class.CRITICAL, Timer.PROBE, Timer.SILENCE
+"""Members that each frame needs. The class of an enumeration looks them up by a Python function."""
+
 
 def send_frames(peer: Peer, frames: Sequence[bytes], now: float, cls: Class) -> list[Output]:
     """Put frames that are here together into as few envelopes as hold them, in their order."""
     session, paths = peer.sessions.current, peer.paths
-    route = paths.stream_route if cls is Class.STREAM else paths.routes[cls]
-    keeps = cls is Class.CRITICAL and paths.has_relayed  # also without a route
+    outlet = paths.outlet
+    if outlet is not None and cls is STREAM and len(frames) == 1:
+        of_session, route, longest, until = outlet
+        if of_session is session and len(frames[0]) <= longest and now < until:
+            return send_payloads(peer, session, frames, route, now)
+    paths.outlet = None
+    route = paths.routes[cls]
+    keeps = cls is CRITICAL and paths.has_relayed  # also without a route
     if session is None or now >= session.reject_at or session.send_counter >= c.SESSION_ENVELOPE_LIMIT:
         return peer.drop(DropReason.NO_SESSION, len(frames))
     if not route:
         return _keep(peer, session, frames, now) if keeps else peer.drop(DropReason.NO_SESSION, len(frames))
-    if peer.timers.deadlines[Timer.PROBE] == NEVER and peer.durations.probe_interval_s:
+    if peer.timers.deadlines[PROBE] == NEVER and peer.durations.probe_interval_s:
         # On a slow network, a request about freshness measures the round trip too: it comes first if frames arrive.
         least_s = (1 + c.VERIFY_REPEAT_SHARE) * paths.pace.interval_s
-        peer.timers.set(Timer.PROBE, now + max(peer.durations.probe_interval_s, least_s))
+        peer.timers.set(PROBE, now + max(peer.durations.probe_interval_s, least_s))
     limit = session.payload_limit - max(0, session.max_envelope - paths.longest[cls])
     asks_at = NEVER
     if len(frames) > 1 and not paths.shares_envelopes:
@@ -41,7 +51,9 @@ def send_frames(peer: Peer, frames: Sequence[bytes], now: float, cls: Class) -> 
         peer.set_paths_timer()
     if len(paths.by_path) > 1:
         _note_activity(peer, now)
-    if paths.is_multiple and cls is not Class.CRITICAL and len(route) == 1:
+    elif cls is STREAM and not paths.is_multiple:
+        paths.outlet = Outlet(session, route, limit, session.reject_at)
+    if paths.is_multiple and cls is not CRITICAL and len(route) == 1:
         asks_at = route[0].question_at - c.QUESTION_EARLY_S
     if len(frames) == 1 and len(frames[0]) <= limit:
         payloads, too_large = [frames[0]], 0
@@ -161,16 +173,12 @@ def send_payloads(
     out: list[Output] = []
     traffic = peer.traffic
     is_counted = session is peer.sessions.current
-    before = session.send_counter
+    if session.send_counter + len(payloads) >= c.REKEY_AFTER_ENVELOPES:
+        payloads = _limited(peer, session, payloads, now, out)
     for payload in payloads:
-        if session.send_counter >= c.SESSION_ENVELOPE_LIMIT:
-            out += peer.drop(DropReason.NO_SESSION, 1)
-            continue
         datagram = session.seal(payload, now)
         size, is_copy = len(datagram), False
         traffic.envelopes_sent += 1
-        if session.send_counter == c.REKEY_AFTER_ENVELOPES:
-            peer.set_initiate()
         for state in route:
             if (is_copy and not peer.paths.carries(state, size)) or not (state.is_proven or state.allows(size)):
                 continue
@@ -181,15 +189,26 @@ def send_payloads(
             traffic.bytes_sent += size
             out.append(new_tuple(Transmit, (datagram, state.path, is_copy)))
             is_copy = True
-    if session.send_counter == before:
+    if not payloads:
         return out
     peer.sent_at = now
     if peer.unanswered_since is None and not is_answer:
         peer.unanswered_since = now
         peer.echo_at = now + peer.echo_after_s
-        if now + peer.silence_s < peer.timers.deadlines[Timer.SILENCE]:
-            peer.timers.set(Timer.SILENCE, now + peer.silence_s)
+        if now + peer.silence_s < peer.timers.deadlines[SILENCE]:
+            peer.timers.set(SILENCE, now + peer.silence_s)
     return out
+
+
+def _limited(
+    peer: Peer, session: Session, payloads: Sequence[bytes], now: float, out: list[Output]
+) -> Sequence[bytes]:
+    """The payloads that the keys may still seal. From :data:`c.REKEY_AFTER_ENVELOPES` on there are to be new keys."""
+    if session.send_counter < c.REKEY_AFTER_ENVELOPES:
+        peer.timers.set(Timer.INITIATE, now)
+    left = c.SESSION_ENVELOPE_LIMIT - session.send_counter
+    out += peer.drop(DropReason.NO_SESSION, max(0, len(payloads) - left))
+    return payloads[:left]
 
 
 def transmit(peer: Peer, datagram: bytes, path: Path, *, is_copy: bool = False) -> list[Output]:
@@ -225,7 +244,8 @@ def ask_for_echo(peer: Peer, session: Session, now: float, route: Route = ()) ->
 
     A request that is repeated if it is lost goes along the best path first: ``paths.echo_route``.
     """
-    peer.timers.stop(Timer.PROBE)  # until traffic asks for another
+    peer.timers.stop(PROBE)  # until traffic asks for another
+    peer.paths.outlet = None
     peer.traffic.echoes_unanswered += peer.echo_requests.expire(now)
     repeat_s = peer.echo_requests.repeat_s(session.held.pace)
     if not route:
@@ -235,7 +255,7 @@ def ask_for_echo(peer: Peer, session: Session, now: float, route: Route = ()) ->
     repeats = NO_REPEATS if peer.paths.best is None else peer.paths.best.repeats
     token = peer.echo_requests.add(session, now, session.send_counter + 1 - session.uncounted, repeats)
     echo = wire.Echo(False, token, session.received, session.expected)
-    out = send_echo(peer, session, echo, route or peer.paths.routes[Class.CRITICAL], now)
+    out = send_echo(peer, session, echo, route or peer.paths.routes[CRITICAL], now)
     peer.asked_at = now
     peer.echo_at = now + max(peer.echo_after_s, repeat_s)
     return out
