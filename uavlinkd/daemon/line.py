@@ -8,6 +8,7 @@ decides about the first frame of a flow, and to :class:`.FrameCarrier`.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Final
 
@@ -32,7 +33,7 @@ from uavlinkd.system.guard import report
 from uavlinkd.system.stall import STALL_S, StallWatch
 
 MAX_PATHS: Final = 1024
-"""Paths of received datagrams that are remembered: a frame on one of them costs no new object."""
+"""Paths of a socket's received datagrams that are remembered: a frame on one of them costs no new object."""
 STREAM: Final = Class.STREAM
 
 
@@ -79,7 +80,7 @@ class Line:
         self._links = links
         self._sockets, self._senders = sockets, sockets.senders
         self.unwrap = lambda socket, data, source: (data, self.path_of(socket, source))  # no relay is configured
-        self._paths: dict[tuple[int, SocketAddress], Path] = {}
+        self._paths = defaultdict[int, dict[SocketAddress, Path]](dict)  # by the socket
         self._frames: dict[PeerLink, list[Frame]] = {}  # delivered, but not forwarded yet
 
     def receive(self, socket: int, datagrams: Datagrams, now: float, epoch: int, waited_s: float) -> None:
@@ -88,11 +89,10 @@ class Line:
             self.read_at, self.epoch = now, epoch
             datagram, address = datagrams[0]
             try:
-                if datagram[:1] == RELAYED_START:
-                    inside = self.unwrap(socket, datagram, address)
-                else:
-                    inside = datagram, self._paths.get((socket, address)) or self.path_of(socket, address)
-                if inside is not None:
+                if datagram[:1] != RELAYED_START:
+                    path = self._paths[socket].get(address) or self.path_of(socket, address)
+                    self.perform(self._node.receive(datagram, path, now))
+                elif (inside := self.unwrap(socket, datagram, address)) is not None:
                     self.perform(self._node.receive(*inside, now))
             except Exception as error:  # a fault costs this datagram
                 report(error)
@@ -105,12 +105,12 @@ class Line:
 
     def path_of(self, socket: int, address: SocketAddress) -> Path:
         """The path along which a datagram came."""
-        paths = self._paths
-        path = paths.get((socket, address))
+        paths = self._paths[socket]
+        path = paths.get(address)
         if path is None:
             if len(paths) >= MAX_PATHS:
                 paths.clear()
-            path = paths[socket, address] = Path(socket, address)
+            path = paths[address] = Path(socket, address)
         return path
 
     def perform(self, outputs: Iterable[Output]) -> None:
@@ -146,10 +146,11 @@ class Line:
                             self._drops.add("frames_dropped", reason, link.name, count, monotonic())
                     elif link.output.repair.is_on:
                         link.note_requests(frames, self.read_at)
-                    if link in self._frames:
-                        self._frames[link] += frames
-                    else:
+                    gathered = self._frames.get(link)
+                    if gathered is None:
                         self._frames[link] = frames
+                    else:
+                        gathered += frames
                 else:
                     self.on_output(output)
             except Exception as error:

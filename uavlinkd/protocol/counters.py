@@ -19,34 +19,52 @@ class ReplayWindow:
 
     Two steps, because nothing may be written before the tag is verified: :meth:`is_used`, verify, :meth:`mark`.
     A counter above :attr:`highest` is never used.
+
+    The newest counters are mostly a run without a gap. It is in the ring only after the next gap: a counter that
+    continues the run just moves :attr:`highest`.
     """
 
-    __slots__ = ("blocks", "highest")
+    __slots__ = ("_begun", "_blocks", "_run", "highest")
 
     def __init__(self) -> None:
         self.highest = -1
         """The highest counter accepted, -1 before the first."""
-        self.blocks = _NONE
-        """The ring, once there is a counter."""
+        self._run = 0  # all counters from here to the highest are used, and not in the ring
+        self._blocks = _NONE  # the ring, once there was a gap
+        self._begun = -1  # the newest block that is in the ring
 
     def is_used(self, counter: int) -> bool:
         """Whether a counter up to the highest must not be accepted: it was before, or is below the window."""
-        if counter <= self.highest - REPLAY_WINDOW:
+        if counter >= self._run or counter <= self.highest - REPLAY_WINDOW:
             return True
-        return bool(self.blocks[counter // BLOCK_BITS % BLOCKS] >> counter % BLOCK_BITS & 1)
+        return bool(self._blocks[counter // BLOCK_BITS % BLOCKS] >> counter % BLOCK_BITS & 1)
 
     def mark(self, counter: int) -> None:
         """Remember an authentic counter that was not used."""
-        block = counter // BLOCK_BITS
-        if counter > self.highest:
-            newest = self.highest // BLOCK_BITS  # -1 before the first counter
-            if block > newest:
-                if not self.blocks:  # not before: a relay may have many sessions that were never confirmed
-                    self.blocks = array("Q", bytes(8 * BLOCKS))
-                for cleared in range(max(newest, block - BLOCKS) + 1, block + 1):
-                    self.blocks[cleared % BLOCKS] = 0
+        if counter == self.highest + 1:
             self.highest = counter
-        self.blocks[block % BLOCKS] |= 1 << counter % BLOCK_BITS
+        elif counter > self.highest:
+            self._end_run()
+            self._begin(counter // BLOCK_BITS)
+            self.highest = self._run = counter
+        else:
+            self._blocks[counter // BLOCK_BITS % BLOCKS] |= 1 << counter % BLOCK_BITS
+
+    def _end_run(self) -> None:
+        """Put the run into the ring, as far as it is in the window."""
+        if not self._blocks:  # not before: most sessions lose nothing, and a relay may have many that end unused
+            self._blocks = array("Q", bytes(8 * BLOCKS))
+        first = max(self._run, self.highest + 1 - REPLAY_WINDOW)
+        for block in range(first // BLOCK_BITS, self.highest // BLOCK_BITS + 1):
+            self._begin(block)
+            start, end = max(first, block * BLOCK_BITS), min(self.highest + 1, (block + 1) * BLOCK_BITS)
+            self._blocks[block % BLOCKS] |= (1 << end - start) - 1 << start % BLOCK_BITS
+
+    def _begin(self, block: int) -> None:
+        """Clear the blocks up to this one that are not in the ring yet: those of old counters are there."""
+        for cleared in range(max(self._begun, block - BLOCKS) + 1, block + 1):
+            self._blocks[cleared % BLOCKS] = 0
+        self._begun = max(self._begun, block)
 
 
 class CounterHistory:

@@ -9,6 +9,7 @@ from typing import Final, NamedTuple
 from uavlinkd.protocol import constants as c
 from uavlinkd.protocol import freshness, probing, wire
 from uavlinkd.protocol.admission import CookieRequired
+from uavlinkd.protocol.constants import LATE_AFTER_S
 from uavlinkd.protocol.drops import Drop, DropReason
 from uavlinkd.protocol.early import EarlyEnvelope
 from uavlinkd.protocol.establish import adopt, receive_close, receive_hint
@@ -24,8 +25,19 @@ from uavlinkd.protocol.send import may_echo, send_echo
 from uavlinkd.protocol.session import Session
 from uavlinkd.protocol.sessions import Indices
 from uavlinkd.protocol.timers import Schedule, Timer
-from uavlinkd.protocol.wire import ANSWER_BYTES, PROBE, QUESTION_BYTES, ProblemReport, RefusalReport
+from uavlinkd.protocol.wire import (
+    ANSWER_BYTES,
+    FRAMES_FROM,
+    PROBE,
+    QUESTION_BYTES,
+    SHORT_ENVELOPE,
+    SHORT_HEADER_BYTES,
+    ProblemReport,
+    RefusalReport,
+)
 
+USABLE: Final = PathCondition.USABLE
+"""A name of the module: the class of an enumeration looks its members up by a Python function."""
 _unpack_short = wire.SHORT_HEADER.unpack_from
 _SHORT_LEAST: Final = wire.SHORT_HEADER_BYTES + wire.TAG_LENGTHS[0]
 _NOBODY: Final = (None, None)
@@ -70,9 +82,9 @@ class DatagramReceiver:
         try:
             # The usual way of a frame from here on has no call but that which opens the envelope.
             size = len(datagram)
-            if size >= _SHORT_LEAST and datagram[0] == wire.SHORT_ENVELOPE:
+            if size >= _SHORT_LEAST and datagram[0] == SHORT_ENVELOPE:
                 _, index, counter = _unpack_short(datagram)
-                header_bytes = wire.SHORT_HEADER_BYTES
+                header_bytes = SHORT_HEADER_BYTES
             elif datagram[:1] in wire.ENVELOPE_STARTS:
                 index, counter, header_bytes = wire.parse_envelope_header(datagram)
             else:
@@ -109,30 +121,27 @@ class DatagramReceiver:
                 session.arrivals.note(counter, state.number, now)
             is_new = now <= session.trusted_until and not is_superseded
             if is_new:
-                session.trusted_until = now + c.LATE_AFTER_S
+                session.trusted_until = now + LATE_AFTER_S
                 peer.received_at = now
                 peer.unanswered_since = None
                 if not peer.is_up:
                     out += peer.note_received(now)
             elif not peer.is_up and not is_superseded:
                 out += freshness.question(peer, session, now)
-            if state.condition is not PathCondition.USABLE and payload[:1] != _PROBE:
+            if state.condition is not USABLE and payload[:1] != _PROBE:
                 _ask_path(peer, session, state, now, out, is_candidate=is_candidate)
             if not payload:
                 pass
-            elif (
-                payload[0] >= wire.FRAMES_FROM
-                and is_new
-                and peer.early is None
-                and now < session.verification.look_at
-            ):
-                traffic.out_of_order += counter < session.window.highest
+            elif payload[0] >= FRAMES_FROM and is_new and peer.early is None and now < session.verification.look_at:
+                if counter != session.window.highest:
+                    traffic.out_of_order += 1
                 order = 0 if session.arrivals is None else session.order_base + counter
                 out.append(new_tuple(Deliver, (peer, payload, order)))
             else:
                 arrived = Arrived(peer, session, counter, state, now, is_new, is_superseded)
                 _receive_other(arrived, payload, out)
-            if peer.timers.next_at < peer.timers.scheduled_at:
+            timers = peer.timers
+            if timers.next_at < timers.scheduled_at:
                 self.schedule.update(peer)
             return out
         except CookieRequired as drop:

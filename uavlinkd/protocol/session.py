@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from uavlinkd.protocol import constants as c
 from uavlinkd.protocol import wire
-from uavlinkd.protocol.counters import BLOCK_BITS, BLOCKS, Arrivals, CounterHistory, ReplayWindow
+from uavlinkd.protocol.counters import Arrivals, CounterHistory, ReplayWindow
 from uavlinkd.protocol.crypto import AeadKey, MacKey, equal, hkdf_expand
 from uavlinkd.protocol.drops import Drop, DropReason
 from uavlinkd.protocol.handshake import Keys
@@ -185,10 +185,12 @@ class Session:
             raise Drop(DropReason.TOO_LONG)
         if now >= self.reject_at:
             raise Drop(DropReason.SESSION_EXPIRED)
-        window = self.window
-        is_overtaken = counter <= window.highest
-        is_copy = is_overtaken and window.is_used(counter)  # a counter above the highest was never used
-        if not is_copy and (counter <= self._floor or (is_overtaken and self.is_late(counter, now))):
+        window, is_copy = self.window, False
+        if counter <= window.highest:
+            is_copy = window.is_used(counter)
+            if not is_copy and (counter <= self._floor or self.is_late(counter, now)):
+                raise Drop(DropReason.DELAYED)
+        elif counter <= self._floor:
             raise Drop(DropReason.DELAYED)
 
         key, tag_at = self._receive, len(datagram) - self.tag_bytes
@@ -209,11 +211,10 @@ class Session:
             self.first_received_at = now
         if now >= self._received_history.next_at:
             self._received_history.note(window.highest, self.received, now)
-        if counter == window.highest + 1 and counter % BLOCK_BITS:  # as window.mark(), without a call
+        if counter == window.highest + 1:  # as window.mark(), without a call
             window.highest = counter
-            window.blocks[counter // BLOCK_BITS % BLOCKS] |= 1 << counter % BLOCK_BITS
         else:
-            if is_overtaken:
+            if counter < window.highest:
                 self._received_history.add(counter)
             window.mark(counter)
         self.received += 1
