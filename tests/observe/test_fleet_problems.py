@@ -79,7 +79,7 @@ async def test_a_fleet_without_problems_has_none(tmp_path: Path) -> None:
 
 
 async def test_members_that_are_refused_are_named(tmp_path: Path) -> None:
-    """With their serials and addresses; both of a conflict. A sender without a name has its key."""
+    """With their serials and addresses. A sender without a name has its key; other refusals are only counted."""
     member = Member(tmp_path, news=bulletin(2, 9), more='operator = "pinned"')
     member.shows(C, certificate(name="v9", ids=(9, 9), key=KEY["c"], serial=9))
     member.shows(D, certificate(name="v8", ids=(8, 8), key=KEY["c"]))
@@ -87,11 +87,9 @@ async def test_members_that_are_refused_are_named(tmp_path: Path) -> None:
     member.shows(C, certificate(MemberRole.OPERATOR, "gs", (255, 255), key=KEY["c"], serial=12))
     texts = {cause: finding.text for cause, finding in member.findings().items()}
     at = "at 198.51.100.7:5790"
-    assert set(texts) == {"certificate_revoked", "bad_certificate", "member_conflict", "role_not_accepted"}
+    assert set(texts) == {"certificate_revoked", "bad_certificate"}
     assert texts["certificate_revoked"].endswith(f": v9 (serial 9) {at}")
     assert texts["bad_certificate"].endswith(f"of {KEY['d']} {at}")
-    assert texts["member_conflict"].endswith(f"v8 (serial 11) and this daemon's own certificate {at}")
-    assert texts["role_not_accepted"].endswith(f": gs (role operator) {at}")
     assert member.findings(NOW + 31) == {}
 
 
@@ -145,7 +143,7 @@ async def test_introduction_that_is_refused_is_shown(tmp_path: Path) -> None:
     assert member.record(CertificateRecord(C, b64decode(revoked))) is DropReason.CERTIFICATE_REVOKED
     other = certificate(MemberRole.OPERATOR, "gs", (255, 255), key=KEY["c"], serial=12)
     assert member.record(CertificateRecord(C, b64decode(other))) is DropReason.ROLE_NOT_ACCEPTED
-    assert set(member.findings()) == {"certificate_revoked", "role_not_accepted"}
+    assert set(member.findings()) == {"certificate_revoked"}
 
 
 async def test_key_of_small_order_is_not_introduced(tmp_path: Path) -> None:

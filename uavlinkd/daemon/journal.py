@@ -74,8 +74,6 @@ class DaemonJournal:
         self.watcher: JournalReader | None = None
         self.totals: Counter[str] = Counter()
         """All drops by reason since the start."""
-        self.paused: tuple[float, float] | None = None
-        """When the last pause of the process ended, and its duration in seconds."""
         self.refused_file: list[str] = []
         """The problems of the file at the last reload, if it was refused."""
         self._fresh: dict[Key, Tally] = {}
@@ -129,8 +127,7 @@ class DaemonJournal:
             self.watcher.write_client(event, endpoint, client, monotonic())
 
     def on_pause(self, pause_s: float) -> None:
-        """Note that the process was paused."""
-        self.paused = monotonic(), pause_s
+        """Pass on that the process was paused."""
         if self.watcher is not None:
             self.watcher.write_pause(pause_s, monotonic())
 

@@ -24,7 +24,7 @@ ENDED_PROBLEMS = 100
 FINDING_QUIET_S = 10.0
 """A finding has ended when it was absent for so long, see :data:`uavlinkd.observe.conditions.QUIET_S`."""
 
-_OTHER_EVENTS = frozenset({"daemon_paused", "network_absent", "configuration_refused", "fault_inside"})
+_OTHER_EVENTS = frozenset({"network_absent", "configuration_refused", "fault_inside"})
 """Findings that are logged by events of their own."""
 _State = o.PeerUp | o.PeerLost | o.PeerClosed
 _FindingKey = tuple[str, Subject, str]

@@ -113,12 +113,6 @@ def fault_inside(moment: Moment) -> Signs:
         yield {"places": listed(f"{place} ({count}x)" for place, count in guard.faults.most_common())}
 
 
-def daemon_paused(moment: Moment) -> Signs:
-    paused = moment.daemon.journal.paused
-    if paused is not None and moment.now - paused[0] <= EVIDENCE_S:
-        yield {"pause_s": paused[1]}
-
-
 def configuration_refused(moment: Moment) -> Signs:
     if problems := moment.daemon.journal.refused_file:
         yield {"problems": listed(problems, 1), "file": moment.daemon.config.path}
@@ -192,10 +186,11 @@ def bulletin_rolled_back(moment: Moment) -> Signs:
             yield {"by": noticed[ROLLED_BACK][1]}
 
 
-MEMBER_REFUSALS: Final = (
+_OF_MEMBERS: Final = (
     *(DropReason.BAD_CERTIFICATE, DropReason.CERTIFICATE_REVOKED),
     *(DropReason.MEMBER_CONFLICT, DropReason.ROLE_NOT_ACCEPTED),
 )
+"""Why this daemon refuses a certificate: its sender is no stranger."""
 
 
 def _senders(moment: Moment, reason: DropReason) -> dict[Detail, SocketAddress | None]:
@@ -217,7 +212,7 @@ def not_a_member(moment: Moment) -> Signs:
     """A sender that no other finding names, nor holds a certificate that counts."""
     daemon = moment.daemon
     if daemon.fleet is not None:
-        named = {address for reason in MEMBER_REFUSALS for address in _senders(moment, reason).values()}
+        named = {address for reason in _OF_MEMBERS for address in _senders(moment, reason).values()}
         held, unknown = daemon.fleet.trust.held, _senders(moment, DropReason.UNKNOWN_PEER)
         unknown = {key: at for key, at in unknown.items() if key not in held and at not in named}
     elif daemon.relay is not None:

@@ -106,12 +106,6 @@ OF_DAEMON: Final = (
         "send what `uavlinkd status --json` prints, and the log, to the developers; frames pass meanwhile",
     ),
     Row(
-        *("daemon_paused", WARNING, CERTAIN, signs.daemon_paused),
-        "the daemon was paused for {pause_s:.1f} s, and dropped frames from that time",
-        "give the daemon more CPU time (`uptime`), or do not suspend the machine",
-        code=9,
-    ),
-    Row(
         *("configuration_refused", WARNING, CERTAIN, signs.configuration_refused),
         "the last reload was refused, and the configuration before is in force: {problems}",
         "correct what `uavlinkd check --config {file}` prints, and run `uavlinkd reload`",
@@ -157,16 +151,6 @@ OF_DAEMON: Final = (
         *("certificate_revoked", WARNING, HINT, signs.member_refused(DropReason.CERTIFICATE_REVOKED)),
         "refused, because the bulletin revokes it, or `deny` in this file names it: {senders}",
         "none if it was captured; else let the authority sign it again",
-    ),
-    Row(
-        *("member_conflict", WARNING, HINT, signs.member_refused(DropReason.MEMBER_CONFLICT)),
-        "two members claim one name or system id, and one is refused: {senders}",
-        "sign one of them again with another name and other ids, and revoke the certificate that it had",
-    ),
-    Row(
-        *("role_not_accepted", WARNING, HINT, signs.member_refused(DropReason.ROLE_NOT_ACCEPTED)),
-        "this file has no policy for members of its role: {senders}",
-        'none if that is meant, as with operator = "pinned"; else write a [[fleet_role]]',
     ),
     Row(
         *("not_a_member", WARNING, HINT, signs.not_a_member),
@@ -233,12 +217,7 @@ _REFUSED: Final = (
         code=1,
     ),
     Row(
-        *("commands_refused", WARNING, CERTAIN, traffic_signs.commands("in")),
-        "{commands} refused from it: {rule}",
-        "intended, if {rule} is right; else write another role, or allow the command",
-    ),
-    Row(
-        *("commands_withheld", WARNING, CERTAIN, traffic_signs.commands("out")),
+        *("commands_withheld", WARNING, CERTAIN, traffic_signs.commands_withheld),
         "{commands} withheld: {rule}",
         "intended, if {rule} is right; else write another role, or allow the command",
     ),

@@ -14,7 +14,6 @@ from uavlinkd.mavlink.dialect import command_name, name_of
 from uavlinkd.mavlink.egress.lanes import EgressDrop
 from uavlinkd.mavlink.policy.gate import ANY_OTHER, REFUSALS, Refusal
 from uavlinkd.observe.facts import KERNEL_ERRORS, NOT_LISTENING, SILENT_S, EndpointFacts, PartFacts, PeerFacts, listed
-from uavlinkd.observe.history import GateHistory
 from uavlinkd.observe.signs import SECURITY_S, Signs
 from uavlinkd.ops.log import shown
 from uavlinkd.protocol import constants as c
@@ -123,21 +122,13 @@ def roles_exchanged(peer: PeerFacts) -> Signs:
         yield {"advice": remedy, **({} if peer.blocked else {"severity": "warning"})}
 
 
-def commands(direction: str) -> Callable[[PartFacts], Signs]:
-    """Commands from or to the part that its role or lists refuse, those of a flight first."""
-
-    def signs(part: PartFacts) -> Signs:
-        gate = part.history.incoming if direction == "in" else part.history.outgoing
-        if names := _commands(gate, part.now):
-            yield {"commands": names}
-
-    return signs
-
-
-def _commands(gate: GateHistory, now: float) -> str:
-    counts = [(key, count) for key, count in gate.commands.within(COMMANDS_S, now).items() if key[2] in _BY_RULE]
+def commands_withheld(part: PartFacts) -> Signs:
+    """Commands to the part that its role or lists refuse, those of a flight first."""
+    refused = part.history.outgoing.commands.within(COMMANDS_S, part.now)
+    counts = [(key, count) for key, count in refused.items() if key[2] in _BY_RULE]
     counts.sort(key=lambda entry: _rank(entry[0][1]))
-    return listed(f"{_command(msgid, number)} {count:,}x" for (msgid, number, _), count in counts)
+    if counts:
+        yield {"commands": listed(f"{_command(msgid, number)} {count:,}x" for (msgid, number, _), count in counts)}
 
 
 def _rank(number: int) -> int:
