@@ -32,7 +32,7 @@ GOOD = HEAD + ENDPOINT + PEER
 LTE = '[[network]]\nname = "lte"\ninterface = "wwan0"\nmetered = true\nbudget_bits_s = 256000\n'
 MESH = '[[network]]\nname = "mesh"\naddress = "10.13.0.5"\n'
 SIK = '[[network]]\nname = "sik"\nserial = "/dev/ttyUSB0:57600"\n'
-HTTPS = '[relay_server]\nhttps = { listen = "127.0.0.1:5443" }\n'
+HTTPS = '[relay_server]\nhttps = { listen = "127.0.0.1:5443", certificate = "tls.crt", key = "tls.key" }\n'
 BY_MESH = '{ address = "10.13.0.9:5790", network = "mesh" }'
 BY_SIK = '[{ network = "sik" }]'
 

@@ -24,6 +24,7 @@ from tests.config.files import (
     relay,
     relays,
 )
+from tests.tls_files import write_tls_files
 from uavlinkd.config import keys
 from uavlinkd.config.changes import compare
 from uavlinkd.config.model import ConfigError
@@ -76,6 +77,7 @@ def test_changes_are_found(tmp_path: Path, before: str, after: str, changes: dic
 def test_other_changes_need_a_restart(tmp_path: Path, before: str, after: str, key: str) -> None:
     """The problem names the key and the remedy."""
     keys.write_secret_file(tmp_path / "other.key", keys.generate_private_key())
+    write_tls_files(tmp_path)
     with pytest.raises(ConfigError) as caught:
         compare(load(tmp_path, before), load(tmp_path, after))
     assert [problem.key for problem in caught.value.problems] == [key]

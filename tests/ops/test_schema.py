@@ -11,6 +11,7 @@ from tests.ops.schema import golden
 from tests.processes.frames import frame
 from tests.processes.harness import Stage
 from tests.processes.members import CertifiedFleet
+from tests.processes.tls import listen_for_tls
 from tests.test_readmes import ROOT, names_in_table
 from uavlinkd.authority.certificates import MemberRole
 from uavlinkd.lab.sim.loopback_ports import free_port
@@ -117,7 +118,7 @@ async def observed() -> dict[str, str]:
             {"name": "drone1", "public_key": b.public_key},
             {"name": "far", "public_key": far.public_key},
         ]
-        relay.config["relay_server"] = {"https": {"listen": f"127.0.0.1:{free_port()}"}}
+        listen_for_tls(relay)
         relay.add_peer(b, [b.address])
         b.add_peer(relay, [relay.address])
         b.config["relay"] = [{"name": "station", "public_key": relay.public_key, "addresses": []}]

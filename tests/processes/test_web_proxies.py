@@ -1,4 +1,4 @@
-"""Members that reach their relay through real web servers and HTTP proxies."""
+"""Members that reach their relay through real HTTP proxies."""
 
 from __future__ import annotations
 
@@ -6,12 +6,10 @@ import asyncio
 from collections.abc import Callable
 from pathlib import Path
 
-import pytest
-
 from tests.processes.frames import GROUND_SYSTEM, heartbeat
 from tests.processes.harness import Stage
 from tests.processes.test_relay_by_tls import Scene, carrying
-from tests.processes.web_servers import PASSWORD, USER, WebServer, caddy, nginx, running, squid, tinyproxy
+from tests.processes.web_servers import PASSWORD, USER, WebServer, running, squid, tinyproxy
 from tests.waiting import PATIENCE_S
 from uavlinkd.lab.sim.loopback_ports import free_port
 
@@ -40,20 +38,6 @@ async def check_restart(scene: Scene, server: WebServer) -> None:
     await server.start()
     await until_connections(scene, 2)
     await talk_both_ways(scene)
-
-
-@pytest.mark.parametrize("make", [nginx, caddy])
-async def test_members_through_a_web_server(stage: Stage, make: Make) -> None:
-    """With its published example, which passes one path on to a relay without TLS."""
-    scene, port = Scene(stage), free_port()
-    scene.relay.config["relay_server"] = {"https": {"listen": f"127.0.0.1:{port}"}}
-    async with running(make, stage.folder / "web", port) as server:
-        url = f"wss://127.0.0.1:{server.port}/uavlink"
-        await scene.start([url], [url])
-        await talk_both_ways(scene)
-        assert await carrying(scene.drone) == url
-        assert await scene.connections() == 2
-        await check_restart(scene, server)
 
 
 async def test_member_through_a_proxy(stage: Stage) -> None:

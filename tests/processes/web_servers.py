@@ -1,4 +1,4 @@
-"""Real web servers before a relay, and real HTTP proxies: processes of Debian's packages."""
+"""Real HTTP proxies: processes of Debian's packages."""
 
 from __future__ import annotations
 
@@ -14,44 +14,15 @@ from time import monotonic
 from typing import Final
 
 from tests.needs import need
-from tests.tls_files import write_tls_files
 from tests.waiting import PATIENCE_S
 from uavlinkd.lab.child_processes import end_with_parent, stop_child
 from uavlinkd.lab.sim.loopback_ports import free_port
 
-EXAMPLES: Final = Path(__file__).parents[2] / "configs" / "web"
 USER, PASSWORD = "member", "secret"
 """That tinyproxy wants."""
 _SBIN: Final = os.pathsep.join((os.environ.get("PATH", os.defpath), "/usr/sbin"))
 _END_S: Final = 10.0
 
-_NGINX = """
-daemon off;
-master_process off;
-error_log {folder}/error.log;
-pid {folder}/nginx.pid;
-events {{}}
-http {{
-    access_log off;
-    client_body_temp_path {folder}/body;
-    proxy_temp_path {folder}/proxy;
-    fastcgi_temp_path {folder}/fastcgi;
-    uwsgi_temp_path {folder}/uwsgi;
-    scgi_temp_path {folder}/scgi;
-    include {folder}/site.conf;
-}}
-"""
-_CADDY = """
-{{
-    admin off
-    auto_https disable_redirects
-    default_bind 127.0.0.1
-    https_port {port}
-    local_certs
-    skip_install_trust
-    storage file_system {folder}
-}}
-"""
 _TINYPROXY = """
 Listen 127.0.0.1
 Port {port}
@@ -112,38 +83,6 @@ def _write(folder: Path, **files: str) -> None:
     folder.mkdir()
     for name, text in files.items():
         (folder / name.replace("_", ".")).write_text(text)
-
-
-def _example(name: str, *replacements: tuple[str, str]) -> str:
-    """A published configuration with other names and ports, each of which must be in it."""
-    text = (EXAMPLES / name).read_text()
-    for published, here in replacements:
-        assert published in text, f"{published} is not in {name}"
-        text = text.replace(published, here)
-    return text
-
-
-def nginx(folder: Path, relay_port: int) -> WebServer:
-    """Passes on to the relay, with the published example."""
-    server = WebServer("nginx", folder, "-p", str(folder), "-e", f"{folder}/error.log", "-c", f"{folder}/nginx.conf")
-    site = _example(
-        "nginx.conf",
-        ("listen 443 ", f"listen 127.0.0.1:{server.port} "),
-        ("/etc/uavlinkd/", f"{folder}/"),
-        ("127.0.0.1:5443", f"127.0.0.1:{relay_port}"),
-    )
-    _write(folder, nginx_conf=_NGINX.format(folder=folder), site_conf=site)
-    write_tls_files(folder, is_valid=True)
-    return server
-
-
-def caddy(folder: Path, relay_port: int) -> WebServer:
-    """Passes on to the relay, with the published example. Its certificate is of an authority of its own."""
-    server = WebServer("caddy", folder, "run", "--config", f"{folder}/Caddyfile", "--adapter", "caddyfile")
-    options = _CADDY.format(folder=folder, port=server.port)
-    replacements = ("relay.example.org", "127.0.0.1"), ("127.0.0.1:5443", f"127.0.0.1:{relay_port}")
-    _write(folder, Caddyfile=options + _example("Caddyfile", *replacements))
-    return server
 
 
 def tinyproxy(folder: Path, to: int) -> WebServer:

@@ -100,7 +100,7 @@ STATUS: dict[str, Any] = {
         "dropped": numbered("relay_over_limit"),
         "https": {
             **numbered("connections", "strangers"),
-            "refused": numbered("prefix_full", "tls"),
+            "refused": numbered("displaced", "tls"),
             "lost": numbered("closed"),
         },
         "members": {"drone1": {"is_up": True, **MEMBER}},

@@ -151,13 +151,11 @@ class PeerConfig:
 
 @dataclass(frozen=True, slots=True)
 class HttpsServer:
-    """Where members reach a relay by TLS. Without files: through a web server on this machine that has the
-    certificate.
-    """
+    """Where members reach a relay by TLS."""
 
     listen: Address
-    certificate: Path | None = None
-    key: Path | None = None
+    certificate: Path
+    key: Path
 
 
 @dataclass(frozen=True, slots=True)

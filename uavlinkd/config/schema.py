@@ -154,23 +154,21 @@ def _peer_address(value: Any) -> PeerAddress:
 
 
 def _https(value: Any) -> HttpsServer:
-    files = {"certificate", "key"}
+    files = ("certificate", "key")
     if not isinstance(value, dict) or not {"listen"} <= set(value) <= {"listen", *files}:
         raise ValueError(f"has keys of its own: write {_HTTPS}")
     names: dict[str, Path] = {}
     part = "listen"
     try:
         listen = parse_address(_text(value["listen"]), allow_names=False)
-        for part in sorted(files & set(value)):
+        for part in set(files) & set(value):
             names[part] = Path(_file_name(value[part]))
     except ValueError as error:
         raise ValueError(f"{part} {error}") from None
-    if len(names) == 1:
-        raise ValueError("has only one of certificate and key: write both, or none if a web server here has them")
-    if not names and not listen.is_loopback:
+    if len(names) < len(files):
         raise ValueError(
-            "has no certificate, so only a web server on this machine may connect: write certificate and key, or"
-            ' listen = "127.0.0.1:5443"'
+            "needs a certificate and its key: a web server can no longer stand before the relay. Give it another port"
+            f" or address: write {_HTTPS}"
         )
     return HttpsServer(listen, **names)
 

@@ -28,8 +28,6 @@ def find_tls_files(server: HttpsServer, folder: Path, environ: Mapping[str, str]
 
     Raises TlsFileError if they cannot be used.
     """
-    if server.certificate is None or server.key is None:
-        return server
     certificate, key = (find_secret_file(str(name), folder, environ)[0] for name in (server.certificate, server.key))
     load_tls(certificate, key)
     return replace(server, certificate=certificate, key=key)

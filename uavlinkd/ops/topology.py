@@ -87,8 +87,7 @@ def _identity(config: Config) -> Iterator[Row]:
         others = ", and from peer to peer" if config.relays_frames else " only"
         yield "routing", f"between peers and endpoints{others}"
     if config.relay_server is not None and (https := config.relay_server.https) is not None:
-        how = "" if https.certificate else " (without TLS, for a web server on this machine)"
-        yield "by TLS", f"{https.listen}{how}"
+        yield "by TLS", str(https.listen)
 
 
 def _fleet(fleet: FleetConfig) -> Iterator[Row]:

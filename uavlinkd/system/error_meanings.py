@@ -66,9 +66,7 @@ ERROR_MEANINGS: Final[Mapping[str, str]] = {
     " again by itself",
     # Connections to a relay by TLS.
     "too_many_connections": "this relay has as many connections by TLS as it may: run several relays",
-    "prefix_full": "too many connections from one network that no member has proved: a scan or an attack, or many"
-    " members of that network start at once",
-    "displaced": "too many connections that no member has proved: new ones displace the oldest",
+    "displaced": "too many connections that no member has proved: a scan or an attack, or many members start at once",
     "flood": "a connection that no member has proved sent too many messages: an attack",
     # Files and devices.
     "ENOENT": "there is no such file or device now: plug it in, or correct its name",

@@ -2,9 +2,8 @@
 
 To the rest of the daemon they are one socket of UDP: a datagram comes from the address of a connection, and goes back
 to it. Any machine may connect to such a port. A connection belongs to a stranger until a peer has answered a question
-of the core along it. Strangers are limited, and do not stay.
-
-Without a certificate, a web server on this machine has it, and says who connected to it.
+of the core along it. Strangers are limited, and do not stay. One that says nothing costs a file descriptor only: TLS
+begins with its first bytes.
 """
 
 from __future__ import annotations
@@ -16,8 +15,7 @@ import socket
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
-from ipaddress import IPv6Address, ip_address
-from math import inf
+from ipaddress import IPv6Address
 from typing import Final
 
 from uavlinkd.config.model import HttpsServer
@@ -35,26 +33,22 @@ from uavlinkd.system.addresses import Address, numeric_host
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.stall import Backlog, StallWatch
 from uavlinkd.tls.channel import TlsFactory, server_tls
-from uavlinkd.tls.newcomers import NEWCOMERS, Newcomer, Newcomers
 from uavlinkd.tls.stream import WebStream, server_protocol
 
 CONNECTIONS: Final = 4096
-STRANGERS: Final = 256
-"""Connections that no member has proved. One more displaces the oldest: a member needs a second, or less."""
-STRANGERS_OF_PREFIX: Final = 32
-"""Of them, from one IPv4 /24 or IPv6 /48."""
+STRANGERS: Final = 512
+"""Connections that no member has proved. One more displaces the oldest of the IPv4 /24 or IPv6 /48 that has most: a
+member needs a second, or less."""
 STRANGER_S: Final = 5.0
 """So long a stranger may stay."""
 STRANGER_MESSAGES: Final = 128
 """So many messages it may send. A member needs two or three, and what it has to say until the relay's first question
 has its answer."""
-DISPLACED_S: Final = 1.0
-"""In a network that has its share, a new stranger displaces one that is so old."""
 ACCEPTED_S: Final = 5000.0
 """TCP connections a second. The others wait in the kernel."""
 ACCEPTED_AT_ONCE: Final = 100
 HANDSHAKES_S: Final = 200.0
-"""Connections a second that get a place when their first bytes are there: each costs a handshake of TLS."""
+"""Handshakes of TLS a second. The network with the fewest strangers comes first."""
 HANDSHAKES_AT_ONCE: Final = 20
 PAUSE_S: Final = 0.02
 """Until there are tokens for the next ones,"""
@@ -62,7 +56,7 @@ EXHAUSTED_S: Final = 1.0
 """and without a file descriptor."""
 LOOK_AGAIN_S: Final = 0.1
 """While there are too many strangers, they are looked at this often at most."""
-FILES: Final = CONNECTIONS + NEWCOMERS + 512
+FILES: Final = CONNECTIONS + 512
 """File descriptors that the daemon asks for, with those of everything else."""
 SENDER: Final = "members by TLS"
 """The name of their stale datagrams."""
@@ -81,18 +75,30 @@ _EXHAUSTED: Final = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.
 class _Connection:
     """One connection, the handler of its stream.
 
-    ``since``: when it became a stranger's. ``messages``: how many it sent since then.
+    ``epoch``: in which its other end could first send. ``since``: when it became a stranger's. ``messages``: how many
+    it sent since then. ``stream``: None before its first bytes, and until there is a handshake for it.
     """
 
-    __slots__ = ("_listener", "address", "messages", "prefix", "since", "stream")
+    __slots__ = ("_listener", "address", "epoch", "messages", "prefix", "since", "sock", "stream")
 
-    def __init__(self, listener: WebListener, address: SocketAddress, prefix: object, now: float) -> None:
+    def __init__(self, listener: WebListener, sock: socket.socket, address: SocketAddress, epoch: int) -> None:
         self._listener = listener
+        self.sock = sock
         self.address = address
-        self.prefix = prefix
-        self.since = now
+        self.prefix = _prefix_of(address[0])
+        self.epoch = epoch
+        self.since = monotonic()
         self.messages = 0
-        self.stream: WebStream
+        self.stream: WebStream | None = None
+
+    def lose(self, reason: str) -> None:
+        """End it."""
+        if self.stream is not None:
+            self.stream.lose(reason)
+            return
+        asyncio.get_running_loop().remove_reader(self.sock.fileno())
+        self.sock.close()
+        self.on_lost(reason)
 
     def on_open(self) -> None:
         self._listener.on_open(self)
@@ -127,21 +133,21 @@ class WebListener(PathKind):
         self._every = set[_Connection]()
         self._strangers: dict[_Connection, None] = {}  # the oldest first
         self._strangers_of = Counter[object]()  # by prefix
+        self._ready: dict[_Connection, None] = {}  # they wait for a handshake
         self._by_address: dict[SocketAddress, _Connection] = {}  # the open ones
         self._dropped = 0  # datagrams, of connections that ended
         self._accepted = TokenBucket(ACCEPTED_S, ACCEPTED_AT_ONCE, monotonic())
         self._handshakes = TokenBucket(HANDSHAKES_S, HANDSHAKES_AT_ONCE, monotonic())
-        self._welcoming: asyncio.TimerHandle | None = None  # newcomers that are ready wait for tokens
+        self._welcoming: asyncio.TimerHandle | None = None
         self._looked_at = 0.0
         self._resume: asyncio.TimerHandle | None = None
 
     def open(self, add: AddSender) -> None:
         """Listen. Raises BindError if the address or the certificate cannot be used."""
-        self._tls = _tls_of(self._config)
-        self._newcomers = Newcomers(is_tls=self._tls is not None, refuse=self._refuse, on_ready=self._welcome)
         try:
+            self._tls = server_tls(load_tls(self._config.certificate, self._config.key))
             self._sock = tcp_listener(self._config.listen)
-        except BindError as error:
+        except (TlsFileError, BindError) as error:
             raise BindError(f"relay_server.https: {error}") from None
         self._sock.listen(_BACKLOG)
         self._backlog = Backlog(self._stall, self._sock.fileno(), lambda: _BACKLOG + 1)
@@ -169,14 +175,16 @@ class WebListener(PathKind):
         asyncio.get_running_loop().remove_reader(self._sock.fileno())
         self._sock.close()
         self._backlog.close()
-        self._newcomers.end_since(inf, "closed")
         for connection in list(self._every):
-            connection.stream.finish()  # the sessions of the members have just been closed
+            if connection.stream is not None:
+                connection.stream.finish()  # the sessions of the members have just been closed
+            else:
+                connection.lose("closed")
 
     def send(self, datagram: bytes, address: SocketAddress) -> int:
         """As a socket's ``sendto``."""
         connection = self._by_address.get(address)
-        if connection is None:
+        if connection is None or connection.stream is None:
             raise OSError(errno.ENOTCONN, "the connection has ended")
         connection.stream.send(datagram)
         return len(datagram)
@@ -186,20 +194,19 @@ class WebListener(PathKind):
         now = monotonic()
         if self._every:
             self._look(now)
-        self._newcomers.end_since(now - STRANGER_S, "slow_handshake")
         for connection in [one for one in self._strangers if now - one.since >= STRANGER_S]:
-            connection.stream.lose("unproven")
+            connection.lose("slow_handshake" if connection.stream is None else "unproven")
 
     def status(self) -> dict[str, object]:
         """As plain values."""
+        streams = (one.stream for one in self._every if one.stream is not None)
         return {
             "address": str(self.address),
-            "is_plain": self._tls is None,
             "connections": len(self._every),
             "strangers": len(self._strangers),
             "refused": dict(self.refused),
             "lost": dict(self.lost),
-            "datagrams_dropped": self._dropped + sum(one.stream.dropped for one in self._every),
+            "datagrams_dropped": self._dropped + sum(stream.dropped for stream in streams),
         }
 
     # Accepting.
@@ -215,13 +222,16 @@ class WebListener(PathKind):
                 return
             except OSError as error:
                 if error.errno in _EXHAUSTED:  # else this one is gone already
-                    self._refuse(failure_name(error))
+                    self._refuse(failure_name(error), now)
                     self._pause(EXHAUSTED_S)
                     return
                 continue
             self._backlog.end(1, is_empty=False)
-            address = numeric_host(sockaddr), sockaddr[1]
-            self._newcomers.add(Newcomer(sock, address, _prefix_of(address[0]), epoch, now))
+            if len(self._every) >= CONNECTIONS:
+                self._refuse("too_many_connections", now)
+                sock.close()
+            else:
+                self._add(_Connection(self, sock, (numeric_host(sockaddr), sockaddr[1]), epoch), now)
         self._pause(PAUSE_S)
 
     def _pause(self, seconds: float) -> None:
@@ -229,73 +239,53 @@ class WebListener(PathKind):
         loop.remove_reader(self._sock.fileno())
         self._resume = loop.call_later(seconds, self._watch)
 
-    def _welcome(self) -> None:
-        """Accept newcomers whose first bytes are there, as far as there are tokens."""
-        if self._welcoming is not None:
-            return
-        now = monotonic()
-        while self._newcomers.ready and self._handshakes.has(now):
-            newcomer = self._newcomers.pop()
-            if reason := self._make_place(newcomer, now):
-                self._refuse(reason)
-                newcomer.sock.close()
-            else:
-                self._handshakes.take(now)
-                self._accept(newcomer, now)
-        if self._newcomers.ready:
-            self._welcoming = asyncio.get_running_loop().call_later(PAUSE_S, self._welcome_later)
-
-    def _welcome_later(self) -> None:
-        self._welcoming = None
-        self._welcome()
-
-    def _accept(self, newcomer: Newcomer, now: float) -> None:
-        set_options(newcomer.sock, _KEEPALIVE)
-        prefix = None if self._tls is None else newcomer.source  # a web server's connections are not its own
-        connection = _Connection(self, newcomer.address, prefix, now)
-        connection.stream = WebStream(
-            newcomer.sock, server_protocol(), self._tls, connection, self._stall, SENDER, newcomer.epoch
-        )
+    def _add(self, connection: _Connection, now: float) -> None:
+        if len(self._strangers) >= STRANGERS and now - self._looked_at >= LOOK_AGAIN_S:
+            self._look(now)
+        if len(self._strangers) >= STRANGERS:
+            greediest = max(self._strangers_of, key=self._strangers_of.__getitem__)
+            self._drops.add("connections_failed", "displaced", "", 1, now)
+            next(one for one in self._strangers if one.prefix == greediest).lose("displaced")
+        connection.sock.setblocking(False)
         self._every.add(connection)
         self._add_stranger(connection)
-        connection.stream.start()
+        asyncio.get_running_loop().add_reader(connection.sock.fileno(), self._on_first_bytes, connection)
 
-    def _make_place(self, newcomer: Newcomer, now: float) -> str:
-        """For a stranger. Returns why there is none."""
-        if len(self._every) >= CONNECTIONS:
-            return "too_many_connections"
-        if self._tls is not None and self._is_full(newcomer.source, now):
-            return "prefix_full"
-        if len(self._strangers) >= STRANGERS:
-            self._look_again(now)
-        if len(self._strangers) >= STRANGERS:
-            self._displace(next(iter(self._strangers)), now)
-        return ""
+    def _on_first_bytes(self, connection: _Connection) -> None:
+        try:
+            is_closed = not connection.sock.recv(1, socket.MSG_PEEK)
+        except BlockingIOError:
+            return
+        except OSError as error:
+            connection.lose(failure_name(error))
+            return
+        if is_closed:
+            connection.lose("closed")
+            return
+        asyncio.get_running_loop().remove_reader(connection.sock.fileno())
+        self._ready[connection] = None
+        if self._welcoming is None:
+            self._welcome()
 
-    def _is_full(self, prefix: object, now: float) -> bool:
-        if self._strangers_of[prefix] >= STRANGERS_OF_PREFIX:
-            self._look_again(now)
-        if self._strangers_of[prefix] < STRANGERS_OF_PREFIX:
-            return False
-        oldest = next(one for one in self._strangers if one.prefix == prefix)
-        if now - oldest.since < DISPLACED_S:
-            return True
-        self._displace(oldest, now)
-        return False
+    def _welcome(self) -> None:
+        """Begin TLS with those that are ready, as far as there are tokens."""
+        self._welcoming = None
+        while self._ready and self._handshakes.take(monotonic()):
+            connection = min(self._ready, key=lambda one: self._strangers_of[one.prefix])
+            del self._ready[connection]
+            set_options(connection.sock, _KEEPALIVE)
+            connection.stream = WebStream(
+                connection.sock, server_protocol(), self._tls, connection, self._stall, SENDER, connection.epoch
+            )
+            connection.stream.start()
+        if self._ready:
+            self._welcoming = asyncio.get_running_loop().call_later(PAUSE_S, self._welcome)
 
-    def _displace(self, stranger: _Connection, now: float) -> None:
-        self._drops.add("connections_failed", "displaced", "", 1, now)
-        stranger.stream.lose("displaced")
-
-    def _refuse(self, reason: str) -> None:
+    def _refuse(self, reason: str, now: float) -> None:
         self.refused[reason] += 1
-        self._drops.add("connections_failed", reason, "", 1, monotonic())
+        self._drops.add("connections_failed", reason, "", 1, now)
 
     # Strangers.
-
-    def _look_again(self, now: float) -> None:
-        if now - self._looked_at >= LOOK_AGAIN_S:
-            self._look(now)
 
     def _look(self, now: float) -> None:
         """Whose connection is it? A peer's, as long as the core has a path there that was proved."""
@@ -307,10 +297,9 @@ class WebListener(PathKind):
             if path.socket == self.number and state.is_validated
         }
         for connection in self._every:
-            is_stranger = connection in self._strangers
             if connection.address in proved:
                 self._remove_stranger(connection)
-            elif not is_stranger:
+            elif connection not in self._strangers:
                 connection.since, connection.messages = now, 0
                 self._add_stranger(connection)
 
@@ -321,49 +310,23 @@ class WebListener(PathKind):
 
     def _add_stranger(self, connection: _Connection) -> None:
         self._strangers[connection] = None
-        if connection.prefix is not None:
-            self._strangers_of[connection.prefix] += 1
+        self._strangers_of[connection.prefix] += 1
 
     def _remove_stranger(self, connection: _Connection) -> bool:
         """Returns whether it was one."""
         if connection not in self._strangers:
             return False
         del self._strangers[connection]
-        if connection.prefix is not None:
-            self._strangers_of[connection.prefix] -= 1
-            if not self._strangers_of[connection.prefix]:
-                del self._strangers_of[connection.prefix]
+        self._strangers_of[connection.prefix] -= 1
+        if not self._strangers_of[connection.prefix]:
+            del self._strangers_of[connection.prefix]
         return True
 
     # As the owner of the connections.
 
     def on_open(self, connection: _Connection) -> None:
-        """Datagrams may be sent. Behind a web server, now it is known who connected."""
-        if self._tls is None and not self._take_forwarded(connection, monotonic()):
-            return
-        before = self._by_address.get(connection.address)
+        """Datagrams may be sent."""
         self._by_address[connection.address] = connection
-        if before is not None:
-            before.stream.lose("replaced")
-
-    def _take_forwarded(self, connection: _Connection, now: float) -> bool:
-        """Take over the address that the web server wrote. Returns whether the connection may stay."""
-        request = connection.stream.request
-        assert request is not None, "it opened the stream"
-        hosts = request.headers.get_all("X-Forwarded-For") or [str(connection.address[0])]
-        host = _host_in(hosts[-1])
-        if host is None:
-            connection.stream.lose("forwarded_for")
-            return False
-        prefix = _prefix_of(host)
-        if self._is_full(prefix, now):
-            self._drops.add("connections_failed", "prefix_full", "", 1, now)
-            connection.stream.lose("prefix_full")
-            return False
-        self._remove_stranger(connection)
-        connection.address, connection.prefix = (host, connection.address[1]), prefix
-        self._add_stranger(connection)
-        return True
 
     def on_datagrams(self, connection: _Connection, datagrams: list[bytes], now: float, epoch: int) -> None:
         """Messages came in one read."""
@@ -380,28 +343,21 @@ class WebListener(PathKind):
             self._remove_stranger(stranger)
             return True
         self._drops.add("connections_failed", "flood", "", 1, now)
-        stranger.stream.lose("flood")
+        stranger.lose("flood")
         return False
 
     def on_lost(self, connection: _Connection, reason: str) -> None:
         """The connection ended."""
         self._every.discard(connection)
+        self._ready.pop(connection, None)
         if self._by_address.get(connection.address) is connection:
             del self._by_address[connection.address]
             self._node.remove_path(Path(self.number, connection.address), monotonic())
             self._on_change()
         ended = self.refused if self._remove_stranger(connection) else self.lost
         ended[reason] += 1
-        self._dropped += connection.stream.dropped
-
-
-def _tls_of(config: HttpsServer) -> TlsFactory | None:
-    if config.certificate is None or config.key is None:
-        return None
-    try:
-        return server_tls(load_tls(config.certificate, config.key))
-    except TlsFileError as error:
-        raise BindError(f"relay_server.https: {error}") from None
+        if connection.stream is not None:
+            self._dropped += connection.stream.dropped
 
 
 def _raise_file_limit() -> None:
@@ -416,16 +372,3 @@ def _raise_file_limit() -> None:
 def _prefix_of(host: str) -> object:
     """The network from which a stranger may have all addresses."""
     return IPv6Address(host).packed[:6] if ":" in host else host.rpartition(".")[0]
-
-
-def _host_in(forwarded: str) -> str | None:
-    """The last host of the header: the web server appended it, and the client may have written those before."""
-    try:
-        ip = ip_address(forwarded.rpartition(",")[2].strip())
-    except ValueError:
-        return None
-    if isinstance(ip, IPv6Address):
-        if ip.scope_id is not None:
-            return None
-        ip = ip.ipv4_mapped or ip
-    return str(ip)

@@ -181,7 +181,7 @@ def _refusals(part: Status) -> dict[tuple[str, str], int]:
 
 _FINDING = ("cause", "severity", "subject", "name")
 _SESSION = ("suite", "mode", "tag_bits")
-_STRANGERS = ("prefix_full", "displaced", "too_many_connections", "unproven", "slow_handshake")
+_STRANGERS = ("displaced", "too_many_connections", "unproven", "slow_handshake")
 _STATES = ("bound", "waiting", "unanswered")  # of a peer at a relay
 
 _PARTS: Mapping[str, Callable[[Status], Iterator[Part]]] = {
