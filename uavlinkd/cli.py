@@ -38,10 +38,6 @@ COMMANDS: Final = {
     "keygen": ("make a private key and print its public key", f"{__name__}:_add_keygen"),
     "pubkey": ("print the public key of a private key on standard input, or in FILE", f"{__name__}:_add_pubkey"),
     "psk": ("make a pre-shared key for one pair of peers", f"{__name__}:_add_psk"),
-    "record": (
-        "record the frames that a daemon sends to a local client, until Ctrl-C",
-        "uavlinkd.ops.commands:add_record",
-    ),
     "fleet": ("sign and revoke the members of a fleet", "uavlinkd.fleet.commands:add_fleet"),
     "enroll": (
         "make this machine a member of a fleet, with one line each way",
@@ -61,6 +57,7 @@ _REMOVED: Final = {
     "help": "`uavlinkd --help` shows the commands, and `uavlinkd COMMAND --help` the options of one",
     "peer": "`uavlinkd status` shows the peers, and `uavlinkd status --json` their keys too",
     "ping": "`uavlinkd status --watch` shows whether each path answers, its round trip and its loss",
+    "record": "ground stations record, and so does `mavproxy.py --master=udpout:127.0.0.1:14550 --daemon`",
 }
 """Commands of earlier versions, each with what to do in its place."""
 _NOT_A_RELAY = (

@@ -120,7 +120,7 @@ _FILE_ROWS = [
     (TOP + ENDPOINT + OTHER_PEER, "peer[0].addresses (drone2)", "neither end could initiate"),
     (GOOD + "[metrics]\n", "metrics", "was removed: delete [metrics]; `uavlinkd web` serves http://127.0.0.1:8790"),
     (GOOD + "[relay_server]\nmember_max_peers = 9", "relay_server.member_max_peers", "was removed: delete the line"),
-    (GOOD + "[recording]\n", "recording", "was removed: run `uavlinkd record URL FILE` beside the daemon"),
+    (GOOD + "[recording]\n", "recording", "was removed: delete [recording]: ground stations record"),
     # Networks.
     (networks(LTE + LTE.replace("wwan0", "wwan1")), "network[1].name (lte)", "the name of network[0] (lte) too"),
     (networks(LTE + LTE.replace("lte", "b")), "network[1].interface (b)", "the interface of network[0] (lte) too"),

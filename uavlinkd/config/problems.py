@@ -252,7 +252,7 @@ _REMOVED = {
     ),
     **dict.fromkeys(("deny_in", "deny_out"), INSTEAD_OF_DENIAL),
     "successor": "delete the line: nothing used it",
-    "recording": "run `uavlinkd record URL FILE` beside the daemon",
+    "recording": "delete [recording]: ground stations record, and so does `mavproxy.py --daemon` beside the daemon",
     "mac_key_bits": "delete the line: every HMAC key has 256 bits, and a longer one was no stronger",
     **dict.fromkeys(
         ("datagrams_s", "member_datagrams_s"),

@@ -1,4 +1,4 @@
-"""The commands beside a running daemon: ``status``, ``reload``, ``netcheck`` and ``record``.
+"""The commands beside a running daemon: ``status``, ``reload`` and ``netcheck``.
 
 Each command imports what it needs when it runs: the other commands start without it.
 """
@@ -40,21 +40,6 @@ def add_netcheck(parser: argparse.ArgumentParser) -> None:
     add_daemon(parser)
     parser.set_defaults(command=_netcheck)
     add_json(parser)
-
-
-def add_record(parser: argparse.ArgumentParser) -> None:
-    parser.set_defaults(command=_record)
-    parser.add_argument(
-        "url", metavar="URL", help="the daemon's endpoint as a client sees it: udpout:127.0.0.1:14550 for its udpin"
-    )
-    parser.add_argument("file", metavar="FILE", type=Path, help="a new telemetry log (.tlog, mode 0600)")
-    parser.add_argument(
-        "--system-id",
-        metavar="ID",
-        type=int,
-        default=254,
-        help="of its HEARTBEAT, 1 to 254: never that of a ground station (default: %(default)s)",
-    )
 
 
 def add_daemon(parser: argparse.ArgumentParser) -> None:
@@ -217,21 +202,3 @@ def _netcheck(options: argparse.Namespace) -> int:
         return OK if any(relay["state"] == "up" for relay in answer["relays"].values()) else FAILED
 
     return _for_each(control_sockets(options), "netcheck", show)
-
-
-def _record(options: argparse.Namespace) -> int:
-    import asyncio
-
-    from uavlinkd.io.url import UrlError, parse_url
-    from uavlinkd.ops.recorder import record
-
-    if not 1 <= options.system_id <= 254:
-        raise UsageError("--system-id must be 1 to 254: 255 is that of ground stations")
-    try:
-        count = asyncio.run(record(parse_url(options.url), options.file, options.system_id))
-    except UrlError as error:
-        raise UsageError(f"{options.url} {error}") from None
-    except OSError as error:
-        raise CommandError(f"{options.file}: {error.strerror}") from None
-    print(printable(f"{count} frames in {options.file}"))
-    return OK if count else FAILED
