@@ -5,22 +5,15 @@ from __future__ import annotations
 import re
 import tomllib
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from uavlinkd.config import keys
 from uavlinkd.config.load import load_config
 from uavlinkd.config.model import Config
-from uavlinkd.config.schema import (
-    EndpointSection,
-    LinkSection,
-    PolicySection,
-    RoutingSection,
-)
-from uavlinkd.config.section import REQUIRED, Section, read
+from uavlinkd.config.schema import POLICY, SECTIONS
+from uavlinkd.config.section import REQUIRED, read
 from uavlinkd.mavlink.policy.roles import ROLES
-from uavlinkd.mavlink.policy.settings import KEYS
 
 EXAMPLES = Path(__file__).parents[2] / "configs"
 STATION = (EXAMPLES / "ground-station.toml").read_text()
@@ -67,22 +60,15 @@ def test_configuration_in_a_readme_is_valid(tmp_path: Path, text: str) -> None:
 def test_station_has_every_default() -> None:
     """The ground station's file contains every key with its default, and names each key of a policy."""
     table = tomllib.loads(STATION)
-    for name, model in (
-        ("link", LinkSection),
-        ("routing", RoutingSection),
-    ):
-        assert read(model, table[name]) == (_defaults(model), [])
+    for name in ("link", "routing"):
+        values, problems = read(SECTIONS[name], table[name])
+        assert (values.valid, problems) == ({key: one.default for key, one in SECTIONS[name].items()}, [])
     (endpoint,) = table["endpoint"]
-    written, problems = read(EndpointSection, endpoint)
-    assert (set(endpoint), problems) == (set(EndpointSection.keys) - set(PolicySection.keys), [])
-    defaults = _defaults(EndpointSection)
-    assert all(defaults[key] in (REQUIRED, value) for key, value in written.items())
-    assert {*KEYS, *ROLES} <= set(re.findall(r"[\w-]+", STATION))
-    assert set(PolicySection.keys) == set(KEYS)
-
-
-def _defaults(section: type[Section]) -> dict[str, Any]:
-    return {name: key.default for name, key in section.keys.items()}
+    keys = SECTIONS["endpoint"]
+    values, problems = read(keys, endpoint)
+    assert (set(endpoint), problems) == (set(keys) - set(POLICY), [])
+    assert all(keys[key].default in (REQUIRED, value) for key, value in values.valid.items())
+    assert {*POLICY, *ROLES} <= set(re.findall(r"[\w-]+", STATION))
 
 
 def test_examples_fit_together() -> None:

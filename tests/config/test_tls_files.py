@@ -81,13 +81,11 @@ def test_files_that_cannot_be_used_are_a_problem(tmp_path: Path, break_it: Break
     ("https", "says"),
     [
         ("true", 'write { listen = "0.0.0.0:443", certificate'),
-        ("{}", "has keys of its own"),
-        ('{ listen = "127.0.0.1:1", port = 443 }', "has keys of its own"),
-        ('{ listen = "relay.example.org:443" }', "listen must be a numeric address"),
-        ("{ listen = 443 }", "listen must be text"),
-        ('{ listen = "127.0.0.1:1", key = "" }', "key must name a file"),
-        ('{ listen = "127.0.0.1:1", key = "tls.key" }', "needs a certificate and its key"),
         ('{ listen = "127.0.0.1:5443" }', "a web server can no longer stand before the relay"),
+        (f'{{ listen = "127.0.0.1:1", {_FILES}, port = 443 }}', "needs listen, certificate and key"),
+        (f'{{ listen = "relay.example.org:443", {_FILES} }}', "listen must be a numeric address"),
+        (f"{{ listen = 443, {_FILES} }}", "listen must be text"),
+        ('{ listen = "127.0.0.1:1", certificate = "a", key = "" }', "key must name a file"),
     ],
 )
 def test_table_is_checked(tmp_path: Path, https: str, says: str) -> None:
@@ -100,4 +98,4 @@ def test_its_port_is_its_own(tmp_path: Path) -> None:
     """Two cannot listen on one."""
     write_tls_files(tmp_path)
     tcp = '[[endpoint]]\nname = "tcp"\nurl = "tcpin:127.0.0.1:5443"\n'
-    assert "where endpoint[1] (tcp) listens" in refused(tmp_path, _RELAY + tcp + HTTPS)["relay_server.https"]
+    assert "where endpoint[1].url (tcp) listens too" in refused(tmp_path, _RELAY + tcp + HTTPS)["relay_server.https"]

@@ -108,7 +108,7 @@ def _keeps_every_claim(_: Any) -> Any:
 
 def _blind_look_up(right: Any) -> Any:
     def check(file: Any) -> Any:
-        assert len({peer.valid["name"] for peer in file.peers}) >= 0  # a KeyError where a name is missing or wrong
+        assert len({peer.valid["name"] for peer in file["peer"]}) >= 0  # a KeyError where a name is missing or wrong
         return right(file)
 
     return check

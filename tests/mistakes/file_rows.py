@@ -9,7 +9,6 @@ from collections.abc import Awaitable, Callable
 
 from tests.mistakes.row import Mistake
 from tests.mistakes.scene import Scene, checked, checked_file, said
-from uavlinkd.config import keys
 
 
 async def _own_key(scene: Scene) -> None:
@@ -21,12 +20,6 @@ async def _own_key(scene: Scene) -> None:
 async def _without_quotation_mark(scene: Scene) -> None:
     path = scene.here.write_config()
     path.write_text(path.read_text().replace(f'"{scene.here.name}"', f'"{scene.here.name}', 1))
-    scene.check = checked_file(path)
-
-
-async def _wireguard(scene: Scene) -> None:
-    path = scene.here.write_config()
-    path.write_text(f"[Interface]\nPrivateKey = {keys.generate_private_key()}\n")
     scene.check = checked_file(path)
 
 
@@ -58,7 +51,6 @@ FILE_ROWS = (
     Mistake("15", _without_quotation_mark, check=r":\d+:.*write name = "),
     Mistake("40", _no_control_socket, command=r'add control_socket = "NAME\.sock"'),
     Mistake("43", _windows, check=r"public key"),
-    Mistake("55", _wireguard, check=r"is a WireGuard file.*start from configs/drone0\.toml"),
     Mistake("56a", _fleet("init", "--no-passphrase"), command=r"exists already: choose the name"),
     Mistake("56e", _fleet("sign", "v7", "--address", "vps"), command=r"--address: has no port"),
     Mistake("56k", _fleet("revoke", "drone9"), command=r'has no "drone9": its members are none'),

@@ -48,7 +48,6 @@ LINK_ROWS = (
     Mistake(
         "23",
         scenes.families,
-        check=r'add "\[::\]:(?!5790)\d+" to listen',
         signs=_both("no_route", r'add "\[::\]:(?!5790)\d+"'),
     ),
     Mistake("25", scenes.psk, signs=_both("wrong_psk", r"same psk_file")),

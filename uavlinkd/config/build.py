@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
-from uavlinkd.authority.certificates import Certificate, MemberRole
+from uavlinkd.authority.certificates import MemberRole
+from uavlinkd.config.file import File, Found, over_ip, role_of, with_same_key
 from uavlinkd.config.members import DEFAULT_POLICIES, fleet_link, member_peer
 from uavlinkd.config.model import (
     Config,
@@ -17,23 +18,14 @@ from uavlinkd.config.model import (
     EndpointConfig,
     FleetConfig,
     Log,
-    PeerAddress,
     PeerConfig,
     PolicyData,
     RelayConfig,
     RelayServer,
 )
 from uavlinkd.config.network_rules import network_of
-from uavlinkd.config.problems import Found, Sections, Values, role_of
-from uavlinkd.config.relay_rules import over_ip, peer_of
-from uavlinkd.config.schema import (
-    EndpointSection,
-    FleetSection,
-    LinkSection,
-    MemberSection,
-    PolicySection,
-    RelayServerSection,
-)
+from uavlinkd.config.schema import LINK, POLICY
+from uavlinkd.config.section import Values
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.mavlink.policy.settings import PolicyError, read_settings
 from uavlinkd.protocol import constants as c
@@ -44,13 +36,17 @@ from uavlinkd.system.addresses import IPV6_UDP_BYTES
 
 if TYPE_CHECKING:
     from uavlinkd.authority.trust import HeldCertificate
-    from uavlinkd.relay.forwarding import MemberSettings, RelayLimits
+    from uavlinkd.relay.forwarding import RelayLimits
 
 VERIFYING_SHARE: Final = 0.05
 """Share of the budget that the echo requests and replies of one end may use."""
 TIMERS: Final = Timers(echo_after_s=0.1, handshake_after_s=0.2, lost_after_s=1.0, retry_max_s=0.5)
 """A relay is asked when a path along it fails or its peer is silent, and answers at once unless it was restarted. A
 try costs 0.3 kB: while a relay is down, 5 kbit/s. When it is lost, its name is resolved again: it may have moved."""
+_PEERS_OF_MEMBER: Final = 256
+"""Members that one member may ask for."""
+_RETRIES_BEFORE_REJECT: Final = 2
+"""The ends need time to make new keys before they drop the old ones."""
 _BITS_OF_DATAGRAM: Final = 10_000
 """A relay passes one datagram for each so many bits that it may pass: almost the largest that fits Ethernet."""
 # A policy's messages repeat a group, a message, a command or a number, so that a person can search for it.
@@ -60,68 +56,63 @@ _MOST = 2**63
 _HIDDEN = "…"
 
 
-def build(path: Path, file: Sections, states: Path) -> Config:
+def build(file: File, states: Path) -> Config:
     """The configuration in a file without problems, without its warnings. ``states``: folder of the fleet's state."""
-    private, public = file.secret(file.top, "private_key_file"), file.own_key
-    assert private is not None  # their absence is a problem
-    assert public is not None
-    top = file.top
-    socket, fleet = top.get("control_socket"), _fleet(file, states) if file.has_fleet else None
-    pinned = (_peer(file, peer) for peer in file.peers)
+    top, fleet = file.top, _fleet(file, states) if file["fleet"] else None
+    private, socket = top.get("private_key_file"), top.get("control_socket")
+    assert file.own_key is not None  # its absence is a problem
     return Config(
-        path=path,
-        name=top.valid["name"],
+        path=file.path,
+        name=top.get("name"),
         private_key=private,
-        public_key=public,
-        listen=tuple(top.get("listen", ())),
-        endpoints=tuple(_endpoint(endpoint) for endpoint in file.endpoints),
-        peers=(*pinned, *(_contact_peers(file, fleet) if fleet else ())),
-        relays_frames=file.routing.get("relay", False),
+        public_key=file.own_key,
+        listen=tuple(top.get("listen")),
+        endpoints=tuple(_endpoint(endpoint) for endpoint in file["endpoint"]),
+        peers=(*(_peer(file, peer) for peer in file["peer"]), *(_contact_peers(file, fleet) if fleet else ())),
+        relays_frames=file.one("routing").get("relay"),
         control_socket=file.folder / socket if socket else None,
-        log=Log(**file.log.valid),
-        networks=tuple(network_of(network) for network in file.networks),
-        relay_server=_relay_server(file),
+        log=Log(**file.one("log").valid),
+        networks=tuple(map(network_of, file["network"])),
+        relay_server=_relay_server(file) if file.is_relay else None,
         relays=tuple(_relay(file, relay, fleet) for relay in file.used_relays),
         fleet=fleet,
     )
 
 
-def _fleet(file: Sections, states: Path) -> FleetConfig:
-    keys = FleetSection(file.fleet.valid)
-    link, limits = LinkSection(file.link.valid), _relay_server_keys(file)
-    own = keys.certificate.certificate.role
-    policies = fleet_policies(file, own)
-    usual = MemberRole.OPERATOR if own == MemberRole.VEHICLE else MemberRole.VEHICLE
-    called = [usual.name.lower()] if usual in policies else []
+def _fleet(file: File, states: Path) -> FleetConfig:
+    keys, own, link = file.one("fleet"), file.one("fleet").get("certificate"), file.one("link")
+    policies = fleet_policies(file, own.certificate.role)
+    usual = MemberRole.OPERATOR if own.certificate.role == MemberRole.VEHICLE else MemberRole.VEHICLE
+    call = keys.get("call")
     return FleetConfig(
-        authority=keys.authority,
-        own=keys.certificate,
-        bulletin=keys.bulletin,
-        contacts=tuple(_contact(file, contact) for contact in file.contacts),
-        call=frozenset(map(member_role, called if keys.call is None else keys.call)),
-        required_bulletin=keys.require_bulletin,
-        denied=frozenset(keys.deny),
-        link=fleet_link(link_of(link)),
-        egress=EgressSettings(link.budget_bits_s, link.coalesce_s, link.max_age_s),
+        authority=keys.get("authority"),
+        own=own,
+        bulletin=keys.get("bulletin"),
+        contacts=tuple(_contact(file, contact) for contact in file["contact"]),
+        call=frozenset({usual} & set(policies) if call is None else map(member_role, call)),
+        required_bulletin=keys.get("require_bulletin"),
+        denied=frozenset(keys.get("deny")),
+        link=fleet_link(_link(link)),
+        egress=_egress(link),
         policies=MappingProxyType(policies),
-        relays=tuple(relay.valid["name"] for relay in file.used_relays),
-        state_file=states / f"{file.top.valid['name']}.fleet-state",
-        member_limits=_limits(limits.member_bits_s),
+        relays=tuple(relay.get("name") for relay in file.used_relays),
+        state_file=states / f"{file.top.get('name')}.fleet-state",
+        member_limits=_limits(file.one("relay_server").get("member_bits_s")),
     )
 
 
-def fleet_policies(file: Sections, own: MemberRole) -> dict[MemberRole, PolicyData]:
+def fleet_policies(file: File, own: MemberRole) -> dict[MemberRole, PolicyData]:
     """What members of each role may send here, without their system ids. A role without a policy has no link.
 
     A complete policy of the file replaces the default one, another adds to it.
     """
     policies = {**DEFAULT_POLICIES[own]}
-    for section in file.fleet_roles:
-        if "name" in section.valid:
-            role, policy = member_role(section.valid["name"]), policy_data(section)
+    for section in file["fleet_role"]:
+        if name := section.get("name"):
+            role, policy = member_role(name), policy_data(section)
             is_complete = "role" in policy or {"allow_in", "allow_out"} <= set(policy)
             policies[role] = policy if is_complete else {**policies.get(role, {}), **policy}
-    if file.fleet.get("operator") == "pinned":
+    if file.one("fleet").get("operator") == "pinned":
         policies.pop(MemberRole.OPERATOR, None)
     return policies
 
@@ -130,75 +121,78 @@ def member_role(name: str) -> MemberRole:
     return MemberRole[name.upper()]
 
 
-def _contact(file: Sections, section: Values) -> ContactConfig:
-    held: HeldCertificate = section.valid["certificate"]
+def _contact(file: File, section: Values) -> ContactConfig:
+    held: HeldCertificate = section.get("certificate")
     return ContactConfig(
-        key=section.valid["public_key"],
+        key=section.get("public_key"),
         certificate=held.data,
         name=held.certificate.name,
         role=held.certificate.role,
-        addresses=tuple(section.valid["addresses"]),
+        addresses=tuple(section.get("addresses")),
         relays=section in file.used_relays,
     )
 
 
-def _contact_peers(file: Sections, fleet: FleetConfig) -> Iterator[PeerConfig]:
-    for section in file.contacts:
-        certificate: Certificate = section.valid["certificate"].certificate
-        if certificate.role in fleet.policies:
-            yield member_peer(fleet, section.valid["public_key"], certificate)
+def _contact_peers(file: File, fleet: FleetConfig) -> Iterable[PeerConfig]:
+    for section in file["contact"]:
+        if role_of(section) in fleet.policies:
+            yield member_peer(fleet, section.get("public_key"), section.get("certificate").certificate)
 
 
 def _endpoint(section: Values) -> EndpointConfig:
-    keys = EndpointSection(section.valid)
-    return EndpointConfig(keys.name, keys.url, policy_data(section), keys.radio_status, keys.status_text)
+    own = ("name", "url", "radio_status", "status_text")
+    return EndpointConfig(**{key: section.get(key) for key in own}, policy=policy_data(section))
 
 
-def _peer(file: Sections, peer: Values) -> PeerConfig:
-    keys = LinkSection(inherited(file.link, peer))
-    link, used = link_of(keys), _relays(peer, file.used_relays)
-    if file.has_fleet:
+def _peer(file: File, peer: Values) -> PeerConfig:
+    keys = Values(
+        "", LINK, {key: value for key, value in {**file.one("link").valid, **peer.valid}.items() if key in LINK}
+    )
+    link, written = _link(keys), peer.get("relays")
+    used = [relay for relay in file.used_relays if written is None or relay.get("name") in written]
+    along = tuple(relay.get("name") for relay in used if with_same_key(relay, [peer]) is None)  # not along itself
+    if file["fleet"]:
         link = fleet_link(link)
-    elif used or peer_of(peer, (*file.members, *file.relays)):  # they exchange records
+    elif along or with_same_key(peer, (*file["member"], *file["relay"])):  # they exchange records
         link = replace(link, features=link.features | c.FEATURE_RECORDS)
-    psk = file.secret(peer, "psk_file")
+    as_relay = (address for relay in file["relay"] if with_same_key(relay, [peer]) for address in over_ip(relay))
     return PeerConfig(
-        settings=PeerSettings(peer.valid["name"], peer.valid["public_key"], psk, link),
-        addresses=_addresses(peer, file.relays),
-        relays=used,
+        settings=PeerSettings(peer.get("name"), peer.get("public_key"), peer.get("psk_file"), link),
+        addresses=tuple(dict.fromkeys((*peer.get("addresses"), *as_relay))),
+        relays=along,
         policy=policy_data(peer),
-        egress=EgressSettings(keys.budget_bits_s, keys.coalesce_s, keys.max_age_s),
+        egress=_egress(keys),
     )
 
 
-def inherited(link: Values, peer: Values) -> dict[str, Any]:
-    """The link keys that apply to a peer: its own, else those of ``[link]``, without defaults."""
-    return {key: value for key, value in {**link.valid, **peer.valid}.items() if key in LinkSection.keys}
-
-
-def link_of(keys: LinkSection) -> Link:
+def _link(keys: Values) -> Link:
     """The settings of one link. ``lost_after_s`` sets the pace of the questions before it."""
-    tag_bytes, pace = keys.tag_bits // 8, keys.lost_after_s / c.LOST_AFTER_S
+    tag_bytes, pace = keys.get("tag_bits") // 8, keys.get("lost_after_s") / c.LOST_AFTER_S
+    same = ("rekey_after_s", "retry_max_s", "keepalive_s", "lost_after_s", "probe_interval_s")
+    timers = {key: keys.get(key) for key in same}
+    least_s = timers["rekey_after_s"] + _RETRIES_BEFORE_REJECT * timers["retry_max_s"]
     return Link(
-        suites=tuple(keys.suites),
-        confidential=keys.confidential,
+        suites=tuple(keys.get("suites")),
+        confidential=keys.get("confidential"),
         tag_bytes=tag_bytes,
-        max_envelope=keys.max_envelope_bytes,
+        max_envelope=keys.get("max_envelope_bytes"),
         timers=Timers(
-            rekey_after_s=keys.rekey_after_s,
-            reject_after_s=keys.reject_after_s,
-            retry_min_s=min(c.RETRY_MIN_S, keys.retry_max_s),
-            retry_max_s=keys.retry_max_s,
-            keepalive_s=keys.keepalive_s,
+            **timers,
+            reject_after_s=max(keys.get("reject_after_s"), least_s),
+            retry_min_s=min(c.RETRY_MIN_S, timers["retry_max_s"]),
             echo_after_s=pace * c.ECHO_AFTER_S,
             handshake_after_s=pace * c.HANDSHAKE_AFTER_S,
-            lost_after_s=keys.lost_after_s,
-            probe_interval_s=keys.probe_interval_s,
         ),
-        redundancy=Redundancy(keys.redundancy),
-        idle_probe_s=keys.idle_probe_s,
-        verify_interval_s=verify_interval_s(keys.budget_bits_s, tag_bytes),
+        redundancy=Redundancy(keys.get("redundancy")),
+        idle_probe_s=keys.get("idle_probe_s"),
+        verify_interval_s=verify_interval_s(keys.get("budget_bits_s"), tag_bytes),
     )
+
+
+def _egress(keys: Values) -> EgressSettings:
+    """How frames wait. One that waits for others does not become too old by that."""
+    max_age_s = keys.get("max_age_s")
+    return EgressSettings(keys.get("budget_bits_s"), min(keys.get("coalesce_s"), max_age_s / 2), max_age_s)
 
 
 def verify_interval_s(budget_bits_s: int, tag_bytes: int) -> float:
@@ -215,9 +209,7 @@ def verify_interval_s(budget_bits_s: int, tag_bytes: int) -> float:
 
 def policy_data(section: Values) -> PolicyData:
     """The section's policy, as data that cannot change and that messages may repeat."""
-    return MappingProxyType(
-        {key: _frozen(key, value) for key, value in section.valid.items() if key in PolicySection.keys}
-    )
+    return MappingProxyType({key: _frozen(key, value) for key, value in section.valid.items() if key in POLICY})
 
 
 def policy_problems(section: Values, policy: PolicyData, *, is_local: bool) -> Found:
@@ -247,63 +239,41 @@ def _leaf(value: Any) -> object:
     return _HIDDEN
 
 
-def _relays(peer: Values, sections: Sequence[Values]) -> tuple[str, ...]:
-    """The names of the relays that a peer uses. It is not reached along itself."""
-    names: list[str] | None = peer.get("relays")
-    return tuple(
-        section.valid["name"]
-        for section in sections
-        if peer_of(section, [peer]) is None and (names is None or section.valid["name"] in names)
-    )
-
-
-def _addresses(peer: Values, sections: Sequence[Values]) -> tuple[PeerAddress, ...]:
-    """The addresses of a peer: its own, and those of the relay that it is."""
-    of_relay = [written for section in sections if peer_of(section, [peer]) for written in over_ip(section)]
-    return tuple(dict.fromkeys((*peer.get("addresses", ()), *of_relay)))
-
-
-def _relay(file: Sections, section: Values, fleet: FleetConfig | None) -> RelayConfig:
+def _relay(file: File, section: Values, fleet: FleetConfig | None) -> RelayConfig:
     """A relay. It inherits the suites of ``[link]``."""
-    suites, is_contact = LinkSection(file.link.valid).suites, section.kind == "contact"
-    link = Link(tuple(suites), timers=TIMERS, features=c.KNOWN_FEATURES & ~c.FEATURE_FLEET)
-    peer = peer_of(section, file.peers)
+    is_contact = section.kind == "contact"
+    link = Link(tuple(file.one("link").get("suites")), timers=TIMERS, features=c.KNOWN_FEATURES & ~c.FEATURE_FLEET)
+    peer = with_same_key(section, file["peer"])
     if fleet is not None and is_contact and role_of(section) in fleet.policies:
         peer = section
     return RelayConfig(
         settings=PeerSettings(
-            name=RELAY_HOST + section.valid["name"],
-            public_key=section.valid["public_key"],
-            psk=file.secret(section, "psk_file"),
+            name=RELAY_HOST + section.get("name"),
+            public_key=section.get("public_key"),
+            psk=section.get("psk_file"),
             link=link if fleet is None else fleet_link(link),
             is_certified=is_contact,
         ),
         addresses=tuple(dict.fromkeys((*([] if peer is None else over_ip(peer)), *over_ip(section)))),
-        peer=None if peer is None else peer.valid["name"],
+        peer=None if peer is None else peer.get("name"),
     )
 
 
-def _relay_server_keys(file: Sections) -> RelayServerSection:
-    return RelayServerSection(file.relay_server.valid)
-
-
-def _relay_server(file: Sections) -> RelayServer | None:
-    """The relay that this daemon is; None if it has no members."""
-    if not file.is_relay:
-        return None
-    keys = _relay_server_keys(file)
-    link = replace(link_of(LinkSection(file.link.valid)), features=c.FEATURE_RECORDS)
-    link = fleet_link(link) if file.has_fleet else link
-    every = tuple(_member(file, section, link) for section in file.members)
-    return RelayServer(every, _limits(keys.bits_s), keys.https)
-
-
-def _member(file: Sections, section: Values, link: Link) -> MemberSettings:
+def _relay_server(file: File) -> RelayServer:
     from uavlinkd.relay.forwarding import MemberSettings  # noqa: PLC0415  only if configured
 
-    keys = MemberSection(section.valid)
-    peer = PeerSettings(keys.name, keys.public_key, file.secret(section, "psk_file"), link, initiates=False)
-    return MemberSettings(peer, keys.max_peers, _limits(keys.bits_s))
+    keys, link = file.one("relay_server"), replace(_link(file.one("link")), features=c.FEATURE_RECORDS)
+    link = fleet_link(link) if file["fleet"] else link
+    limits = _limits(keys.get("member_bits_s"))
+    members = (
+        PeerSettings(one.get("name"), one.get("public_key"), one.get("psk_file"), link, initiates=False)
+        for one in file["member"]
+    )
+    return RelayServer(
+        members=tuple(MemberSettings(peer, _PEERS_OF_MEMBER, limits) for peer in members),
+        limits=_limits(keys.get("bits_s")),
+        https=keys.get("https"),
+    )
 
 
 def _limits(bits_s: int) -> RelayLimits:

@@ -5,60 +5,94 @@ A rule uses the valid values and ignores the others.
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
 from itertools import combinations
+from typing import NamedTuple
 
 from uavlinkd.config import fleet_rules, key_rules, network_rules, relay_rules
-from uavlinkd.config.build import inherited, policy_data, policy_problems
-from uavlinkd.config.model import HttpsServer
-from uavlinkd.config.problems import Found, Sections, Values, unique
-from uavlinkd.config.schema import LinkSection
-from uavlinkd.io.url import EndpointKind, NetworkUrl
+from uavlinkd.config.build import policy_data, policy_problems
+from uavlinkd.config.file import File, Found, over_ip, unique, with_same_key
+from uavlinkd.config.section import Values
+from uavlinkd.io.url import EndpointKind, NetworkUrl, SerialUrl
 from uavlinkd.system.addresses import Address, overlaps
 
-_RETRIES_BEFORE_REJECT = 2
 
-
-def check(file: Sections) -> Found:
-    for sections in (file.endpoints, file.peers, file.members):
-        yield from unique(sections, "name", "the name of {other} too: write another")
+def check(file: File) -> Found:
+    for kind in ("endpoint", "peer", "member", "network", "fleet_role"):
+        yield from unique(file[kind], "name")
+    yield from unique(file.used_relays, "name")
+    for kind in ("peer", "member", "relay", "contact"):
+        yield from unique(file[kind], "public_key")
+    for key in ("interface", "address"):
+        yield from unique(file["network"], key)
+    yield from unique(
+        [one for one in file["endpoint"] if isinstance(url := one.get("url"), NetworkUrl) and not url.listens], "url"
+    )
     yield from key_rules.check(file)
-    yield from relay_rules.members(file)
-    yield from _reachability(file)
-    yield from relay_rules.relays(file)
+    yield from relay_rules.check(file)
+    yield from _who_initiates(file)
+    yield from _ports(file)
+    yield from _devices(file)
     yield from fleet_rules.check(file)
     yield from network_rules.networks(file)
-    yield from _endpoints(file)
-    yield from _timers(file.link)
-    for endpoint in file.endpoints:
-        yield from policy_problems(endpoint, policy_data(endpoint), is_local=True)
-    for peer in file.peers:
-        yield from _timers(peer, file.link)
-        yield from policy_problems(peer, policy_data(peer), is_local=False)
+    for kind in ("endpoint", "peer"):
+        for section in file[kind]:
+            yield from policy_problems(section, policy_data(section), is_local=kind == "endpoint")
 
 
-def _reachability(file: Sections) -> Found:
-    """One of the two ends must be able to initiate, and a daemon does not initiate to itself."""
-    listen: list[Address] = file.top.get("listen", [])
-    for a, b in combinations(listen, 2):
-        if overlaps(a, b):
-            yield "listen", f"names {a} and {b}, which one machine cannot listen on at once: write one"
-    for peer in file.peers:
-        if (
-            peer.lacks("addresses")
-            and file.top.lacks("listen")
-            and not relay_rules.needs_no_address(peer, file.used_relays)
-        ):
-            or_else = ", and remove relays = []" if peer.get("relays") == [] else ""
+def _who_initiates(file: File) -> Found:
+    """One of the two ends can initiate: an address, a relay, or an address of this daemon is known."""
+    for peer in file["peer"]:
+        has_relay = bool(file.used_relays) and peer.get("relays") != [] and "relays" not in peer.invalid
+        can_call = has_relay or not peer.lacks("addresses") or with_same_key(peer, file.used_relays)
+        if not can_call and file.top.lacks("listen"):
             yield (
                 peer.at("addresses"),
                 "is empty, and so is listen: neither end could initiate; write the peer's address here,"
                 ' or listen = ["0.0.0.0:5790"] at the top so that the peer can initiate, or a [[relay]] that both'
-                f" ends use{or_else}",
+                " ends use",
             )
-    for section in (*file.peers, *file.relays, *file.contacts):
-        for written in section.get("addresses", ()):
-            if not written.address.resource and any(_reaches(written.address, own) for own in listen):
-                yield section.at("addresses"), f"names {written.address}, where this daemon listens: write the peer's"
+
+
+class _Port(NamedTuple):
+    """An address where this daemon listens or to which it sends, with its place in the file."""
+
+    place: str
+    is_udp: bool
+    address: Address
+
+
+def _ports(file: File) -> Found:
+    """Each port has one listener. The daemon does not send to itself: frames would loop."""
+    listening, sending = list(_listening(file)), list(_sending(file))
+    for one, other in combinations(listening, 2):
+        if one.is_udp == other.is_udp and overlaps(one.address, other.address):
+            yield other.place, f"has the port where {one.place} listens too, {one.address}: write another"
+    for sender in sending:
+        for listener in listening:
+            if sender.is_udp == listener.is_udp and _reaches(sender.address, listener.address):
+                text = f"names {sender.address}, where this daemon listens ({listener.place}), so frames would loop"
+                yield sender.place, f"{text}: write the address of the other end"
+
+
+def _listening(file: File) -> Iterator[_Port]:
+    for address in file.top.get("listen"):
+        yield _Port("listen", True, address)
+    for section in file["endpoint"]:
+        if isinstance(url := section.get("url"), NetworkUrl) and url.listens:
+            yield _Port(section.at("url"), url.kind is EndpointKind.UDPIN, url.address)
+    if https := file.one("relay_server").get("https"):
+        yield _Port("relay_server.https", False, https.listen)
+
+
+def _sending(file: File) -> Iterator[_Port]:
+    for section in (*file["peer"], *file["relay"], *file["contact"]):
+        for written in over_ip(section):
+            yield _Port(section.at("addresses"), not written.address.resource, written.address)
+    for section in file["endpoint"]:
+        if isinstance(url := section.get("url"), NetworkUrl) and not url.listens:
+            yield _Port(section.at("url"), url.kind is EndpointKind.UDPOUT, url.address)
 
 
 def _reaches(target: Address, listening: Address) -> bool:
@@ -68,61 +102,12 @@ def _reaches(target: Address, listening: Address) -> bool:
     return target.ip == listening.ip or (listening.is_wildcard and target.is_loopback)
 
 
-def _endpoints(file: Sections) -> Found:
-    """Each endpoint has a port of its own, which is not a port for peers, and does not feed another endpoint."""
-    listen: list[Address] = file.top.get("listen", [])
-    https: HttpsServer | None = file.relay_server.get("https")
-    urls = [(section, url) for section in file.endpoints if isinstance(url := section.get("url"), NetworkUrl)]
-    for section, url in urls:
-        key = section.at("url")
-        if url.kind is EndpointKind.UDPIN and any(own.port == url.address.port for own in listen):
-            yield key, f"has the port that `listen` has for peers, {url.address.port}: write another"
-        if url.kind is EndpointKind.UDPOUT and any(_reaches(url.address, own) for own in listen):
-            yield key, "sends to this daemon's own port for peers: write the address of the MAVLink client"
-        if https and url.kind is EndpointKind.TCPIN and overlaps(https.listen, url.address):
-            yield file.relay_server.at("https"), f"is where {section.at()} listens: write another port"
-    for (other, other_url), (section, url) in combinations(urls, 2):
-        if message := _clash(url, other_url):
-            yield section.at("url"), message.format(other=other.at())
-
-
-_FEEDS = {(EndpointKind.UDPOUT, EndpointKind.UDPIN), (EndpointKind.TCP, EndpointKind.TCPIN)}
-
-
-def _clash(a: NetworkUrl, b: NetworkUrl) -> str | None:
-    if a.listens and a.kind is b.kind and overlaps(a.address, b.address):
-        return "listens where {other} does: write another port"
-    if a == b:
-        return "sends where {other} does, so every frame would arrive twice: write it once"
-    for sender, listener in ((a, b), (b, a)):
-        if (sender.kind, listener.kind) in _FEEDS and _reaches(sender.address, listener.address):
-            return "and {other} are both ends of one connection, so frames would loop: write one of them"
-    return None
-
-
-def _timers(section: Values, link: Values | None = None) -> Found:
-    """The timers of ``[link]``, or of a peer that inherits from it, are in order."""
-    given = inherited(link, section) if link else section.valid
-    values = {name: key.default for name, key in LinkSection.keys.items()} | given
-    unknown = section.invalid | (link.invalid - set(section.valid) if link else frozenset())
-    least = values["rekey_after_s"] + _RETRIES_BEFORE_REJECT * values["retry_max_s"]
-    for key, others, is_wrong, message in (
-        (
-            "max_age_s",
-            {"coalesce_s"},
-            values["coalesce_s"] >= values["max_age_s"],
-            f"must be more than coalesce_s ({values['coalesce_s']:g}): a frame that waits for others must not become"
-            " too old",
-        ),
-        (
-            "reject_after_s",
-            {"rekey_after_s", "retry_max_s"},
-            values["reject_after_s"] < least,
-            f"must be {least:g} or more, rekey_after_s and {_RETRIES_BEFORE_REJECT} times retry_max_s: the ends need"
-            " time to make new keys before they drop the old ones",
-        ),
-    ):
-        involved = {key, *others}
-        # A problem that a peer only inherits is reported once, for [link].
-        if is_wrong and not involved & unknown and (link is None or involved & set(section.valid)):
-            yield section.at(key), message
+def _devices(file: File) -> Found:
+    """A device has one user: a network or an endpoint."""
+    users: dict[str, Values] = {}
+    for section in (*file["endpoint"], *file["network"]):
+        key = "url" if section.kind == "endpoint" else "serial"
+        if isinstance(line := section.get(key), SerialUrl):
+            other = users.setdefault(os.path.realpath(line.device), section)
+            if other is not section:
+                yield section.at(key), f"is the device of {other.at()} too, and only one can open it: write another"

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
+from uavlinkd.config.file import File, Found
 from uavlinkd.config.keys import encode_key, looks_private
-from uavlinkd.config.problems import Found, Sections, Values, unique
+from uavlinkd.config.section import Values
 from uavlinkd.protocol.crypto import x25519_public_key
 
 EXAMPLE_KEYS = frozenset(
@@ -21,32 +22,25 @@ EXAMPLE_KEYS = frozenset(
     }
 )
 """The public keys in README.md and configs/. Their private keys do not exist. A test compares this list with them."""
-_THERE = "write what `uavlinkd pubkey` prints on the {}"
 _EXPOSED = "it is exposed: make a new one there with `uavlinkd keygen`, and write here the public key that it prints"
 
 
-def check(file: Sections) -> Found:
-    for what, sections in (("peer", file.peers), ("member", file.members), ("relay", file.relays)):
-        yield from unique(sections, "public_key", f"the key of {{other}} too: each {what} has its own")
-    yield from _public_keys(file)
-
-
-def _public_keys(file: Sections) -> Found:
+def check(file: File) -> Found:
     """No secret key is written as a public one, and no key of this daemon as another's."""
-    private, own = file.secret(file.top, "private_key_file"), file.own_key
-    for section in file.others:
-        if private is not None and file.secret(section, "psk_file") == private:
+    secret, own = file.top.get("private_key_file"), file.own_key
+    for section in file.others if secret is not None else ():
+        if section.valid.get("psk_file") == secret:
             text = "holds this daemon's private key, which must stay secret: make a PSK with `uavlinkd psk`"
             yield section.at("psk_file"), text
         if (key := section.get("public_key")) is None:
             continue
-        there = _THERE.format(section.kind)
-        if private is not None and key == private.reveal() and not looks_private(key):
+        there = f"write what `uavlinkd pubkey` prints on the {section.kind}"
+        if key == secret.reveal() and not looks_private(key):
             text = f"holds the public key of {section.at()}, not a private key: make this daemon's own with"
             yield "private_key_file", f"{text} `uavlinkd keygen`"
         elif key == own:
-            or_else = f"; or private_key_file is that of the {section.kind}: carry each key file to its own machine"
-            yield section.at("public_key"), f"is this daemon's own key: {there}{or_else}"
+            or_else = f"or private_key_file is that of the {section.kind}: carry each key file to its own machine"
+            yield section.at("public_key"), f"is this daemon's own key: {there}; {or_else}"
         elif x25519_public_key(key) == own:
             remedy = f"move its file away, make a new one with `uavlinkd keygen`, and {there}"
             yield section.at("public_key"), f"is this daemon's private key, which must stay secret: {remedy}"

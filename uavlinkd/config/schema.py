@@ -1,4 +1,4 @@
-"""The keys of a configuration file, with their ranges and defaults: one class for each section, by its name.
+"""The keys of a configuration file, with their ranges and defaults: one table for each section, by its name.
 
 README.md explains each key. The kinds of values come first, each with the check of a single value. Checks of several
 values are in :mod:`uavlinkd.config.checks`.
@@ -9,30 +9,18 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from contextlib import suppress
-from ipaddress import IPv4Address, IPv6Address, ip_address
+from ipaddress import IPv6Address, ip_address
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
-
-from pydantic_core import CoreSchema
 
 from uavlinkd.authority.certificates import LAST_SERIAL, parse_bulletin, parse_certificate
 from uavlinkd.authority.certificates import NAME as MEMBER_NAME
 from uavlinkd.config.keys import decode_key, is_canonical_public_key
 from uavlinkd.config.model import SERIAL, HttpsServer, PeerAddress
-from uavlinkd.config.section import (
-    ANYTHING,
-    BOOLEAN,
-    Section,
-    checked,
-    choice,
-    each,
-    integer,
-    key,
-    number,
-    parsed,
-)
-from uavlinkd.io.url import EndpointUrl, SerialUrl, parse_line, parse_url
+from uavlinkd.config.section import Choice, Key, Keys, Kind, Number, anything, boolean, each, integer, text
+from uavlinkd.io.url import SerialUrl, parse_line, parse_url
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
+from uavlinkd.mavlink.policy.settings import KEYS as POLICY_KEYS
 from uavlinkd.protocol import constants as c
 from uavlinkd.protocol.crypto import AuthorityKey, is_usable_public_key
 from uavlinkd.protocol.drops import Drop
@@ -49,86 +37,71 @@ _INTERFACE = re.compile(r"[^\s/:]{1,15}")  # as dev_valid_name() of Linux
 _LIKE_A_KEY = re.compile(r"[A-Za-z0-9+/_-]{40,}={0,2}")
 _HTTPS = '{ listen = "0.0.0.0:443", certificate = "tls.crt", key = "tls.key" }'
 ENROLL_AGAIN = "run `uavlinkd enroll --finish` again with the line of `uavlinkd fleet sign`"
-LEAST_BUDGET = 1000
-_LEAST_AIR = 1000
+LEAST_BITS_S = 1000
+MEMBER_BITS_S = 20_000_000
 _EGRESS = EgressSettings()
-
-
-def _text(value: Any) -> str:
-    if not isinstance(value, str):
-        raise ValueError("must be text in quotes")
-    return value
 
 
 def _name(value: Any) -> str:
     # Logs, metrics and file names contain names, so a name has no character with a special meaning there.
-    if not _NAME.fullmatch(_text(value)):
+    if not _NAME.fullmatch(text(value)):
         raise ValueError("must be a name of up to 63 letters, digits, dots, hyphens and underscores")
     return str(value)
 
 
 def _file_name(value: Any) -> str:
-    text = _text(value)
-    if _LIKE_A_KEY.fullmatch(text.strip()):
+    name = text(value)
+    if _LIKE_A_KEY.fullmatch(name.strip()):
         raise ValueError("is a key, not the name of a file: write the key to a file of mode 0600 and name that file")
-    if not text or not text.isprintable():
+    if not name or not name.isprintable():
         raise ValueError('must name a file: write a name such as "drone0.key"')
-    return text
+    return name
 
 
 def _public_key(value: Any) -> bytes:
+    remedy = "write what `uavlinkd pubkey` prints there"
     try:
-        decoded = decode_key(_text(value))
+        decoded = decode_key(text(value))
     except ValueError as error:
-        raise ValueError(f"{error}: write what `uavlinkd pubkey` prints there") from None
+        raise ValueError(f"{error}: {remedy}") from None
     if not is_usable_public_key(decoded):
-        raise ValueError(
-            "is a point of low order, with which everyone knows the shared secret:"
-            " write what `uavlinkd pubkey` prints there"
-        )
+        raise ValueError(f"is a point of low order, with which everyone knows the shared secret: {remedy}")
     if not is_canonical_public_key(decoded):
-        raise ValueError(
-            "is not a public key of X25519, but perhaps a private key, which must stay secret:"
-            " write what `uavlinkd pubkey` prints there"
-        )
+        problem = "is not a public key of X25519, but perhaps a private key, which must stay secret"
+        raise ValueError(f"{problem}: {remedy}")
     return decoded
 
 
 def _suite(value: Any) -> Suite:
-    if isinstance(value, int) and not isinstance(value, bool):
-        value = str(value)
-    text = _text(value).strip().lower()
-    if (suite := SUITES_BY_NAME.get(text)) and text == value:
-        return suite
-    names = ", ".join(SUITES_BY_NAME)
-    raise ValueError(f"is not a suite: write one of {names}")
+    if (suite := SUITES_BY_NAME.get(text(value))) is None:
+        raise ValueError(f"is not a suite: write one of {', '.join(SUITES_BY_NAME)}")
+    return suite
 
 
-def _suites(values: list[Suite]) -> list[Suite]:
-    if not values:
+def _suites(value: Any) -> list[Suite]:
+    suites: list[Suite] = each(_suite)(value)
+    if not suites:
         raise ValueError('must name a suite: write ["x25519"]')
-    if len(set(values)) != len(values):
-        raise ValueError("names a suite twice: write each once, first the one to offer")
-    return values
+    return suites
 
 
-def _addresses(values: list[PeerAddress]) -> list[PeerAddress]:
-    everywhere = {value.address for value in values if not value.network}
-    if len(set(values)) != len(values):
-        raise ValueError("names an address twice: write each once")
-    if any(value.network and value.address in everywhere for value in values):
+def _addresses(value: Any) -> list[PeerAddress]:
+    addresses: list[PeerAddress] = each(_peer_address)(value)
+    everywhere = {one.address for one in addresses if not one.network}
+    if any(one.network and one.address in everywhere for one in addresses):
         raise ValueError("names an address with a network and without, which stands for every network: write one")
-    return values
+    return addresses
 
 
-def _budget(value: int) -> int:
-    if 0 < value < LEAST_BUDGET:
-        raise ValueError(f"is too small: write {LEAST_BUDGET} or more, in bits a second, or 0 for no limit")
-    return value
+def _budget(value: Any) -> float:
+    bits_s = integer(0, 10**9)(value)
+    if 0 < bits_s < LEAST_BITS_S:
+        raise ValueError(f"is too small: write {LEAST_BITS_S} or more, in bits a second, or 0 for no limit")
+    return bits_s
 
 
 def _peer_address(value: Any) -> PeerAddress:
-    text, network = value, ""
+    place, network = value, ""
     if isinstance(value, dict):
         if set(value) == {"network"}:
             return PeerAddress(SERIAL, _name(value["network"]))
@@ -137,15 +110,14 @@ def _peer_address(value: Any) -> PeerAddress:
                 'must have two keys: write { address = "10.13.0.2:5790", network = "mesh" }, or { network = "sik" }'
                 " for a serial network"
             )
-        text, network = value["address"], _name(value["network"])
+        place, network = value["address"], _name(value["network"])
     try:
-        address = parse_place(_text(text))
+        address = parse_place(text(place))
     except AddressError as error:
-        if network or {".", ":"} & set(text):
+        if network or {".", ":"} & set(place):
             raise
-        raise ValueError(
-            f'{error}. The other end of a serial network is {{ network = "sik" }}, with its name'
-        ) from None
+        remedy = 'The other end of a serial network is { network = "sik" }, with its name'
+        raise ValueError(f"{error}. {remedy}") from None
     if address.is_wildcard:
         raise ValueError('is every address of this machine: write the peer\'s own, such as "10.13.0.2:5790"')
     if address.resource and network:
@@ -153,69 +125,62 @@ def _peer_address(value: Any) -> PeerAddress:
     return PeerAddress(address, network)
 
 
+def _listening(value: Any) -> Address:
+    return parse_address(text(value), allow_names=False)
+
+
 def _https(value: Any) -> HttpsServer:
-    files = ("certificate", "key")
-    if not isinstance(value, dict) or not {"listen"} <= set(value) <= {"listen", *files}:
-        raise ValueError(f"has keys of its own: write {_HTTPS}")
-    names: dict[str, Path] = {}
-    part = "listen"
-    try:
-        listen = parse_address(_text(value["listen"]), allow_names=False)
-        for part in set(files) & set(value):
-            names[part] = Path(_file_name(value[part]))
-    except ValueError as error:
-        raise ValueError(f"{part} {error}") from None
-    if len(names) < len(files):
-        raise ValueError(
-            "needs a certificate and its key: a web server can no longer stand before the relay. Give it another port"
-            f" or address: write {_HTTPS}"
-        )
-    return HttpsServer(listen, **names)
+    kinds: dict[str, Kind] = {"listen": _listening, **dict.fromkeys(("certificate", "key"), _file_name)}
+    if not isinstance(value, dict) or set(value) != set(kinds):
+        problem = "needs listen, certificate and key: a web server can no longer stand before the relay"
+        raise ValueError(f"{problem}. Give it another port or address: write {_HTTPS}")
+    parts = dict[str, Any]()
+    for part, written in value.items():
+        try:
+            parts[part] = kinds[part](written)
+        except ValueError as error:
+            raise ValueError(f"{part} {error}") from None
+    return HttpsServer(parts["listen"], Path(parts["certificate"]), Path(parts["key"]))
 
 
 def _interface(value: Any) -> str:
-    text = _text(value)
-    if not _INTERFACE.fullmatch(text) or not text.isprintable() or text in (".", ".."):
+    name = text(value)
+    if not _INTERFACE.fullmatch(name) or not name.isprintable() or name in (".", ".."):
         raise ValueError("is not a name of a network interface: write one of those that `ip -brief link` lists")
-    return text
+    return name
 
 
 def _own_address(value: Any) -> str:
-    try:
-        ip = ip_address(_text(value))
-    except ValueError:
-        raise ValueError(
-            'is not an IP address: write one of this machine\'s, without a port, such as "10.0.0.5";'
-            " the port is that of listen"
-        ) from None
-    if ip.is_unspecified:
-        raise ValueError('is every address of this machine: write one of them, or interface = "wlan0" instead')
-    if ip.is_multicast or ip == IPv4Address("255.255.255.255"):
-        raise ValueError("is a multicast or broadcast address: write an address of this machine")
-    if isinstance(ip, IPv6Address) and ip.ipv4_mapped is not None:
-        raise ValueError(f'is an IPv4 address in IPv6 form: write "{ip.ipv4_mapped}"')
-    if isinstance(ip, IPv6Address) and ip.is_link_local and ip.scope_id is None:
-        raise ValueError(f'is link-local, valid on one interface only: write "{ip}%wlan0" with that interface')
-    return str(ip)
+    with suppress(ValueError):
+        ip = ip_address(text(value))
+        has_other_form = isinstance(ip, IPv6Address) and (
+            ip.ipv4_mapped or (ip.is_link_local and ip.scope_id is None)
+        )
+        if not (ip.is_unspecified or ip.is_multicast or str(ip) == "255.255.255.255" or has_other_form):
+            return str(ip)
+    raise ValueError(
+        'is not one address of this machine: write one, without a port, such as "10.0.0.5" or "fe80::5%wlan0", or'
+        ' write interface = "wlan0" instead'
+    )
 
 
 def _member_name(value: Any) -> str:
-    if not MEMBER_NAME.fullmatch(_text(value)):
+    if not MEMBER_NAME.fullmatch(text(value)):
         raise ValueError("is not the name of a member: names have 1 to 21 of a-z, 0-9 and -")
     return str(value)
 
 
-def _signed(parse: Callable[[bytes], object], what: str) -> CoreSchema:
+def _signed(parse: Callable[[bytes], object], what: str) -> Kind:
     """A value of the line that an authority prints, in base64. Its signature: :mod:`uavlinkd.config.fleet_rules`."""
 
     def check(value: Any) -> object:
-        text = _text(value)
+        encoded = text(value)
         with suppress(ValueError, Drop):
-            if (result := parse(from_base64(text))) is not None:
+            if (result := parse(from_base64(encoded))) is not None:
                 return result
         raise ValueError(f"is not {what}, or was cut: {ENROLL_AGAIN}")
 
-    return parsed(check)
+    return check
 
 
 def _certificate(data: bytes) -> HeldCertificate:
@@ -224,163 +189,118 @@ def _certificate(data: bytes) -> HeldCertificate:
     return HeldCertificate(parse_certificate(data), data)
 
 
-NAME: Final = parsed(_name)
-FILE_NAME: Final = parsed(_file_name)
-PUBLIC_KEY: Final = parsed(_public_key)
-PEER_ADDRESSES: Final = checked(each(parsed(_peer_address)), _addresses)
-BUDGET: Final = checked(integer(0, 10**9), _budget)
-CERTIFICATE: Final = _signed(_certificate, "a certificate")
-FRAME_ROLE: Final = choice("vehicle", "operator", "observer")
+def _line(value: Any) -> SerialUrl:
+    return parse_line(text(value))
 
 
-def _seconds(default: float, least: float, most: float) -> Any:
-    return key(number(least, most), default)
+def _seconds(default: float, least: float, most: float) -> Key:
+    return Key(Number(least, most), default)
 
 
-_SIGNED = '"…", which `uavlinkd enroll --finish` writes'
+_BITS_S: Final = integer(LEAST_BITS_S, 10**10)
+_SIGNED: Final = '"…", which `uavlinkd enroll --finish` writes'
+_CERTIFICATE: Final = Key(_signed(_certificate, "a certificate"), written=_SIGNED)
+_FRAME_ROLE: Final = Choice("vehicle", "operator", "observer")
 
+LINK: Final[Keys] = {
+    "suites": Key(_suites, [X25519], '["x25519"]'),
+    "confidential": Key(boolean, False),
+    "tag_bits": Key(Choice(64, 96, 128), 128),
+    "max_envelope_bytes": Key(integer(c.MIN_ENVELOPE_LIMIT, c.MAX_ENVELOPE_LIMIT), c.DEFAULT_ENVELOPE_LIMIT),
+    "keepalive_s": _seconds(c.KEEPALIVE_S, 0.1, 3600),
+    "lost_after_s": _seconds(c.LOST_AFTER_S, 0.2, 1200),
+    "retry_max_s": _seconds(c.RETRY_MAX_S, 0.05, 60),
+    "rekey_after_s": _seconds(c.REKEY_AFTER_S, 1, 3600),
+    "reject_after_s": _seconds(c.REJECT_AFTER_S, 1, 7200),
+    "probe_interval_s": _seconds(c.PROBE_INTERVAL_S, 0.1, 3600),
+    "budget_bits_s": Key(_budget, _EGRESS.budget_bits_s),
+    "coalesce_s": _seconds(_EGRESS.coalesce_s, 0, 0.5),
+    "max_age_s": _seconds(_EGRESS.max_age_s, 0.1, 60),
+    "redundancy": Key(Choice("critical", "all", "none"), "critical"),
+    "idle_probe_s": _seconds(c.PROBE_IDLE_S, 0, 3600),
+}
+"""``[link]``, and the same keys in ``[[peer]]``: how to communicate with peers."""
+_POLICY_EXAMPLES: Final = {
+    "role": '"swarm-member"',
+    "system_ids": "[2]",
+    **dict.fromkeys(("allow_in", "allow_out"), '["heartbeat", "telemetry"]'),
+    **dict.fromkeys(("rate_in", "rate_out"), "{ ATTITUDE = 10 }"),
+    **dict.fromkeys(("mavlink1", "ground_station"), "false"),
+}
+POLICY: Final[Keys] = {key: Key(anything, None, _POLICY_EXAMPLES[key]) for key in POLICY_KEYS}
+"""The keys that limit messages. :func:`uavlinkd.mavlink.policy.settings.read_settings` checks them together."""
+_WITH_KEY: Final[Keys] = {
+    "name": Key(_name, written='"drone1"'),
+    "public_key": Key(_public_key, written='"…", what `uavlinkd pubkey` prints there'),
+    "psk_file": Key(_file_name, None, '"drone0-drone1.psk"'),
+}
+"""The keys that say who another daemon is."""
 
-class LinkSection(Section):
-    """``[link]``, and the same keys in ``[[peer]]``: how to communicate with peers."""
-
-    suites: list[Suite] = key(checked(each(parsed(_suite)), _suites), [X25519], '["x25519"]')
-    confidential: bool = key(BOOLEAN, False)
-    tag_bits: int = key(choice(64, 96, 128), 128)
-    max_envelope_bytes: int = key(integer(c.MIN_ENVELOPE_LIMIT, c.MAX_ENVELOPE_LIMIT), c.DEFAULT_ENVELOPE_LIMIT)
-
-    keepalive_s: float = _seconds(c.KEEPALIVE_S, 0.1, 3600)
-    lost_after_s: float = _seconds(c.LOST_AFTER_S, 0.2, 1200)
-    retry_max_s: float = _seconds(c.RETRY_MAX_S, 0.05, 60)
-    rekey_after_s: float = _seconds(c.REKEY_AFTER_S, 1, 3600)
-    reject_after_s: float = _seconds(c.REJECT_AFTER_S, 1, 7200)
-    probe_interval_s: float = _seconds(c.PROBE_INTERVAL_S, 0.1, 3600)
-
-    budget_bits_s: int = key(BUDGET, _EGRESS.budget_bits_s)
-    coalesce_s: float = _seconds(_EGRESS.coalesce_s, 0, 0.5)
-    max_age_s: float = _seconds(_EGRESS.max_age_s, 0.1, 60)
-    redundancy: str = key(choice("critical", "all", "none"), "critical")
-    idle_probe_s: float = _seconds(c.PROBE_IDLE_S, 0, 3600)
-
-
-class NetworkSection(Section):
-    name: str = key(NAME, example='"lte"')
-    interface: str | None = key(parsed(_interface), None, '"wwan0"')
-    address: str | None = key(parsed(_own_address), None, '"10.0.0.5"')
-    serial: SerialUrl | None = key(parsed(lambda value: parse_line(_text(value))), None, '"/dev/ttyUSB0:57600"')
-    air_bits_s: int | None = key(integer(_LEAST_AIR, 10_000_000), None, "24000")
-    metered: bool = key(BOOLEAN, False)
-    budget_bits_s: int = key(BUDGET, 0)
-
-
-class PolicySection(Section):
-    """The keys in ``[[peer]]`` and ``[[endpoint]]`` that limit messages.
-
-    :func:`uavlinkd.mavlink.policy.settings.read_settings` checks them together.
-    """
-
-    role: Any = key(ANYTHING, None, '"swarm-member"')
-    system_ids: Any = key(ANYTHING, None, "[2]")
-    allow_in: Any = key(ANYTHING, None, '["heartbeat", "telemetry"]')
-    allow_out: Any = key(ANYTHING, None, '["heartbeat", "telemetry"]')
-    rate_in: Any = key(ANYTHING, None, "{ ATTITUDE = 10 }")
-    rate_out: Any = key(ANYTHING, None, "{ ATTITUDE = 10 }")
-    mavlink1: Any = key(ANYTHING, None, "false")
-    ground_station: Any = key(ANYTHING, None, "false")
-
-
-class KeySection(Section):
-    """The keys in ``[[peer]]``, ``[[relay]]`` and ``[[member]]`` that say who another daemon is."""
-
-    name: str = key(NAME, example='"drone1"')
-    public_key: bytes = key(PUBLIC_KEY, example='"…", what `uavlinkd pubkey` prints there')
-    psk_file: str | None = key(FILE_NAME, None, '"drone0-drone1.psk"')
-
-
-class PeerSection(LinkSection, PolicySection, KeySection):
-    addresses: list[PeerAddress] = key(PEER_ADDRESSES, [], '["10.13.0.2:5790"]')
-    relays: list[str] | None = key(each(NAME), None, "[]")
-
-
-class RelaySection(KeySection):
-    addresses: list[PeerAddress] = key(PEER_ADDRESSES, [], '["relay.example.org:5790"]')
-
-
-class MemberSection(KeySection):
-    max_peers: int = key(integer(1, 4000), 256)
-    bits_s: int = key(integer(LEAST_BUDGET, 10**10), 20_000_000, "20_000_000")
-
-
-class RelayServerSection(Section):
-    https: HttpsServer | None = key(parsed(_https), None, _HTTPS)
-    bits_s: int = key(integer(LEAST_BUDGET, 10**10), 10**10, "100_000_000")
-    member_bits_s: int = key(integer(LEAST_BUDGET, 10**10), 20_000_000, "20_000_000")
-
-
-class FleetSection(Section):
-    authority: AuthorityKey = key(_signed(AuthorityKey, "the public key of an authority"), example=_SIGNED)
-    certificate: HeldCertificate = key(CERTIFICATE, example=_SIGNED)
-    bulletin: bytes = key(_signed(lambda data: data if parse_bulletin(data) else None, "a bulletin"), example=_SIGNED)
-    call: list[str] | None = key(each(FRAME_ROLE), None, '["operator"]')
-    operator: str = key(choice("certificate", "pinned"), "certificate")
-    require_bulletin: int = key(integer(0, LAST_SERIAL), 0)
-    deny: list[str] = key(each(parsed(_member_name)), [], '["v3"]')
-
-
-class ContactSection(Section):
-    public_key: bytes = key(PUBLIC_KEY, example=_SIGNED)
-    certificate: HeldCertificate = key(CERTIFICATE, example=_SIGNED)
-    addresses: list[PeerAddress] = key(PEER_ADDRESSES, [], '["relay.example.org:5790"]')
-    relays: bool = key(BOOLEAN, False)
-
-
-class FleetRoleSection(PolicySection):
-    """``[[fleet_role]]``: what the members with a role may send here, instead of the usual policy."""
-
-    name: str = key(FRAME_ROLE, example='"operator"')
-
-
-class EndpointSection(PolicySection):
-    name: str = key(NAME, example='"autopilot"')
-    url: EndpointUrl = key(parsed(lambda value: parse_url(_text(value))), example='"udpin:127.0.0.1:14550"')
-    radio_status: bool = key(BOOLEAN, False)
-    status_text: bool = key(BOOLEAN, False)
-
-
-class RoutingSection(Section):
-    relay: bool = key(BOOLEAN, False)
-
-
-class LogSection(Section):
-    level: str = key(choice("debug", "info", "warning", "error"), "info")
-    format: str = key(choice("auto", "console", "json"), "auto")
-
-
-class FileSection(Section):
-    """The top of the file. Its sections are read one by one, so that each problem names its section."""
-
-    name: str = key(NAME, example='"drone0"')
-    private_key_file: str = key(FILE_NAME, example='"drone0.key"')
-    listen: list[Address] = key(
-        each(parsed(lambda value: parse_address(_text(value), allow_names=False))), [], '["0.0.0.0:5790"]'
-    )
-    control_socket: str | None = key(FILE_NAME, None, '"drone0.sock"')
-
-
-SINGLE: dict[str, type[Section]] = {
-    "link": LinkSection,
-    "log": LogSection,
-    "routing": RoutingSection,
-    "relay_server": RelayServerSection,
-    "fleet": FleetSection,
+SINGLE: Final[dict[str, Keys]] = {
+    "link": LINK,
+    "log": {
+        "level": Key(Choice("debug", "info", "warning", "error"), "info"),
+        "format": Key(Choice("auto", "console", "json"), "auto"),
+    },
+    "routing": {"relay": Key(boolean, False)},
+    "relay_server": {
+        "https": Key(_https, None, _HTTPS),
+        "bits_s": Key(_BITS_S, 10**10, "100_000_000"),
+        "member_bits_s": Key(_BITS_S, MEMBER_BITS_S, "20_000_000"),
+    },
+    "fleet": {
+        "authority": Key(_signed(AuthorityKey, "the public key of an authority"), written=_SIGNED),
+        "certificate": _CERTIFICATE,
+        "bulletin": Key(_signed(lambda data: data if parse_bulletin(data) else None, "a bulletin"), written=_SIGNED),
+        "call": Key(each(_FRAME_ROLE), None, '["operator"]'),
+        "operator": Key(Choice("certificate", "pinned"), "certificate"),
+        "require_bulletin": Key(integer(0, LAST_SERIAL), 0),
+        "deny": Key(each(_member_name), [], '["v3"]'),
+    },
 }
 """The sections that a file has once, such as ``[link]``."""
-REPEATED: dict[str, type[Section]] = {
-    "network": NetworkSection,
-    "endpoint": EndpointSection,
-    "peer": PeerSection,
-    "member": MemberSection,
-    "relay": RelaySection,
-    "contact": ContactSection,
-    "fleet_role": FleetRoleSection,
+REPEATED: Final[dict[str, Keys]] = {
+    "network": {
+        "name": Key(_name, written='"lte"'),
+        "interface": Key(_interface, None, '"wwan0"'),
+        "address": Key(_own_address, None, '"10.0.0.5"'),
+        "serial": Key(_line, None, '"/dev/ttyUSB0:57600"'),
+        "air_bits_s": Key(integer(LEAST_BITS_S, 10_000_000), None, "24000"),
+        "metered": Key(boolean, False),
+        "budget_bits_s": Key(_budget, 0),
+    },
+    "endpoint": {
+        "name": Key(_name, written='"autopilot"'),
+        "url": Key(lambda value: parse_url(text(value)), written='"udpin:127.0.0.1:14550"'),
+        "radio_status": Key(boolean, False),
+        "status_text": Key(boolean, False),
+        **POLICY,
+    },
+    "peer": {
+        **_WITH_KEY,
+        "addresses": Key(_addresses, [], '["10.13.0.2:5790"]'),
+        "relays": Key(each(_name), None, "[]"),
+        **POLICY,
+        **LINK,
+    },
+    "member": _WITH_KEY,
+    "relay": {**_WITH_KEY, "addresses": Key(_addresses, [], '["relay.example.org:5790"]')},
+    "contact": {
+        "public_key": Key(_public_key, written=_SIGNED),
+        "certificate": _CERTIFICATE,
+        "addresses": Key(_addresses, [], '["relay.example.org:5790"]'),
+        "relays": Key(boolean, False),
+    },
+    "fleet_role": {"name": Key(_FRAME_ROLE, written='"operator"'), **POLICY},
 }
 """The sections that a file may have several times, such as ``[[peer]]``."""
+TOP: Final[Keys] = {
+    "name": Key(_name, written='"drone0"'),
+    "private_key_file": Key(_file_name, written='"drone0.key"'),
+    "listen": Key(each(_listening), [], '["0.0.0.0:5790"]'),
+    "control_socket": Key(_file_name, None, '"drone0.sock"'),
+}
+"""The keys at the top of the file, before its sections."""
+SECTIONS: Final[dict[str, Keys]] = {**SINGLE, **REPEATED}
+TITLES: Final = {**{key: f"[{key}]" for key in SINGLE}, **{key: f"[[{key}]]" for key in REPEATED}}
+"""The sections as they are written in a file."""

@@ -1,121 +1,167 @@
-"""What a section of a configuration is made of: kinds of values, keys, and the check of a section by pydantic.
+"""What a configuration file is made of: kinds of values, keys, and the values of a section.
 
-The schemas are those of pydantic's core, written as its plain data. The import of pydantic's models would take half
-of the processor time of a start. Each kind is strict by itself: nothing is converted.
+A kind is a function. It returns the value that the daemon uses, or raises ValueError with the message for the person.
+The message never repeats the value, which may be a secret in the wrong place. Nothing is converted: a number in
+quotation marks is a mistake.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
-from pydantic_core import CoreSchema, ErrorDetails, SchemaValidator, ValidationError
+Kind = Callable[[Any], Any]
+
+
+class WrongTypeError(ValueError):
+    """The value has the wrong type. An example of the key follows the message."""
+
+
+class ListError(ValueError):
+    """The messages about values of a list, by their index."""
+
+    def __init__(self, messages: Mapping[int, str]) -> None:
+        super().__init__("; ".join(messages.values()))
+        self.messages = messages
+
+
+def boolean(value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise WrongTypeError("must be true or false, without quotes")
+    return value
+
+
+def anything(value: Any) -> Any:
+    return value
+
+
+def text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise ValueError("must be text in quotes")
+    return value
+
+
+class Number:
+    """A kind: a number in a range."""
+
+    def __init__(self, least: float, most: float, *, is_whole: bool = False) -> None:
+        self.least, self.most, self.is_whole = least, most, is_whole
+
+    def __call__(self, value: Any) -> float:
+        if isinstance(value, bool) or not isinstance(value, int if self.is_whole else int | float):
+            raise WrongTypeError(f"must be a {'whole ' if self.is_whole else ''}number, without quotes")
+        if not self.least <= value <= self.most:  # also of NaN
+            raise ValueError(f"must be from {self.least:.12g} to {self.most:.12g}")
+        return value if self.is_whole else float(value)
+
+
+def integer(least: int, most: int) -> Number:
+    return Number(least, most, is_whole=True)
+
+
+class Choice:
+    """A kind: one of a few values."""
+
+    def __init__(self, *values: str | int) -> None:
+        self.values = values
+
+    def __call__(self, value: Any) -> str | int:
+        for one in self.values:
+            if type(value) is type(one) and value == one:
+                return one
+        *most, last = (f'"{one}"' if isinstance(one, str) else str(one) for one in self.values)
+        raise ValueError(f"must be {', '.join(most)} or {last}")
+
+
+def each(kind: Kind) -> Kind:
+    """The kind of a list of different values."""
+
+    def read_list(value: Any) -> list[Any]:
+        if not isinstance(value, list):
+            raise WrongTypeError("must be a list")
+        values, messages = list[Any](), dict[int, str]()
+        for index, item in enumerate(value):
+            try:
+                values.append(kind(item))
+            except ValueError as error:
+                messages[index] = str(error)
+        if messages:
+            raise ListError(messages)
+        if len(set(values)) != len(values):
+            raise ValueError("names one twice: write each once")
+        return values
+
+    return read_list
+
 
 REQUIRED: Final = object()
 """The default of a key that a section must have."""
-
-BOOLEAN: Final[CoreSchema] = {"type": "bool", "strict": True}
-ANYTHING: Final[CoreSchema] = {"type": "any"}
-
-
-def integer(least: int, most: int) -> CoreSchema:
-    return {"type": "int", "ge": least, "le": most, "strict": True}
-
-
-def number(least: float, most: float) -> CoreSchema:
-    return {"type": "float", "ge": least, "le": most, "allow_inf_nan": False, "strict": True}
-
-
-def choice(*values: str | int) -> CoreSchema:
-    return {"type": "literal", "expected": list(values)}
-
-
-def each(kind: CoreSchema) -> CoreSchema:
-    """A list of values of a kind."""
-    return {"type": "list", "items_schema": kind, "strict": True}
-
-
-def parsed(parse: Callable[[Any], object]) -> CoreSchema:
-    """What ``parse`` returns for a value. It raises ValueError with the message for the person."""
-    return {"type": "function-plain", "function": {"type": "no-info", "function": parse}}
-
-
-def checked(kind: CoreSchema, check: Callable[[Any], object]) -> CoreSchema:
-    """A value of a kind that ``check`` returns. It raises ValueError with the message for the person."""
-    return {"type": "function-after", "function": {"type": "no-info", "function": check}, "schema": kind}
 
 
 class Key(NamedTuple):
     """A key: the kind of its value, its default, and an example as it is written in TOML."""
 
-    kind: CoreSchema
-    default: Any
-    example: str
+    kind: Kind
+    default: Any = REQUIRED
+    written: str = ""
 
     @property
-    def is_required(self) -> bool:
-        return self.default is REQUIRED
+    def example(self) -> str:
+        """A value as it is written in TOML. A person who writes a boolean wants another value than the default."""
+        if self.written:
+            return self.written
+        if isinstance(self.default, bool):
+            return str(not self.default).lower()
+        return f"{self.default:g}" if isinstance(self.default, int | float) else f'"{self.default}"'
 
 
-def key(kind: CoreSchema, default: object = REQUIRED, example: str = "") -> Any:
-    """A key of a :class:`Section`. Its attribute in an object of the section has the type of the value."""
-    return Key(kind, default, example)
+Keys = Mapping[str, Key]
 
 
-class Section:
-    """A section. The class has its keys; an object has the value of each key, or its default."""
+class Values(NamedTuple):
+    """The values of one section: the valid ones that are written, and the keys whose values are invalid."""
 
-    keys: ClassVar[dict[str, Key]] = {}
+    section: str  # `peer[1]`; empty for the top of the file
+    keys: Keys
+    valid: dict[str, Any]
+    invalid: frozenset[str] = frozenset()
 
-    def __init_subclass__(cls) -> None:
-        cls.keys = {name: one for base in reversed(cls.__mro__) for name, one in _own_keys(base)}
+    @property
+    def kind(self) -> str:
+        """``peer`` of ``peer[1]``."""
+        return self.section.partition("[")[0]
 
-    def __init__(self, valid: Mapping[str, Any]) -> None:
-        for name, one in self.keys.items():
-            setattr(self, name, valid.get(name, one.default))
+    def get(self, key: str) -> Any:
+        """The valid value of a key, or its default; None without a default."""
+        default = self.keys[key].default if key in self.keys else None
+        return self.valid.get(key, None if default is REQUIRED else default)
 
+    def at(self, key: str = "") -> str:
+        """The place of a key, or of the section: ``peer[1].public_key (drone1)``."""
+        path = ".".join(part for part in (self.section, key) if part)
+        name = self.valid.get("name") if self.section else None
+        return f"{path} ({name})" if name else path
 
-def _own_keys(section: type) -> list[tuple[str, Key]]:
-    return [(name, one) for name, one in vars(section).items() if isinstance(one, Key)]
-
-
-def read(section: type[Section], table: Mapping[str, Any]) -> tuple[dict[str, Any], list[ErrorDetails]]:
-    """The values of the valid keys, and every problem. Unknown keys are problems.
-
-    The checks of several values use the valid ones, so one run reports every problem.
-    """
-    try:
-        return _validator(section).validate_python(table), []
-    except ValidationError as error:
-        problems = error.errors(include_url=False, include_input=False)  # no message repeats what was written
-    wrong = {problem["loc"][0] for problem in problems}
-    valid = {name: value for name, value in table.items() if name not in wrong}
-    return _validator(section, is_complete=False).validate_python(valid), problems
+    def lacks(self, key: str) -> bool:
+        """Whether the key is not written, or its value is empty. False if the value is invalid."""
+        return not self.valid.get(key) and key not in self.invalid
 
 
-_validators: dict[tuple[type[Section], bool], SchemaValidator] = {}
-
-
-def _validator(section: type[Section], *, is_complete: bool = True) -> SchemaValidator:
-    """The validator of a section, or of a part of it, which may lack required keys."""
-    if (section, is_complete) not in _validators:
-        _validators[section, is_complete] = _make_validator(section, is_complete=is_complete)
-    return _validators[section, is_complete]
-
-
-def _make_validator(section: type[Section], *, is_complete: bool) -> SchemaValidator:
-    return SchemaValidator(
-        {
-            "type": "typed-dict",
-            "extra_behavior": "forbid",
-            "strict": True,
-            "fields": {
-                name: {
-                    "type": "typed-dict-field",
-                    "schema": one.kind,
-                    "required": one.is_required and is_complete,
-                }
-                for name, one in section.keys.items()
-            },
-        }
-    )
+def read(keys: Keys, table: Mapping[str, Any], section: str = "") -> tuple[Values, list[tuple[str, str]]]:
+    """The values of a section, and every problem with its place in the section. Unknown keys are no matter of it."""
+    valid, problems = dict[str, Any](), list[tuple[str, str]]()
+    for name, key in keys.items():
+        if name not in table:
+            if key.default is REQUIRED:
+                problems.append((name, f"is missing: write {name} = {key.example}"))
+            continue
+        try:
+            valid[name] = key.kind(table[name])
+        except ListError as error:
+            problems += [(f"{name}[{index}]", message) for index, message in error.messages.items()]
+        except WrongTypeError as error:
+            problems.append((name, f"{error}: write {name} = {key.example}"))
+        except ValueError as error:
+            problems.append((name, str(error)))
+    invalid = frozenset(keys) & {place.partition("[")[0] for place, _ in problems}
+    return Values(section, keys, valid, invalid), problems
