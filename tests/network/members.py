@@ -73,7 +73,6 @@ class Relay(Drone):
     def start(self, clock: float | None = None) -> None:
         super().start(clock)
         assert self.node is not None
-        self._asked.clear()
         if self.on_certificate is not None:
             self.trust = Trust(AUTHORITY, self.public_key, b"", BULLETIN)
         shell = RelayShell(
