@@ -11,7 +11,7 @@ from tests.protocol.harness import Pair, of
 from tests.relay.test_direct_search import HOME_A, LINK, leads_to_mesh
 from uavlinkd.protocol import constants as c
 from uavlinkd.protocol.drops import DropReason
-from uavlinkd.protocol.outputs import RecordReceived, Transmit
+from uavlinkd.protocol.outputs import PathStateChanged, RecordReceived, Transmit
 from uavlinkd.protocol.path import Path, relayed
 from uavlinkd.protocol.path_state import PathState
 from uavlinkd.protocol.relay_records import Bind, Bound, Candidates, Record, wrap
@@ -121,6 +121,20 @@ def test_path_that_the_core_gave_up_is_found_in_turn(relay: FuzzedRelay, monkeyp
         relay.service.do_housekeeping(relay.now)
         routes.append(len(relay.service.forwarding))
     assert routes == [2, 0, 0]
+
+
+def test_address_that_a_nat_gave_up_keeps_no_connection(relay: FuzzedRelay) -> None:
+    """It would take one from the new address of the member. A member that is still there binds again."""
+    connect(relay)
+    failed = PathStateChanged(relay.service.members[KEYS[1]].peer, HOMES[0][0], False, "unanswered")
+    relay.service.on_event(failed, relay.now)
+    relay.service.settle(relay.now)
+    relay.settle()
+    assert len(relay.service.forwarding) == 0
+    assert relay.members[1].handles[RELAY_AT[0]][KEYS[1]] == []
+    to_other, to_one = connect(relay)
+    relay.arrive(wrap(to_one, DATA), HOMES[1][0])
+    assert relay.forwarded == [(wrap(to_other, DATA), HOMES[0][0])]
 
 
 def test_unproven_address_gets_no_report(relay: FuzzedRelay) -> None:

@@ -177,6 +177,8 @@ class RelayService(Feature):
             self.introductions.set_up(member.key, is_up=member.peer.is_up)
         if isinstance(event, o.SessionEstablished):
             self.introductions.on_session(member.key, now)
+        if isinstance(event, o.PathStateChanged) and not event.is_usable:  # a NAT may have given the address up
+            self._apply(self.bindings.end_path(member.key, event.path, now))
         if isinstance(event, o.PeerClosed):
             for path in self.bindings.paths_of(member.key):
                 self._apply(self.bindings.end_path(member.key, path, now))
