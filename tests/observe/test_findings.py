@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from tests.daemon.test_evidence import HOST, OWN_KEY, THERE, Scene
+from tests.daemon.test_evidence import OWN_KEY, THERE, Scene
 from tests.observe.daemon_parts import parts_of
-from tests.processes.frames import command_long, ground_heartbeat, heartbeat
+from tests.processes.frames import command_long, heartbeat
 from tests.protocol.harness import PLAIN
 from tests.samples import blank
 from tests.test_readmes import ROOT
@@ -135,31 +135,6 @@ def test_a_finding_of_the_table_decides_the_exit_status() -> None:
 
 
 # A peer that is down.
-
-
-@pytest.mark.parametrize(
-    ("error", "cause"), [("EPERM", "firewall_here"), ("ENETUNREACH", "no_route"), ("EINVAL", "no_route")]
-)
-def test_errors_of_this_machine(daemon: Daemon, error: str, cause: str) -> None:
-    """They name the address and the error. Then the peer gets no response to confirm."""
-    daemon.now = 5.0
-    unconfirmed: Any = {1: SimpleNamespace(session=SimpleNamespace(created_at=0.5))}
-    daemon.link.peer.sessions.unconfirmed = unconfirmed
-    assert set(daemon.findings()) == {"not_confirmed"}
-    daemon.evidence.add_error(error, THERE, 5.0)
-    assert set(daemon.findings()) == {cause}
-    assert f"{HOST}:5790" in daemon.findings()[cause].text
-    assert error in daemon.findings()[cause].text
-
-
-@pytest.mark.parametrize(("created_at", "is_found"), [(5.0, True), (5.1, False), (0.9, False)])
-def test_responses_that_do_not_arrive(daemon: Daemon, created_at: float, is_found: bool) -> None:
-    """Two seconds after an initiation that came since the peer was last received."""
-    daemon.now, peer = 7.0, daemon.link.peer
-    peer.received_at = 1.0
-    unconfirmed: Any = {1: SimpleNamespace(session=SimpleNamespace(created_at=created_at))}
-    peer.sessions.unconfirmed = unconfirmed
-    assert ("not_confirmed" in daemon.findings()) is is_found
 
 
 def test_absent_own_address_explains_that_nothing_can_be_sent(daemon: Daemon) -> None:
@@ -356,16 +331,6 @@ def test_policy_that_refuses_everything(daemon: Daemon, received: list[bytes], s
     assert text.startswith(f"its policy refuses every frame {which} it: the role, or the lists")
 
 
-def test_role_of_a_member_is_signed_again(daemon: Daemon) -> None:
-    """No file has it."""
-    daemon.set_up(role="vehicle", system_ids="all")
-    daemon.cross([ground_heartbeat()])
-    assert 'write role = "operator"' in daemon.findings()["roles_exchanged"].remedy
-    settings = replace(daemon.link.config.settings, is_certified=True)
-    daemon.link.config = replace(daemon.link.config, settings=settings)
-    assert "`uavlinkd fleet sign --replace drone1 --role operator`" in daemon.findings()["roles_exchanged"].remedy
-
-
 @pytest.mark.parametrize(
     ("message", "hiding", "frames", "is_found"),
     [
@@ -406,15 +371,6 @@ def test_commands_by_name(daemon: Daemon) -> None:
     assert withheld.text.startswith("COMMAND_LONG (COMPONENT_ARM_DISARM) 1x, COMMAND_LONG (NAV_TAKEOFF) 1x, ")
     assert withheld.text.endswith(" more withheld: role swarm-member")
     assert withheld.severity is Severity.WARNING
-
-
-def test_unverified_freshness(daemon: Daemon) -> None:
-    """The text has its age and what follows."""
-    daemon.set_up(role="all", system_ids="all").peer.unverified_since = 0.0
-    daemon.now = 12.0
-    finding = daemon.findings()["freshness_unverified"]
-    assert finding.text.startswith("freshness unverified for 12 s: ")
-    assert "reports pass and may be old" in finding.text
 
 
 # What the peer claims to refuse.

@@ -5,16 +5,13 @@ from __future__ import annotations
 import shutil
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
-from typing import Final, Literal, NamedTuple, get_args
+from typing import Final, Literal, get_args
 
 from axe_playwright_python.async_playwright import Axe
 from playwright.async_api import Browser, ConsoleMessage, Locator, Page, Request, async_playwright, expect
 
 from tests.needs import need
-from tests.processes.harness import Stage
-from tests.processes.process import DaemonProcess
 from tests.waiting import PATIENCE_S
-from tests.web.served import served
 
 Scheme = Literal["light", "dark"]
 
@@ -70,42 +67,10 @@ async def window(
         await page.close()
 
 
-class Shown(NamedTuple):
-    """The page of a daemon, and the state of its only peer there, which is up."""
-
-    stage: Stage
-    daemon: DaemonProcess
-    page: Page
-    state: Locator
-
-
-@asynccontextmanager
-async def linked_pair(browser: Browser) -> AsyncIterator[Shown]:
-    """Two real daemons that are linked, and the page of one in a window."""
-    async with Stage() as stage:
-        drone, ground = stage.pair()
-        await stage.start(drone, ground)
-        async with served(ground.folder / "control.sock") as web, window(browser, web.url) as page:
-            state = card_of(page, drone.name).locator(".state")
-            await expect(state).to_have_text("up")
-            yield Shown(stage, ground, page, state)
-
-
 async def look_at(page: Page, width: int, scheme: Scheme) -> None:
     """Give the window another width and the colours of another time of day."""
     await page.set_viewport_size({"width": width, "height": 800})
     await page.emulate_media(color_scheme=scheme)
-
-
-async def until_lost(page: Page) -> None:
-    """Wait until the page shows that its facts do not count. It looks at each change, so no time is added."""
-    await page.evaluate(
-        """() => new Promise((done) => {
-          const look = () => { if (document.body.className === "lost") done(); };
-          new MutationObserver(look).observe(document.body, { attributes: true });
-          look();
-        })"""
-    )
 
 
 async def overflow(page: Page) -> int:

@@ -9,7 +9,6 @@ from tests.processes.conftest import stage
 from tests.processes.harness import Stage
 from tests.waiting import PATIENCE_S, Stopwatch
 from tests.web.statuses import few_facts, overview
-from uavlinkd.ops.control import MAX_REQUEST_BYTES
 from uavlinkd.web.view import view
 
 __all__ = ["stage"]
@@ -60,16 +59,6 @@ async def test_a_made_up_overview_is_like_a_real_one(stage: Stage) -> None:
     assert answer.keys() == made_up.keys()
     assert {key: type(fact) for key, fact in answer.items()} == {key: type(fact) for key, fact in made_up.items()}
     assert (await one.ask("problems"))["problems"] == []
-
-
-async def test_requests_of_the_page_are_what_they_are_and_no_more(stage: Stage) -> None:
-    """No other request begins so, and names cannot exceed the limit unnoticed."""
-    one, other = stage.pair()
-    await stage.start(one, other)
-    for request in ("problems drone1", "overviews", "problem"):
-        assert "unknown request" in (await one.ask(request))["error"]
-    names = " ".join(["x" * 63] * (MAX_REQUEST_BYTES // 64))
-    assert "longer than" in (await one.ask(f"overview {names}"))["error"]
 
 
 def test_a_member_that_never_came_is_on_the_page() -> None:

@@ -7,7 +7,7 @@ from typing import Final
 import pytest
 from playwright.async_api import Browser, expect
 
-from tests.web.browser import card_of, headline, linked_pair, window
+from tests.web.browser import card_of, window
 from tests.web.made_up_daemon import make_up
 from tests.web.served import page_of
 
@@ -21,20 +21,6 @@ HOSTILE: Final = (
     "${window.ran=1}' onclick='window.ran=1' \" &amp;",
     "../../events?peer=%00#",
 )
-
-
-@pytest.mark.long
-async def test_a_daemon_that_ends_is_lost_and_comes_back(browser: Browser) -> None:
-    """The page keeps no good news, says why, and needs no reload."""
-    async with linked_pair(browser) as (stage, ground, page, state):
-        await expect(headline(page)).to_have_text("1 of 1 peers up")
-        await ground.stop()
-        await expect(headline(page)).to_contain_text("LOST: no daemon answers at")
-        await expect(state).to_have_text("unknown")
-        assert await page.get_by_text("up", exact=True).count() == 0
-        await stage.start(ground)
-        await expect(state).to_have_text("up")
-        await expect(headline(page)).to_have_text("1 of 1 peers up")
 
 
 @pytest.mark.long

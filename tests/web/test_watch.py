@@ -18,7 +18,6 @@ from tests.waiting import PATIENCE_S, Stopwatch
 from tests.web.served import is_answered, served
 from tests.web.statuses import Status, few_facts, overview
 from uavlinkd.ops import STATUS_SCHEMA
-from uavlinkd.ops.control import ControlError
 from uavlinkd.web import watch
 from uavlinkd.web.watch import LONGEST_S, Watcher
 from uavlinkd.web.watch import PATIENCE_S as ANSWER_S
@@ -190,16 +189,6 @@ async def test_a_status_without_a_key_stops_nothing(missing: str) -> None:
         await message(watcher, "", is_answered)
 
 
-@pytest.mark.parametrize("error", [ControlError("no daemon answers"), RecursionError(), MemoryError(), KeyError("a")])
-async def test_no_failure_of_a_question_ends_the_page(error: Exception) -> None:
-    daemon = Daemon()
-    daemon.error = error
-    async with watcher_of(daemon) as watcher:
-        await message(watcher, "", lambda facts: "not answered yet" not in facts["lost"])
-        daemon.error = None
-        await message(watcher, "", is_answered)
-
-
 # Hostile names and texts.
 
 
@@ -222,6 +211,3 @@ async def test_hostile_text_stays_in_its_event(text: str) -> None:
             assert facts["past"][0]["remedy"] == text
             assert facts["cards"][0]["name"] == text
             assert facts["cards"][0]["word"] == "attack"
-
-
-# What the daemon is asked.

@@ -25,24 +25,18 @@ Query = asyncio.Task[Resolved]
 
 FIRST_WAIT_S = 0.5
 LONGEST_WAIT_S = 1.0
-"""Longest wait between look-ups while the addresses do not answer. With up to six named peers, a link is up within
-2 s of the name server's return."""
+"""Longest wait between look-ups while the addresses do not answer."""
 RELAXED_WAIT_S = 30.0
 """Longest wait between look-ups while a name fails whose addresses are not urgent: other addresses answer. A query
 per second would cost 17 MB a day on a metered network."""
-MAX_QUERIES = 5
-"""Concurrent look-ups of one peer's names. The system repeats a query to a silent name server after 5 s and gives up
-after 10 s (resolv.conf(5)). Five look-ups, started 1 s apart, send one query per second."""
+MAX_QUERIES = 3
+"""Concurrent look-ups of one name whose addresses are urgent. The system repeats a query to a silent server after
+5 s and gives up after 10 s (resolv.conf(5)): look-ups that begin :data:`OVERLAP_S` apart send a query as often."""
+OVERLAP_S = 1.7
 MAX_THREADS = 32
-"""At most what systemd's unit allows. More than six peers share them equally, so that names without an answer do not
-delay others."""
+"""At most what systemd's unit allows: names without an answer do not delay others while there are ten of them."""
 
 _THREADS = Threads(MAX_THREADS, "look-up")
-_active: set[object] = set()
-
-
-def _share() -> int:
-    return max(1, min(MAX_QUERIES, MAX_THREADS // max(1, len(_active))))
 
 
 async def resolve(address: Address, threads: Threads | None = None) -> Resolved:
@@ -89,39 +83,34 @@ async def keep_resolving(
     known: Resolved = []
     unresolved = set() if unresolved is None else unresolved
     wake = asyncio.Event() if wake is None else wake
-    wait_s = 0.0
     queries: set[Query] = set()
     loop = asyncio.get_running_loop()
-    queried_at = answered_at = -inf
-    me = object()
+    last_at, wait_s = -inf, 0.0  # of the newest query or the last answer; the pause after a failure, which grows
     try:
         while True:
             asked_s, now = interval_s(), loop.time()
-            is_urgent, is_failing = asked_s <= LONGEST_WAIT_S, address.host in unresolved or not known
-            if address.ip is None and (is_urgent or is_failing):
-                _active.add(me)
+            is_urgent = asked_s <= LONGEST_WAIT_S
+            if queries:
+                pause_s = OVERLAP_S
+            elif is_urgent:
+                pause_s = min(wait_s, LONGEST_WAIT_S)
+            elif known and address.host not in unresolved:
+                pause_s, wait_s = asked_s, 0.0
             else:
-                _active.discard(me)
-            if not is_urgent and not is_failing:
-                wait_s = 0.0
-            # While other queries are open, the next one starts a second after the newest of them.
-            due_at = queried_at + LONGEST_WAIT_S
-            if not queries:
-                due_at = answered_at + _interval_s(asked_s, wait_s, is_failing=is_failing)
-            may_query = not queries or (is_urgent and len(queries) < _share())
-            if may_query and (now >= due_at or wake.is_set()):
+                pause_s = min(asked_s, wait_s)
+            may_query = not queries or (is_urgent and len(queries) < MAX_QUERIES)
+            if may_query and (wake.is_set() or now >= last_at + pause_s):
                 wake.clear()
-                queried_at = now
+                last_at = now
                 queries.add(asyncio.ensure_future(resolve(address)))
                 continue
+            left_s = min(last_at + pause_s - now, FIRST_WAIT_S) if may_query else FIRST_WAIT_S
             if not queries:
                 with suppress(TimeoutError):
-                    async with asyncio.timeout(min(due_at - now, FIRST_WAIT_S)):
+                    async with asyncio.timeout(left_s):
                         await wake.wait()
                 continue
-            answered, queries = await asyncio.wait(
-                queries, timeout=due_at - now if may_query else LONGEST_WAIT_S, return_when=asyncio.FIRST_COMPLETED
-            )
+            answered, queries = await asyncio.wait(queries, timeout=left_s, return_when=asyncio.FIRST_COMPLETED)
             if not answered:
                 continue
             # A server that is back may answer several at once: use the result with the most addresses.
@@ -134,17 +123,11 @@ async def keep_resolving(
             elif address.host not in unresolved:
                 unresolved.add(address.host)
                 log.warning("name_not_resolved", host=address.host, meaning=meaning_of(NAME_NOT_RESOLVED))
-            answered_at, wait_s = loop.time(), max(FIRST_WAIT_S, min(2 * wait_s, RELAXED_WAIT_S))
+            wait_s = max(FIRST_WAIT_S, min(2 * wait_s, RELAXED_WAIT_S))
+            if not queries:
+                last_at = loop.time()
     finally:
-        _active.discard(me)
         _cancel(queries)
-
-
-def _interval_s(asked_s: float, wait_s: float, *, is_failing: bool) -> float:
-    """The interval until the next look-up. ``wait_s`` grows with each."""
-    if asked_s <= LONGEST_WAIT_S:
-        return min(wait_s, LONGEST_WAIT_S)
-    return min(asked_s, wait_s) if is_failing else asked_s
 
 
 def _cancel(queries: set[Query]) -> None:
