@@ -24,11 +24,6 @@ PLACES = {
 configuration reads; ``parts`` puts a daemon together."""
 PUTS_TOGETHER = "uavlinkd.daemon.parts"
 """The one module of the daemon that imports features. They register themselves there."""
-KNOWS_FEATURES_YET = {
-    ("peers", "fleet.members"),
-    ("peers", "fleet.shell"),
-}
-"""Other modules of the daemon that still import features. Nothing may be added."""
 ORDER_OF_LABORATORY = ("child_processes", "mitm", "hostile", "sim", "evaluation", "demo", "commands")
 """Each part of the laboratory may import those before it."""
 IMPURE = {
@@ -120,15 +115,8 @@ def test_packages_import_in_one_direction() -> None:
         for other in others
         if package_of(other) and ORDER.index(package_of(other)) > ORDER.index(package_of(module))
         if module != PUTS_TOGETHER
-        if (module.removeprefix("uavlinkd.daemon."), other.removeprefix("uavlinkd.")) not in KNOWS_FEATURES_YET
     ]
     assert forbidden == []
-
-
-def test_modules_that_know_features_are_fewer_and_fewer() -> None:
-    """What is listed as an exception is one."""
-    for module, other in KNOWS_FEATURES_YET:
-        assert f"uavlinkd.{other}" in graph()[f"uavlinkd.daemon.{module}"]
 
 
 def test_parts_of_the_laboratory_import_in_one_direction() -> None:

@@ -17,8 +17,9 @@ from uavlinkd.authority.state_file import FleetState
 from uavlinkd.authority.trust import Trust
 
 OWN = bytes((1,)) * 32
-BEFORE = FleetState(bulletin(2), signed(vehicle(1, 5), OWN))
-AFTER = FleetState(bulletin(3, 9), signed(vehicle(1, 6), OWN))
+KEY = bytes((2,)) * 32
+BEFORE = FleetState(bulletin(2), ((KEY, signed(vehicle(2), KEY)),))
+AFTER = FleetState(bulletin(3, 9), ((KEY, signed(vehicle(2, 3), KEY)),))
 
 
 @pytest.fixture
@@ -27,20 +28,18 @@ def path(tmp_path: Path) -> Path:
 
 
 def start(path: Path) -> tuple[FleetState, str]:
-    """What a daemon knows after its start, and what it reports. Its configuration has the bulletin 1 and serial 1."""
+    """What a daemon knows after its start, and what it reports. Its configuration has the bulletin 1."""
     trust = Trust(AUTHORITY, OWN, signed(vehicle(1), OWN), bulletin(1))
     problem = state_file.read(path, trust)
-    assert trust.own is not None
-    return FleetState(trust.bulletin_bytes, trust.own.data), problem
+    members = tuple((key, held.data) for key, held in trust.roster.values())
+    return FleetState(trust.bulletin_bytes, members), problem
 
 
-CONFIGURED = FleetState(bulletin(1), signed(vehicle(1), OWN))
+CONFIGURED = FleetState(bulletin(1))
 
 
 @pytest.mark.parametrize(
-    "state",
-    [BEFORE, FleetState(bulletin(2, *range(2, 2 + MOST_REVOKED)), BEFORE.certificate)],
-    ids=["usual", "longest"],
+    "state", [BEFORE, FleetState(bulletin(2, *range(3, 3 + MOST_REVOKED)))], ids=["usual", "longest"]
 )
 def test_state_is_read_back(path: Path, state: FleetState) -> None:
     """Without a file, what the configuration has counts. Beside the file, nothing is left."""
@@ -52,8 +51,8 @@ def test_state_is_read_back(path: Path, state: FleetState) -> None:
 
 
 def test_older_state(path: Path) -> None:
-    """The configuration counts where it is newer. A daemon without a certificate writes none."""
-    state_file.write(path, FleetState(bulletin(0), b""))
+    """The configuration counts where it is newer."""
+    state_file.write(path, FleetState(bulletin(0)))
     assert start(path) == (CONFIGURED, "")
 
 
@@ -69,7 +68,7 @@ def variants(data: bytes) -> Iterator[bytes]:
 def test_damaged_file_counts_as_absent(path: Path) -> None:
     """The cause is reported."""
     state_file.write(path, BEFORE)
-    trust = Trust(AUTHORITY, OWN, CONFIGURED.certificate, CONFIGURED.bulletin)
+    trust = Trust(AUTHORITY, OWN, b"", CONFIGURED.bulletin)
     for data in variants(path.read_bytes()):
         path.write_bytes(data)
         assert state_file.read(path, trust) == f"{path} is incomplete, or was not written by uavlinkd"
@@ -86,8 +85,8 @@ def test_damaged_file_counts_as_absent(path: Path) -> None:
     ],
 )
 def test_foreign_file_counts_as_absent(path: Path, data: bytes, verdict: str) -> None:
-    """Its certificate is not used either."""
-    state_file.write(path, FleetState(data, AFTER.certificate))
+    """Its members are not used either."""
+    state_file.write(path, FleetState(data, AFTER.members))
     state, problem = start(path)
     assert state == CONFIGURED
     assert problem.endswith(f"contradicts the configuration ({verdict})")
@@ -220,14 +219,3 @@ def test_power_cut_at_every_step(tmp_path: Path, is_first: bool) -> None:
             break
     before = CONFIGURED if is_first else BEFORE
     assert outcomes == [{before}, {before}, {before}, {before, AFTER}, {AFTER}]
-
-
-def test_newest_certificates_of_contacts(path: Path) -> None:
-    """That in the configuration may be refused by now. Another member's, or that of no contact, is not held."""
-    keys = [bytes((number,)) * 32 for number in (2, 3, 4)]
-    newest = tuple((key, signed(vehicle(system, 9 + system), key)) for system, key in enumerate(keys, 2))
-    state_file.write(path, FleetState(bulletin(4, least=5), AFTER.certificate, newest))
-    trust = Trust(AUTHORITY, OWN, CONFIGURED.certificate, CONFIGURED.bulletin)
-    contacts = {keys[0]: signed(vehicle(2), keys[0]), keys[1]: signed(vehicle(7), keys[1])}
-    assert state_file.read(path, trust, contacts) == ""
-    assert {key: held.data for key, held in trust.held.items()} == {keys[0]: newest[0][1]}

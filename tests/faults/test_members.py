@@ -29,8 +29,7 @@ async def test_clocks_have_no_effect(tmp_path: Path) -> None:
         for vehicle, day in years.items():
             (started,) = vehicle.events("daemon_started")
             assert started["timestamp"].startswith(day)
-            contact, own = fleet.certificates["ground"][:2], fleet.certificates[vehicle.name][1]
-            state_file.write(tmp_path / "state", FleetState(fleet.bulletin, own, (contact,)))
+            state_file.write(tmp_path / "state", FleetState(fleet.bulletin))
             name = vehicle.name
             await ground.until(lambda status, name=name: status["fleet"]["bulletins"][name] == fleet.number)  # type: ignore[misc]
             await vehicle.stop()

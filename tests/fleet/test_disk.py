@@ -11,7 +11,7 @@ from uavlinkd.authority.state_file import FleetState
 from uavlinkd.fleet.disk import FleetDisk
 from uavlinkd.system.clock import monotonic
 
-FIRST, SECOND = FleetState(b"first", b"", ()), FleetState(b"second", b"", ())
+FIRST, SECOND = FleetState(b"first"), FleetState(b"second")
 
 
 async def test_fault_costs_one_write(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from tests.fleet.vehicles import NAMES, RELAY, Vehicles, flying, join, renew, unasked
+from tests.fleet.vehicles import NAMES, RELAY, Vehicles, flying, join, unasked
 from tests.waiting import until
 from uavlinkd.fleet import operations
 from uavlinkd.lab.sim.loopback_ports import free_port
@@ -51,18 +51,6 @@ async def test_key_is_replaced(vehicles: Vehicles) -> None:
     await vehicles.stop("drone1")
     await vehicles.start("drone1")
     await vehicles.until_linked()
-
-
-async def test_all_are_signed_again(vehicles: Vehicles) -> None:
-    """Each gets its new certificate from the relay, and no link ends. A line has the relay's for the next start."""
-    operations.revoke(vehicles.fleet, "drone2", unasked, resign=True)
-    await published(vehicles)
-    await until(lambda: vehicles.up("drone1") == {"drone3"} and "drone2" not in vehicles.up(RELAY))
-    renew(vehicles.fleet, "drone1")
-    vehicles.carry("drone1")
-    await vehicles.stop("drone1")
-    await vehicles.start("drone1")
-    await until(lambda: vehicles.up("drone1") == {"drone3"} and "drone1" in vehicles.up("drone3"))
 
 
 async def test_enrolled_member_joins(vehicles: Vehicles) -> None:

@@ -191,7 +191,7 @@ def test_values_of_the_user_are_kept(folder: Path) -> None:
     before = tomllib.loads(path.read_text())
     join(folder, "other", RELAY)
     join(folder, "drone1", replaces=True)
-    operations.revoke(folder, "relay", unasked, resign=True)
+    operations.revoke(folder, "relay", unasked)
     renew(folder, "drone1")
     after = tomllib.loads(path.read_text())
     assert after["fleet"].pop("deny") == ["drone9", "drone8"]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import shutil
-import time
 from base64 import b64decode, b64encode
 from collections.abc import AsyncIterator
 from pathlib import Path
@@ -116,22 +115,6 @@ def test_removal_without_a_service_revokes(
     assert main(["fleet", "remove", "drone2"]) == 1
     assert "drone2 is revoked, by bulletin 2." in capsys.readouterr().out
     assert read_manifest(tmp_path / "fleet").former("drone2") is not None
-
-
-async def test_new_certificates_come_before_the_bulletin_that_ends_the_old_ones(
-    daemon: Daemon, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """In several requests: one has room for 45. The bulletin waits for them to arrive."""
-    waited: list[tuple[float, int, int]] = []
-
-    def wait(wait_s: float) -> None:
-        waited.append((wait_s, len(daemon.certificates), daemon.trust.bulletin.number))
-
-    monkeypatch.setattr(time, "sleep", wait)
-    operations.revoke(daemon.socket.parent / "fleet", "drone7", unasked, resign=True)
-    assert await published(daemon) == 2
-    assert waited == [(operations.SETTLE_S, 40, 1)]
-    assert daemon.trust.bulletin.refuses(41)
 
 
 async def test_older_folder_is_refused_unless_it_is_merged(daemon: Daemon) -> None:

@@ -133,29 +133,34 @@ def test_replaced_key_is_revoked_by_the_same_change(fleet: Fleet) -> None:
     assert promoted.member("v7").ids == "254"
 
 
-def test_full_bulletin_names_what_empties_it(fleet: Fleet) -> None:
-    """All others get new certificates; the former ones are below the least serial."""
+def test_full_bulletin_begins_at_the_oldest_member(fleet: Fleet) -> None:
+    """Lower serials need no place. An oldest member that is in the way is named: a new key for it makes room."""
     for number in range(MOST_REVOKED):
         name = f"lost{number}x"
         fleet = signed(fleet, name, Identity(ids=(1, 1)))
-        fleet = revoke(fleet, SIGNER, [fleet.member(name)])
+        fleet = revoke(fleet, SIGNER, fleet.member(name))
     assert len(fleet.bulletin.revoked) == MOST_REVOKED
-    with pytest.raises(FleetError, match="--resign"):
-        revoke(fleet, SIGNER, [fleet.member("v7")])
-    after = revoke(fleet, SIGNER, [fleet.member("v7")], resign=True)
+    with pytest.raises(FleetError, match=r"since that of relay: first give relay a new key .*--replace relay"):
+        revoke(fleet, SIGNER, fleet.member("v7"))
+    for name in ("relay", "station"):
+        with pytest.raises(FleetError, match=f"--replace {name}"):
+            revoke(fleet, SIGNER, fleet.member("v7"))
+        fleet = signed(fleet, name, key=key_of(f"new {name}"), replaces=True)
+    after = revoke(fleet, SIGNER, fleet.member("v7"))
     check(after)
-    assert (after.bulletin.revoked, after.bulletin.number) == ((), fleet.bulletin.number + 1)
     assert not fleet.bulletin.shrinks(after.bulletin)
+    assert after.bulletin.revoked == ()
+    assert after.bulletin.least == after.member("relay").certificate.serial
     assert [member.name for member in after.current] == ["relay", "station"]
-    assert all(after.bulletin.refuses(member.certificate.serial) for member in fleet.members)
-    with pytest.raises(FleetError, match="is that of v7, which is revoked"):
-        signed(after, "v8", key=key_of("v7"))
+    for key in (key_of("v7"), key_of("relay"), key_of("lost1x")):
+        with pytest.raises(FleetError, match=r"which is revoked"):
+            signed(after, "v8", key=key)
 
 
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
-        ({"next_serial": LARGEST_OFFSET + 2}, "--resign"),
+        ({"next_serial": LARGEST_OFFSET + 2}, "--replace relay"),
         ({"next_serial": LAST_SERIAL + 1}, "signed its last certificate"),
     ],
 )
@@ -164,7 +169,7 @@ def test_numbers_that_do_not_fit_are_refused(fleet: Fleet, changes: dict[str, An
 
     def exceed(fleet: Fleet) -> None:
         fleet = signed(replace(fleet, **changes), "v8")
-        revoke(fleet, SIGNER, [fleet.member("v8")])
+        revoke(fleet, SIGNER, fleet.member("v8"))
 
     with pytest.raises(FleetError, match=reason):
         exceed(fleet)
@@ -174,15 +179,15 @@ def test_last_bulletin_of_a_generation(fleet: Fleet) -> None:
     """The next number would be the successor's."""
     last = replace(fleet, bulletin=fleet.bulletin._replace(number=GENERATION - 1))
     with pytest.raises(FleetError, match="signed its last bulletin"):
-        revoke(last, SIGNER, [last.member("v7")])
+        revoke(last, SIGNER, last.member("v7"))
 
 
 @pytest.mark.parametrize("ahead", [0, 3])
 def test_two_copies_are_merged(fleet: Fleet, ahead: int) -> None:
     """The union is newer than both, and revokes what either does. No serial of the other copy is used again."""
     fleet = signed(fleet, "v8")
-    here = revoke(fleet, SIGNER, [fleet.member("v7")])
-    there = revoke(fleet, SIGNER, [fleet.member("v8")]).bulletin
+    here = revoke(fleet, SIGNER, fleet.member("v7"))
+    there = revoke(fleet, SIGNER, fleet.member("v8")).bulletin
     there = there._replace(number=there.number + ahead, revoked=(*there.revoked, 90))
     union = merge(here, SIGNER, there)
     check(union)

@@ -81,7 +81,7 @@ class HostileMembers:
         """A session with a member; if it was removed, also its limits begin."""
         if key not in self.began:
             self.began[key] = self.now
-            self.allowed_checks += 2
+            self.allowed_checks += 1
         self.exchange.on_handshake(key, self.now)
 
     def step(self, script: Script) -> None:
@@ -133,7 +133,7 @@ class HostileMembers:
     def _react(self, reaction: Reaction) -> None:
         for key in reaction.ended:
             self.began.pop(key, None)
-            for kind in (Have, BulletinRecord, CertificateRecord):
+            for kind in (Have, BulletinRecord):
                 del self.sent[key, kind]
 
     def _pass(self, seconds: float) -> None:
@@ -141,7 +141,7 @@ class HostileMembers:
         while self.exchange.next_at <= until:
             self.now = max(self.now, self.exchange.next_at)
             self._send()
-        self.allowed_checks += 2 * len(KEYS) * seconds / CHECKS_APART_S
+        self.allowed_checks += len(KEYS) * seconds / CHECKS_APART_S
         self.now = until
 
     def _send(self) -> None:
@@ -153,7 +153,7 @@ class HostileMembers:
                 assert record.number == self.persisted, "a have that is not on the disk"
                 most = 1 + seconds / HAVE_APART_S
             else:
-                most = (1 + seconds / LEAST_WAIT_S) * (1 + isinstance(record, CertificateRecord))
+                most = 1 + seconds / LEAST_WAIT_S
             assert self.sent[key, type(record)] <= most + 1e-6, f"too many of {type(record).__name__}"
         assert self.exchange.next_at > self.now, "it waits for a moment in the past"
 
@@ -221,5 +221,5 @@ def signed_seeds() -> list[bytes]:
     """One of each kind."""
     (_, certificate), data = CERTIFICATES[0], BULLETINS[5]
     records = (Have(7, b"abcd", 1, 2), BulletinRecord(data), CertificateRecord(OWN, certificate), Who(4, 9))
-    state = state_file._encode(state_file.FleetState(data, certificate))
+    state = state_file._encode(state_file.FleetState(data, ((OWN, certificate),)))
     return [certificate, data, *(record.encode() for record in records), state, state.rpartition(b"\n")[0][:-64]]

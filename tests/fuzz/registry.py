@@ -32,7 +32,7 @@ _TARGETS: Final = (
     Target("relay", "a relay: strangers, and members that hold their keys", relays.make, 512),
     Target("handles", "the handles that a hostile relay assigns", handles.make, 1024),
     Target("candidates", "the candidates of a peer that holds its keys", candidates.make, 1024),
-    Target("exchange", "bulletins and certificates from hostile members", fleets.make_exchange, 1024),
+    Target("exchange", "bulletins from hostile members", fleets.make_exchange, 1024),
     Target(
         "signed", "what an authority signs, and its records", fleets.make_signed, 700, (), False, fleets.signed_seeds
     ),

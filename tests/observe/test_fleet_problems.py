@@ -21,7 +21,6 @@ from uavlinkd.authority.certificates import MemberRole, digest_of
 from uavlinkd.authority.constants import CONTACTS_FIRST_S, HAVE_INTERVAL_S
 from uavlinkd.config.keys import encode_key
 from uavlinkd.fleet.members import EVENT_S, FleetMembers
-from uavlinkd.fleet.shell import FleetShell
 from uavlinkd.observe.finding import Severity, Subject
 from uavlinkd.protocol.drops import Drop, DropReason
 from uavlinkd.protocol.outputs import Dropped, RecordReceived
@@ -44,11 +43,18 @@ class Member(Daemon):
         assert self.config.fleet is not None
         self.relays: dict[str, Any] = {}
         shell = SimpleNamespace(by_name=self.relays)
-        known = self.node, self.links, cast(Any, shell), relay, self.evidence
-        self.membership: Any = SimpleNamespace()
-        self.fleet = FleetMembers(
-            self.config, self.config.fleet, FleetShell(*known, self.membership, lambda outputs: None)
+        parts = SimpleNamespace(
+            config=self.config,
+            node=self.node,
+            links=self.links,
+            relays=shell,
+            relay=relay,
+            evidence=self.evidence,
+            line=SimpleNamespace(perform=lambda outputs: None),
         )
+        self.fleet = FleetMembers(cast(Any, parts), self.config.fleet)
+        self.membership: Any = SimpleNamespace()
+        self.fleet.peers = cast(Any, self.membership)
         self.parts.fleet = self.fleet
         self.key = self.link.key
         self.fleet.exchange.on_handshake(self.key, NOW)
@@ -204,7 +210,7 @@ async def test_state_that_cannot_be_written(tmp_path: Path) -> None:
 
 async def test_state_that_cannot_be_used(tmp_path: Path) -> None:
     """That of another fleet counts as absent and is replaced, and a finding says why until a bulletin comes."""
-    foreign = state_file.FleetState(b64decode(bulletin(5, signer=OTHER_SIGNER)), b"")
+    foreign = state_file.FleetState(b64decode(bulletin(5, signer=OTHER_SIGNER)))
     state_file.write(tmp_path / "drone0.fleet-state", foreign)
     member = Member(tmp_path)
     await until_written(member.fleet)

@@ -8,7 +8,7 @@ import pytest
 
 from tests.processes.frames import frame
 from tests.processes.harness import Stage
-from tests.processes.members import CertifiedFleet, Swarm, is_up, start_swarm
+from tests.processes.members import CertifiedFleet, is_up
 from uavlinkd.authority.certificates import MemberRole
 from uavlinkd.system.base64_text import to_base64
 
@@ -46,33 +46,3 @@ async def test_members_meet_at_a_relay(stage: Stage) -> None:
     await ground.start()
     known = (await ground.ready())["fleet"]
     assert (known["number"], set(known["absent"])) == (2, {"v2"}), "both are on its disk"
-
-
-@pytest.fixture
-async def swarm(stage: Stage) -> Swarm:
-    """No vehicle listens."""
-    return await start_swarm(stage, [])
-
-
-async def test_members_get_newer_certificates(swarm: Swarm) -> None:
-    """All get new certificates, each along live links. Then the least serial rises: no link ends."""
-    fleet, *daemons = swarm
-    ground = daemons[0]
-    before = [(await daemon.status())["peers"] for daemon in daemons]
-    await ground.ask(fleet.renew(*daemons))
-    for daemon in daemons:
-        await daemon.until(
-            lambda status: min(status["fleet"]["serial"], *status["fleet"]["held"].values()) > 3  # all are new
-        )
-    await ground.ask(fleet.raise_least(4))
-    for daemon in daemons:
-        await daemon.until(lambda status: {2, *status["fleet"]["bulletins"].values()} == {2})
-    after = [(await daemon.status())["peers"] for daemon in daemons]
-    for earlier, later in zip(before, after, strict=True):
-        assert {name: peer["handshakes"] for name, peer in earlier.items()} == {
-            name: peer["handshakes"] for name, peer in later.items()
-        }
-    assert {peer["state"] for peer in after[1].values()} == {"up"}
-    await daemons[1].stop()
-    await daemons[1].start()  # its file has a certificate of its contact that is refused now
-    await daemons[1].until(lambda status: is_up(status, "ground", "v2"))

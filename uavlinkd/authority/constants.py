@@ -13,7 +13,7 @@ PUSH_JITTER_S = 0.1
 PUSH_AGAIN_S = 0.2
 PUSH_TRIES = 10
 BULLETIN_LEAST_S = 1.0
-"""A captured member causes one signature check a second, 60 µs, for bulletins and for the certificate of each end."""
+"""A captured member causes one signature check a second, 60 µs."""
 WHO_INTERVAL_S = 600.0
 """Members that come later ask too, and are introduced by their binds: this is for losses."""
 WHO = Rate(4.0, 40)

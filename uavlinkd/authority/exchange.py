@@ -1,4 +1,4 @@
-"""How bulletins and newer certificates reach the peers of one daemon. README.md, "Bulletins".
+"""How bulletins reach the peers of one daemon. README.md, "Bulletins".
 
 Each end states what it has when a session begins and when that changes; the end with the newer one sends it, until
 the other states that it has it. The static public key of a peer names it. Pure: no I/O, no clock, no random source of
@@ -8,7 +8,7 @@ its own.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import inf
 from typing import NamedTuple
 
@@ -16,7 +16,7 @@ from uavlinkd.authority import constants as c
 from uavlinkd.authority.trust import BulletinVerdict, Trust
 from uavlinkd.protocol.crypto import Entropy
 from uavlinkd.protocol.drops import Drop, DropReason
-from uavlinkd.protocol.relay_records import BulletinRecord, CertificateRecord, FleetRecord, Have
+from uavlinkd.protocol.relay_records import BulletinRecord, FleetRecord, Have
 
 ROLLED_BACK = "bulletin_rolled_back"
 """A peer has an older bulletin than it had before: its disk was restored."""
@@ -28,7 +28,7 @@ class Reaction(NamedTuple):
     ended: tuple[bytes, ...] = ()
     """The peers with these keys end at once, without a close. The exchange has forgotten them."""
     persists: bool = False
-    """The bulletin and the own certificate are to be written, then :meth:`BulletinExchange.note_persisted`."""
+    """The bulletin is to be written, then :meth:`BulletinExchange.note_persisted`."""
     event: str = ""
     """For the log: ``bulletin_conflict``, ``bulletin_shrinks`` or ``bulletin_rolled_back``."""
 
@@ -46,9 +46,7 @@ class _Peer:
     tries: int = 0
     owes_have: bool = False  # whether this end has to state what it has
     have_sent_at: float = -inf
-    bulletin_verified_at: float = -inf
-    certificate_verified_at: dict[bytes, float] = field(default_factory=dict)
-    """By the key that it certifies: the peer's or the own one."""
+    verified_at: float = -inf
 
     @property
     def next_at(self) -> float:
@@ -61,8 +59,8 @@ class BulletinExchange:
 
     Look at :attr:`next_at` after each call: :meth:`do_due` alone returns records to send.
 
-    ``trust``: its bulletin and own certificate are on the disk. ``wait_s``: how long the answer to what the peer with
-    this key lacks may take, at least.
+    ``trust``: its bulletin is on the disk. ``wait_s``: how long the answer to a bulletin for the peer with this key
+    may take, at least.
     """
 
     def __init__(self, trust: Trust, entropy: Entropy, wait_s: Callable[[bytes], float] = lambda _: 0.0) -> None:
@@ -108,20 +106,17 @@ class BulletinExchange:
     # Receipt.
 
     def receive(self, key: bytes, record: FleetRecord, order: int, now: float) -> Reaction:
-        """A peer sent *have*, a bulletin, or a certificate for its own key or this daemon's.
+        """A peer sent *have* or a bulletin.
 
         ``order``: that of :class:`~uavlinkd.protocol.outputs.RecordReceived`. Raises Drop if the record has no
         effect.
         """
         peer = self._peers.get(key)
-        if peer is None or not peer.is_up:
-            raise Drop(DropReason.UNEXPECTED_RECORD)
-        if isinstance(record, Have):
-            return self._receive_have(key, peer, record, order, now)
-        if isinstance(record, BulletinRecord):
-            return self._receive_bulletin(peer, record.bulletin, now)
-        if isinstance(record, CertificateRecord):
-            return self._receive_certificate(key, peer, record, now)
+        if peer is not None and peer.is_up:
+            if isinstance(record, Have):
+                return self._receive_have(key, peer, record, order, now)
+            if isinstance(record, BulletinRecord):
+                return self._receive_bulletin(peer, record.bulletin, now)
         raise Drop(DropReason.UNEXPECTED_RECORD)
 
     def _receive_have(self, key: bytes, peer: _Peer, have: Have, order: int, now: float) -> Reaction:
@@ -132,10 +127,10 @@ class BulletinExchange:
         peer.order, peer.have, peer.stated = order, have, have.number
         if not is_repeated:
             peer.tries = 0
-        wait_s = self._wait_s(key)
-        if self._lacks(key, peer):
+        wait_s, own = self._wait_s(key), self._trust.bulletin.number
+        if have.number < own:
             peer.push_at = max(now, peer.pushed_at + wait_s)
-        elif self._asks(peer):
+        elif have.number > own:
             peer.push_at = min(peer.push_at, now + wait_s)
         else:
             peer.push_at = inf
@@ -147,12 +142,12 @@ class BulletinExchange:
         return Reaction(event="" if is_repeated else self._conflict([peer]))
 
     def _receive_bulletin(self, peer: _Peer, data: bytes, now: float) -> Reaction:
-        may_verify = now >= peer.bulletin_verified_at + c.BULLETIN_LEAST_S
+        may_verify = now >= peer.verified_at + c.BULLETIN_LEAST_S
         verdict, ended = self._trust.receive_bulletin(data, may_verify=may_verify)
         if verdict is BulletinVerdict.UNVERIFIED:
             raise Drop(DropReason.RECORD_OVER_LIMIT)
         if verdict is not BulletinVerdict.KNOWN:
-            peer.bulletin_verified_at = now
+            peer.verified_at = now
         if verdict is BulletinVerdict.INVALID:
             raise Drop(DropReason.BAD_CONTROL)
         peer.owes_have |= self._persisted[0] == self._trust.bulletin.number  # else when it is written
@@ -169,9 +164,14 @@ class BulletinExchange:
         return verdict, self._accepted(ended, now) if verdict is BulletinVerdict.NEWER else Reaction()
 
     def _accepted(self, ended: list[bytes], now: float) -> Reaction:
+        """Send each peer the new bulletin, a little later: it may come from others until then."""
         for key in ended:
             self.forget(key)
-        self._plan_all(now)
+        for key, peer in self._peers.items():
+            if peer.is_up:
+                soon = now + c.PUSH_JITTER_S * self._entropy(1)[0] / 255
+                peer.tries, peer.push_at = 0, max(soon, peer.pushed_at + self._wait_s(key))
+                self._note(peer)
         return Reaction(tuple(ended), persists=True, event=self._conflict(self._peers.values()))
 
     def _conflict(self, peers: Iterable[_Peer]) -> str:
@@ -181,54 +181,12 @@ class BulletinExchange:
         is_other = any(have.number == own[0] and have.digest != own[1] for have in stated)
         return BulletinVerdict.CONFLICT.value if is_other else ""
 
-    def _receive_certificate(self, key: bytes, peer: _Peer, record: CertificateRecord, now: float) -> Reaction:
-        trust, is_own = self._trust, record.key == self._trust.own_key
-        held = trust.own if is_own else trust.held.get(key)
-        if record.key not in (trust.own_key, key) or held is None:
-            raise Drop(DropReason.UNEXPECTED_RECORD)
-        peer.owes_have = True
-        self._note(peer)
-        if record.certificate == held.data:
-            return Reaction()
-        if now < peer.certificate_verified_at.get(record.key, -inf) + c.BULLETIN_LEAST_S:
-            raise Drop(DropReason.RECORD_OVER_LIMIT)
-        peer.certificate_verified_at[record.key] = now
-        if not is_own:
-            ended = trust.hold(key, record.certificate)
-            if key in ended:  # it has another name, role or ids now: it has to show that in a handshake
-                del trust.held[key]
-            for other in ended:
-                self.forget(other)
-            return Reaction(tuple(ended))
-        if not trust.replace_own(record.certificate):
-            raise Drop(DropReason.BAD_CERTIFICATE)
-        self.note_own_certificate(now)
-        return Reaction(persists=True)
-
-    # Own changes.
-
     def note_persisted(self, number: int, digest: bytes) -> None:
         """The bulletin with this number is on the disk. Before, no *have* states it."""
         self._persisted = number, digest
-        self._owe_all()
-
-    def note_own_certificate(self, now: float) -> None:
-        """The own certificate was replaced: peers that hold the one before get it."""
-        self._owe_all()
-        self._plan_all(now)
-
-    def _owe_all(self) -> None:
         for peer in self._peers.values():
             peer.owes_have |= peer.is_up
             self._note(peer)
-
-    def _plan_all(self, now: float) -> None:
-        """Send each peer what it lacks, a little later: it may come from others until then."""
-        for key, peer in self._peers.items():
-            if peer.is_up:
-                soon = now + c.PUSH_JITTER_S * self._entropy(1)[0] / 255
-                peer.tries, peer.push_at = 0, max(soon, peer.pushed_at + self._wait_s(key))
-                self._note(peer)
 
     def _wait_s(self, key: bytes) -> float:
         """How long to wait for an answer of a peer before a repetition."""
@@ -240,23 +198,26 @@ class BulletinExchange:
     # Sending.
 
     def do_due(self, now: float) -> list[tuple[bytes, FleetRecord]]:
-        """The records to send now, each with the key of its receiver."""
+        """The records to send now, each with the key of its receiver.
+
+        A peer that is behind gets the bulletin. One that stated nothing yet, or is ahead, gets *have*, which asks it.
+        """
         sent: list[tuple[bytes, FleetRecord]] = []
+        own = self._trust.bulletin.number
         for key, peer in self._peers.items():
-            if peer.next_at > now:
-                continue
-            records: list[FleetRecord] = []
             if peer.push_at <= now:
-                records, asks = self._lacks(key, peer), self._asks(peer)
-                peer.pushed_at = now if records else peer.pushed_at
-                peer.owes_have |= asks
+                is_behind = peer.have is not None and peer.have.number < own
+                is_asked = peer.have is None or peer.have.number > own
+                if is_behind:
+                    sent.append((key, BulletinRecord(self._trust.bulletin_bytes)))
+                    peer.pushed_at = now
+                peer.owes_have |= is_asked
                 peer.tries += 1
                 least_s = 0.0 if peer.tries < c.PUSH_TRIES else c.HAVE_INTERVAL_S
-                peer.push_at = now + max(least_s, self._wait_s(key)) if records or asks else inf
+                peer.push_at = now + max(least_s, self._wait_s(key)) if is_behind or is_asked else inf
             if peer.owes_have and now >= peer.have_sent_at + c.HAVE_LEAST_S:
-                records.append(self._have(key))
+                sent.append((key, self._have(key)))
                 peer.owes_have, peer.have_sent_at = False, now
-            sent += [(key, record) for record in records]
         self.next_at = min((peer.next_at for peer in self._peers.values()), default=inf)
         return sent
 
@@ -264,26 +225,3 @@ class BulletinExchange:
         own, held = self._trust.own, self._trust.held.get(key)
         serials = (0 if one is None else one.certificate.serial for one in (own, held))
         return Have(*self._persisted, *serials)
-
-    def _lacks(self, key: bytes, peer: _Peer) -> list[FleetRecord]:
-        """What a peer does not have, as far as this end knows."""
-        trust, have = self._trust, peer.have
-        if have is None:
-            return []
-        records: list[FleetRecord] = []
-        held, own = trust.held.get(key), trust.own
-        if held is not None and have.serial < held.certificate.serial:
-            records.append(CertificateRecord(key, held.data))
-        if own is not None and 0 < have.known < own.certificate.serial:
-            records.append(CertificateRecord(trust.own_key, own.data))
-        # The bulletin may refuse the certificates that these replace. Then the peer could not get them afterwards.
-        if have.number < trust.bulletin.number and (not records or peer.tries >= c.PUSH_TRIES - 1):
-            records.append(BulletinRecord(trust.bulletin_bytes))
-        return records
-
-    def _asks(self, peer: _Peer) -> bool:
-        """Whether the peer did not state what it has yet, or has more than this end: *have* asks for it."""
-        have, own = peer.have, self._trust.own
-        if have is None or have.number > self._trust.bulletin.number:
-            return True
-        return own is not None and have.known > own.certificate.serial

@@ -1,26 +1,23 @@
-"""The file with the newest bulletin and the newest own certificate, for the next start. README.md, "Start and state".
+"""The file with the newest bulletin, for the next start. README.md, "Start and state".
 
-A text: what it is, the bulletin and the certificate in base64, a line with the key and certificate of each contact
-and of each member of the roster, and a checksum of the lines before.
+A text: what it is, the bulletin in base64, a line with the key and certificate of each member of the roster, and a
+checksum of the lines before.
 """
 
 from __future__ import annotations
 
 from base64 import b64decode, b64encode
-from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from stat import S_ISREG
-from types import MappingProxyType
 from typing import NamedTuple
 
-from uavlinkd.authority.certificates import parse_certificate
-from uavlinkd.authority.trust import BulletinVerdict, Trust, is_same_member
+from uavlinkd.authority.trust import BulletinVerdict, Trust
 from uavlinkd.protocol.crypto import sha256
 from uavlinkd.protocol.drops import Drop
 from uavlinkd.system.folders import replace_file
 
-_TITLE = b"uavlinkd fleet state 1"
+_TITLE = b"uavlinkd fleet state 2"
 _MOST_BYTES = 65536  # of the file. The longest one has 260 members of 182 bytes.
 
 
@@ -28,16 +25,12 @@ class FleetState(NamedTuple):
     """The content of a file."""
 
     bulletin: bytes
-    certificate: bytes  # empty for a daemon that has none
     members: tuple[tuple[bytes, bytes], ...] = ()
-    """The key and the newest certificate of each contact and of each member of the roster.
-
-    A contact's certificate in the configuration may be below the least serial by now.
-    """
+    """The key and the certificate of each member of the roster."""
 
 
-def read(path: Path, trust: Trust, contacts: Mapping[bytes, bytes] = MappingProxyType({})) -> str:
-    """Let a daemon that starts know what the file has. ``contacts``: certificates of the configuration, by key.
+def read(path: Path, trust: Trust) -> str:
+    """Let a daemon that starts know what the file has.
 
     Returns the cause in words if it cannot be used, and nothing if it is used or absent.
     """
@@ -55,12 +48,9 @@ def read(path: Path, trust: Trust, contacts: Mapping[bytes, bytes] = MappingProx
     verdict, _ = trust.receive_bulletin(state.bulletin)
     if verdict not in (BulletinVerdict.NEWER, BulletinVerdict.KNOWN):
         return f"{path} has a bulletin of another fleet, or one that contradicts the configuration ({verdict.value})"
-    trust.replace_own(state.certificate)
-    for key, newest in state.members:
+    for key, certificate in state.members:
         with suppress(Drop):
-            trust.note(key, newest)
-            if key in contacts and is_same_member(parse_certificate(contacts[key]), parse_certificate(newest)):
-                trust.hold(key, newest)
+            trust.note(key, certificate)
     return ""
 
 
@@ -71,15 +61,15 @@ def write(path: Path, state: FleetState) -> None:
 
 def _encode(state: FleetState) -> bytes:
     members = (b" ".join(map(b64encode, member)) for member in state.members)
-    lines = b"\n".join((_TITLE, b64encode(state.bulletin), b64encode(state.certificate), *members, b""))
+    lines = b"\n".join((_TITLE, b64encode(state.bulletin), *members, b""))
     return lines + sha256(lines).hex().encode() + b"\n"
 
 
 def _parse(data: bytes) -> FleetState | None:
     try:
-        _, bulletin, certificate, *members, _, _ = data.split(b"\n")
+        _, bulletin, *members, _, _ = data.split(b"\n")
         pairs = [[b64decode(part) for part in member.split(b" ")] for member in members]
-        state = FleetState(b64decode(bulletin), b64decode(certificate), tuple((key, held) for key, held in pairs))
+        state = FleetState(b64decode(bulletin), tuple((key, held) for key, held in pairs))
     except ValueError:
         return None
     return state if _encode(state) == data else None

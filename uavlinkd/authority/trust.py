@@ -141,7 +141,7 @@ class Trust:
         if before is not None and certificate.serial <= before.certificate.serial:
             return []
         ended = [other for other, _ in self._rivals(key, certificate)]  # the same member before
-        if before is not None and not is_same_member(before.certificate, certificate):
+        if before is not None and not _is_same_member(before.certificate, certificate):
             ended.append(key)
         for other in ended:
             del self.held[other]
@@ -246,7 +246,7 @@ def _label(certificate: Certificate) -> str:
     return f"{certificate.name} (serial {certificate.serial})"
 
 
-def is_same_member(one: Certificate, other: Certificate) -> bool:
+def _is_same_member(one: Certificate, other: Certificate) -> bool:
     return one._replace(serial=0) == other._replace(serial=0)
 
 

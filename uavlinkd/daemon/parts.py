@@ -75,12 +75,12 @@ class DaemonParts:
         """Those that take part in the daemon's work, in the order in which they learn of an event."""
         self.path_kinds: list[PathKind] = []
         """The kinds of paths beside UDP."""
-        self.fleet: FleetMembers | None = None
-        """Who is a member by certificate; None without a fleet."""
         self.relay = self._relay_server()
         """That of this daemon, if it is one."""
         self.relays = self._relays()
         """Those that this daemon uses; None if the file has neither relays nor a fleet."""
+        self.fleet = self._fleet()
+        """Who is a member by certificate; None without a fleet."""
         self.serial = self._serial()
         """The serial networks, if there are any."""
         self.listener = self._listener()
@@ -115,6 +115,15 @@ class DaemonParts:
             relays.forward = None if self.relay is None else self.relay.forwarding.take
             line.unwrap = relays.unwrap
         return relays
+
+    def _fleet(self) -> FleetMembers | None:
+        if (fleet := self.config.fleet) is None:
+            return None
+        from uavlinkd.fleet.members import FleetMembers  # noqa: PLC0415
+
+        members = FleetMembers(self, fleet)
+        self.features.insert(0, members)  # others act on an event of a member that they must know
+        return members
 
     def _serial(self) -> SerialNetworks | None:
         lines = [network for network in self.config.networks if network.serial is not None]

@@ -21,14 +21,8 @@ class Peers:
     def __init__(self, parts: DaemonParts, carriage: Carriage) -> None:
         self._parts = parts
         self._carriage = carriage
-        if (fleet := parts.config.fleet) is not None:
-            from uavlinkd.fleet.members import FleetMembers  # noqa: PLC0415  only if configured
-            from uavlinkd.fleet.shell import FleetShell  # noqa: PLC0415  only if configured
-
-            assert parts.relays is not None, "a fleet may use relays"
-            known = parts.node, parts.links, parts.relays, parts.relay, parts.evidence
-            parts.fleet = FleetMembers(parts.config, fleet, FleetShell(*known, self, carriage.perform))
-            parts.features.insert(0, parts.fleet)
+        if parts.fleet is not None:
+            parts.fleet.peers = self
 
     def start(self) -> None:
         """Add all that the configuration has."""
@@ -37,8 +31,6 @@ class Peers:
             self._add_peer(peer)
         self._add_relays()
         self._follow_members()
-
-    # Members of the fleet: see :class:`.fleet_shell.Membership`.
 
     def add_member(self, config: PeerConfig, peer: Peer | None) -> None:
         """Carry frames to a member by certificate. ``peer``: it is in the core already."""

@@ -99,8 +99,7 @@ def _identity(options: argparse.Namespace) -> Identity:
 def _revoke(options: argparse.Namespace) -> None:
     """Run ``revoke`` or ``remove``."""
     ask = passphrase_from(options.passphrase_file)
-    resign = options.action == "revoke" and options.resign
-    before, fleet = operations.revoke(options.out, options.name, ask, resign=resign)
+    before, fleet = operations.revoke(options.out, options.name, ask)
     _say(f"{options.name} is revoked, by bulletin {fleet.bulletin.number}.")
     _note_contacts(before, fleet)
     if options.action == "revoke":

@@ -52,7 +52,6 @@ def add_fleet(fleet: argparse.ArgumentParser) -> None:
     remove = add("remove", "revoke a member, and publish the bulletin")
     for action in (revoke, remove):
         action.add_argument("name", metavar="NAME")
-    revoke.add_argument("--resign", action="store_true", help="sign all others again, which empties the bulletin")
     publish = add("publish", "hand the bulletin and the members to a running daemon, which passes the bulletin on")
     publish.add_argument("--merge", action="store_true", help="the fleet has a newer bulletin: sign the union")
     members = add("members", "print what a running daemon knows of its fleet, for `restore`", signs=False)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from contextlib import suppress
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from uavlinkd.authority import state_file
 from uavlinkd.authority.certificates import Certificate, parse_certificate, role_bits
@@ -21,7 +21,6 @@ from uavlinkd.config.model import Config, FleetConfig, PeerConfig
 from uavlinkd.daemon.features import Feature
 from uavlinkd.fleet.disk import FleetDisk
 from uavlinkd.fleet.member_questions import MemberQuestions
-from uavlinkd.fleet.shell import FleetShell
 from uavlinkd.protocol import constants as c
 from uavlinkd.protocol import outputs as o
 from uavlinkd.protocol.crypto import is_usable_public_key
@@ -33,6 +32,10 @@ from uavlinkd.protocol.settings import PeerSettings
 from uavlinkd.system.base64_text import from_base64
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.guard import run
+
+if TYPE_CHECKING:
+    from uavlinkd.daemon.parts import DaemonParts
+    from uavlinkd.daemon.peers import Peers
 
 EVENT_S: Final = 600.0
 """An event of bulletins is shown for so long, or until a newer bulletin counts."""
@@ -46,18 +49,22 @@ class FleetMembers(Feature):
 
     records = FleetRecord
 
-    def __init__(self, config: Config, fleet: FleetConfig, daemon: FleetShell) -> None:
+    peers: Peers
+    """The peers of the daemon, which this adds to and takes from."""
+
+    def __init__(self, parts: DaemonParts, fleet: FleetConfig) -> None:
+        config = parts.config
+        assert parts.relays is not None, "a fleet may use relays"
         self.config = fleet
-        self._node = daemon.node
-        self._links = daemon.links
-        self._relays = daemon.relays
-        self._relay = daemon.relay
+        self._node = parts.node
+        self._links = parts.links
+        self._relays = parts.relays
+        self._relay = parts.relay
         self._most_members = most_members(config)
-        self._membership = daemon.membership
-        self._perform = daemon.perform
-        self._evidence = daemon.evidence
+        self._perform = parts.line.perform
+        self._evidence = parts.evidence
         self.trust = Trust(fleet.authority, config.public_key, fleet.own.data, fleet.bulletin)
-        self._unread = self._read(fleet)
+        self._unread = state_file.read(fleet.state_file, self.trust)
         self.exchange = BulletinExchange(self.trust, os.urandom, self._wait_s)
         self._events: dict[str, tuple[float, str]] = {}
         """When something about bulletins was noticed last that a person has to know, and the name of the cause."""
@@ -69,9 +76,6 @@ class FleetMembers(Feature):
         self._hold_contacts(monotonic())
         self._show_certificate()
         self._disk.write()  # the configuration may have a newer bulletin
-
-    def _read(self, fleet: FleetConfig) -> str:
-        return state_file.read(fleet.state_file, self.trust, {one.key: one.certificate for one in fleet.contacts})
 
     @property
     def next_at(self) -> float:
@@ -108,8 +112,7 @@ class FleetMembers(Feature):
                 self._relay.end(key, now)
             if key not in leaving:  # it was a member of this relay only: it has to show its certificate again
                 self._end(key, now)
-        if self.trust.replace_own(fleet.own.data):
-            self.exchange.note_own_certificate(now)
+        self.trust.replace_own(fleet.own.data)
         self._show_certificate()
         met = [key for key in new - old if key in self.trust.held]  # from now on the configuration has their peers
         for key in (*self.trust.reserve(reserved(config, fleet)), *met):
@@ -125,7 +128,7 @@ class FleetMembers(Feature):
                 self._end(key, now)
                 continue
             if link is not None and (config_now := self._config_of(key)) != link.config:
-                self._membership.change_peer(config_now)
+                self.peers.change_peer(config_now)
             if self._relay is not None and key in self._relay.members:
                 self._serve(key, now)
 
@@ -243,7 +246,7 @@ class FleetMembers(Feature):
         if held.certificate.role in self.config.policies:
             if self.trust.note(key, held.data):
                 self._disk.write()
-            self._membership.add_member(self._config_of(key), peer)
+            self.peers.add_member(self._config_of(key), peer)
         self._serve(key, now)
 
     def _serve(self, key: bytes, now: float) -> None:
@@ -261,14 +264,12 @@ class FleetMembers(Feature):
         assert isinstance(peer, Peer)
         key = peer.settings.public_key
         try:
-            if isinstance(record, CertificateRecord) and record.key not in (key, self.trust.own_key):
+            if isinstance(record, CertificateRecord):
                 self._introduce(key, record, now)
             elif isinstance(record, Who):
                 return DropReason.UNEXPECTED_RECORD if self._relay is None else self._relay.on_record(received, now)
             elif isinstance(record, FleetRecord):
                 self._react(self.exchange.receive(key, record, received.order, now), now, peer.name)
-                if isinstance(record, CertificateRecord) and self._is_contact(key):
-                    self._disk.write()
         except Drop as drop:
             self._evidence.add_dropped(o.Dropped(drop.reason, peer, received.path, 1, drop.detail), now)
             return drop.reason
@@ -306,12 +307,7 @@ class FleetMembers(Feature):
             return {"error": "is not a bulletin in base64, or was cut"}
         for key, certificate in certificates:
             with suppress(Drop):
-                if key == self.trust.own_key and self.trust.replace_own(certificate):
-                    self._react(Reaction(persists=True), now)
-                for ended in self.trust.hold(key, certificate) if key in self.trust.held else ():
-                    self._end(ended, now)
                 self.trust.note(key, certificate)
-        self.exchange.note_own_certificate(now)
         self._disk.write()
         return {"verdict": self._publish(bulletin, now).value, "number": self.trust.bulletin.number}
 
@@ -327,11 +323,9 @@ class FleetMembers(Feature):
         if reaction.persists:
             self._events.clear()
             self._unread = ""
+            self._disk.write()
         if reaction.event:
             self._events[reaction.event] = now, who
-        if reaction.persists:
-            self._show_certificate()
-            self._disk.write()
 
     def _show_certificate(self) -> None:
         if self.trust.own is not None:
@@ -374,7 +368,7 @@ class FleetMembers(Feature):
                 if relay.config.settings.public_key == key:
                     self._relays.remove(name, now)
             for name in [name for name, link in self._links.items() if link.key == key]:
-                self._membership.remove_peer(name, closes=False)
+                self.peers.remove_peer(name, closes=False)
         finally:  # whatever failed before: the core accepts nothing of this key
             if (peer := self._node.find(key)) is not None:
                 self._node.remove_peer(peer, now, closes=False)
@@ -392,11 +386,8 @@ class FleetMembers(Feature):
         await self._disk.stop()
 
     def _state(self) -> FleetState:
-        held = self.trust.held
-        contacts = {one.key: held[one.key].data for one in self.config.contacts if one.key in held}
-        roster = {key: one.data for key, one in self.trust.roster.values()}
-        own = b"" if self.trust.own is None else self.trust.own.data
-        return FleetState(self.trust.bulletin_bytes, own, tuple((roster | contacts).items()))
+        roster = self.trust.roster.values()
+        return FleetState(self.trust.bulletin_bytes, tuple((key, held.data) for key, held in roster))
 
     def _on_written(self, state: FleetState) -> None:
         if state.bulletin == self.trust.bulletin_bytes:

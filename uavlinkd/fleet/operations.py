@@ -11,7 +11,6 @@ import os
 import secrets
 import shutil
 import sys
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -42,7 +41,6 @@ from uavlinkd.system.folders import replace_file
 from uavlinkd.system.terminal import printable
 
 _AT_ONCE = 30  # certificates in a request, which has at most 8,192 bytes
-SETTLE_S = 5.0  # members that are linked hand new certificates to each other within this time
 
 
 def init(folder: Path, suite: str, ask: Passphrase | None, *, swarm: bool = False) -> Secret:
@@ -93,14 +91,14 @@ def line_of(fleet: Fleet, name: str) -> str:
     return reply_for(fleet, fleet.member(name)).line()
 
 
-def revoke(folder: Path, name: str, ask: Passphrase, *, resign: bool = False) -> tuple[Fleet, Fleet]:
+def revoke(folder: Path, name: str, ask: Passphrase) -> tuple[Fleet, Fleet]:
     """Sign a bulletin that refuses a member, and return the fleet before and after it. Once more changes nothing."""
     with lock(folder):
         before = read_manifest(folder)
         if before.former(name) is not None:
             return before, before
         member = before.member(name)
-        after = signing.revoke(before, _signer(folder, before, ask), [member], resign=resign)
+        after = signing.revoke(before, _signer(folder, before, ask), member)
         _save(folder, after)
     return before, after
 
@@ -142,10 +140,7 @@ def publish(folder: Path, socket: Path, ask: Passphrase, *, merges: bool = False
             before = read_manifest(folder)
             fleet = signing.merge(before, _signer(folder, before, ask), bulletin)
             _save(folder, fleet)
-    # The certificates come first: a member that meets the bulletin with its old one would be refused.
     introduce(fleet, socket, theirs)
-    if fleet.bulletin.least > bulletin.least:  # all were signed again
-        time.sleep(SETTLE_S)
     verdict = ask_daemon(socket, f"publish {to_base64(fleet.published)}").get("verdict")
     if verdict not in (BulletinVerdict.NEWER.value, BulletinVerdict.KNOWN.value):
         raise FleetError(f"the daemon refused bulletin {fleet.bulletin.number}: {verdict}")

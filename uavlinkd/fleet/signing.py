@@ -89,7 +89,7 @@ def certify(
         raise FleetError(f"{name} has a URL: only a relay has one, beside its HOST:PORT, which is named first")
     member = Member(public_key, certificate, _certified(signer, certificate, public_key), addresses, relays)
     if former is not None:
-        fleet = revoke(fleet, signer, [former])
+        fleet = revoke(fleet, signer, former)
     kept = [other for other in fleet.members if other.public_key != public_key]
     fleet = replace(fleet, members=(*kept, member), next_serial=fleet.next_serial + 1)
     if not addresses and not fleet.contacts_of(name):
@@ -144,22 +144,9 @@ def _system_ids(
     return ids
 
 
-def revoke(fleet: Fleet, signer: SigningKey, members: Iterable[Member], *, resign: bool = False) -> Fleet:
-    """Sign a bulletin that refuses these members' certificates too.
-
-    ``resign``: sign a new certificate for each other member, and a bulletin that refuses all older ones.
-    """
-    revoked = {member.certificate.serial for member in members}
-    if not resign:
-        return _publish(fleet, signer, fleet.bulletin.least, revoked)
-    least, renewed = fleet.next_serial, dict[int, Member]()
-    for member in fleet.current:
-        if (serial := member.certificate.serial) not in revoked:
-            certificate = member.certificate._replace(serial=least + len(renewed))
-            signed = _certified(signer, certificate, member.public_key)
-            renewed[serial] = replace(member, certificate=certificate, signed=signed)
-    members = tuple(renewed.get(member.certificate.serial, member) for member in fleet.members)
-    return _publish(replace(fleet, members=members, next_serial=least + len(renewed)), signer, least, set())
+def revoke(fleet: Fleet, signer: SigningKey, member: Member) -> Fleet:
+    """Sign a bulletin that refuses a member's certificate too."""
+    return _publish(fleet, signer, {member.certificate.serial})
 
 
 def bulletin_of(fleet: Fleet, text: str) -> Bulletin:
@@ -173,24 +160,30 @@ def bulletin_of(fleet: Fleet, text: str) -> Bulletin:
 def merge(fleet: Fleet, signer: SigningKey, other: Bulletin) -> Fleet:
     """Sign the union of the fleet's bulletin and another one, which another copy of the folder signed."""
     newest = other if other.number > fleet.bulletin.number else fleet.bulletin
-    least = max(fleet.bulletin.least, other.least)
-    serial = max(fleet.next_serial, least, *(serial + 1 for serial in other.revoked), 1)
-    fleet = replace(fleet, next_serial=serial)
-    return _publish(fleet, signer, least, {*other.revoked}, number=newest.number)
+    serial = max(fleet.next_serial, other.least, *(serial + 1 for serial in other.revoked), 1)
+    fleet = replace(fleet, next_serial=serial, bulletin=fleet.bulletin._replace(number=newest.number))
+    return _publish(fleet, signer, {*other.revoked}, other.least)
 
 
-def _publish(fleet: Fleet, signer: SigningKey, least: int, revoked: set[int], number: int = 0) -> Fleet:
-    number = (number or fleet.bulletin.number) + 1
-    serials = tuple(sorted(serial for serial in {*fleet.bulletin.revoked, *revoked} if serial >= least))
-    if len(serials) > MOST_REVOKED or (serials and serials[-1] - least > LARGEST_OFFSET):
-        raise FleetError(
-            f"the bulletin is full, with {MOST_REVOKED} certificates: `uavlinkd fleet revoke NAME --resign` signs a"
-            " new one for each other member, and empties it"
-        )
+def _publish(fleet: Fleet, signer: SigningKey, revoked: set[int], least: int = 0) -> Fleet:
+    """Sign the next bulletin. One that would be full gets the serial of the oldest member as its least serial."""
+    number = fleet.bulletin.number + 1
     if number % GENERATION == 0:
         raise FleetError("this authority has signed its last bulletin: create a new fleet")
-    bulletin = Bulletin(fleet.bulletin.fleet, number, least, serials)
-    return replace(fleet, bulletin=bulletin, published=_published(signer, bulletin))
+    refused = {*fleet.bulletin.revoked, *revoked}
+    least = max(least, fleet.bulletin.least)
+    left = [one for one in fleet.current if one.certificate.serial >= least and one.certificate.serial not in refused]
+    oldest = min(left, key=lambda one: one.certificate.serial, default=None)
+    for lowest in (least, oldest.certificate.serial if oldest else fleet.next_serial):
+        serials = tuple(sorted(serial for serial in refused if serial >= lowest))
+        if len(serials) <= MOST_REVOKED and (not serials or serials[-1] - lowest <= LARGEST_OFFSET):
+            bulletin = Bulletin(fleet.bulletin.fleet, number, lowest, serials)
+            return replace(fleet, bulletin=bulletin, published=_published(signer, bulletin))
+    assert oldest is not None, "without a member no serial is left"
+    raise FleetError(
+        f"the bulletin is full, with {MOST_REVOKED} certificates since that of {oldest.name}: first give"
+        f" {oldest.name} a new key (`uavlinkd fleet sign --replace {oldest.name}`)"
+    )
 
 
 def _published(signer: SigningKey, bulletin: Bulletin) -> bytes:
