@@ -51,7 +51,7 @@ _ROWS = [
 @pytest.mark.parametrize(("before", "after", "changes"), _ROWS, ids=[" ".join(changes) for *_, changes in _ROWS])
 def test_changes_are_found(tmp_path: Path, before: str, after: str, changes: dict[str, list[str]]) -> None:
     """Of peers, members and the policies of endpoints, by name."""
-    assert compare(load(tmp_path, before), load(tmp_path, after)).summary() == changes
+    assert compare(load(tmp_path, before), load(tmp_path, after)).summary == changes
 
 
 @pytest.mark.parametrize(

@@ -20,9 +20,6 @@ def _here(cause: str, remedy: str) -> tuple[Sign]:
 LINK_ROWS = (
     Mistake("1", scenes.other_key, signs=(_KEY_HERE, _KEY_THERE)),
     Mistake(
-        "3", scenes.example_key, check=r"is the key of an example.*`uavlinkd pubkey` printed", signs=(_KEY_HERE,)
-    ),
-    Mistake(
         "4",
         scenes.private_key,
         check=r"form of a private key.*make a new one there with `uavlinkd keygen`",

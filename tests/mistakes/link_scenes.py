@@ -18,7 +18,6 @@ from tests.processes.members import CertifiedFleet
 from tests.processes.process import DaemonProcess
 from uavlinkd.authority.certificates import MemberRole
 from uavlinkd.config import keys
-from uavlinkd.config.key_rules import EXAMPLE_KEYS
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.system.base64_text import to_base64
 
@@ -57,11 +56,6 @@ async def _wrong_key(scene: Scene, key: str) -> None:
 async def other_key(scene: Scene) -> None:
     """`here` has a random key for `there`."""
     await _wrong_key(scene, keys.public_key_text(keys.generate_private_key()))
-
-
-async def example_key(scene: Scene) -> None:
-    """`here` has the key of an example."""
-    await _wrong_key(scene, min(EXAMPLE_KEYS))
 
 
 async def private_key(scene: Scene) -> None:

@@ -2,55 +2,45 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from uavlinkd.config.model import Config, ConfigError, EndpointConfig, FleetConfig, PeerConfig, Problem
 
 if TYPE_CHECKING:
     from uavlinkd.relay.forwarding import MemberSettings
 
-_FIXED = {
-    "name": "name",
-    "public_key": "private_key_file",
-    "listen": "listen",
-    "networks": "network",
-    "control_socket": "control_socket",
-    "log": "log",
-    "relays_frames": "routing",
-    "relays": "relay",
+_FIXED: Final[dict[str, Callable[[Config], object]]] = {
+    "name": lambda config: config.name,
+    "private_key_file": lambda config: config.public_key,
+    "listen": lambda config: config.listen,
+    "network": lambda config: config.networks,
+    "control_socket": lambda config: config.control_socket,
+    "log": lambda config: config.log,
+    "routing": lambda config: config.relays_frames,
+    "relay": lambda config: config.relays,
+    "member": lambda config: config.relay_server is None,
+    "relay_server.https": lambda config: config.relay_server and config.relay_server.https,
+    "fleet.authority": lambda config: config.fleet and (config.fleet.authority, config.fleet.state_file),
+    "endpoint": lambda config: [replace(endpoint, policy={}) for endpoint in config.endpoints],
 }
-"""Fields of the configuration that cannot change while the daemon runs, with the key of each in the file."""
-_NEEDS_RESTART = "has changed, and a reload changes peers, members and policies only: restart the daemon"
-_Section = TypeVar("_Section", PeerConfig, EndpointConfig, "MemberSettings")
+"""What cannot change while the daemon runs, by its key in the file."""
+_NEEDS_RESTART: Final = "has changed, and a reload changes peers, members and policies only: restart the daemon"
+_Section = TypeVar("_Section", PeerConfig, "MemberSettings")
 
 
 @dataclass(frozen=True, slots=True)
 class ConfigChanges:
-    """Removed, added and changed peers and members, and endpoints with another policy.
+    """Peers that end, peers with other rules or addresses, and endpoints with another policy.
 
-    A peer with new keys or link settings is removed and added.
+    A peer with new keys or link settings ends, and is added again. ``summary``: names by kind of change, for a log.
     """
 
-    removed_peers: tuple[str, ...]
-    added_peers: tuple[PeerConfig, ...]
-    changed_peers: tuple[PeerConfig, ...]
-    changed_endpoints: tuple[EndpointConfig, ...]
-    removed_members: tuple[str, ...]
-    added_members: tuple[MemberSettings, ...]
-    changed_members: tuple[MemberSettings, ...]
-    changed_fleet: tuple[str, ...]
-    """Fields of :class:`.FleetConfig`."""
-
-    def summary(self) -> dict[str, list[str]]:
-        """Names by kind of change, for a log, without kinds that did not occur."""
-        summary = {}
-        for field in self.__slots__:
-            verb, noun = field.split("_")
-            if sections := getattr(self, field):
-                summary[f"{noun}_{verb}"] = [one if isinstance(one, str) else one.name for one in sections]
-        return summary
+    removed_peers: Sequence[str]
+    changed_peers: Sequence[PeerConfig]
+    changed_endpoints: Sequence[EndpointConfig]
+    summary: dict[str, Sequence[str]]
 
 
 def compare(old: Config, new: Config) -> ConfigChanges:
@@ -58,44 +48,44 @@ def compare(old: Config, new: Config) -> ConfigChanges:
 
     Raises ConfigError with every key whose change needs a restart.
     """
-    fixed = [key for field, key in _FIXED.items() if getattr(old, field) != getattr(new, field)]
-    if (old.relay_server is None) != (new.relay_server is None):
-        fixed.append("member")
-    elif old.relay_server and new.relay_server and old.relay_server.https != new.relay_server.https:
-        fixed.append("relay_server.https")
-    if (old.fleet and (old.fleet.authority, old.fleet.state_file)) != (
-        new.fleet and (new.fleet.authority, new.fleet.state_file)
-    ):
-        fixed.append("fleet.authority")
-    if [replace(one, policy={}) for one in old.endpoints] != [replace(one, policy={}) for one in new.endpoints]:
-        fixed.append("endpoint")
-    peers = _compare(old.peers, new.peers, _is_same_peer)
-    if {peer.name for peer in peers[1]} & {relay.peer for relay in new.relays} and "relay" not in fixed:
+    fixed = [key for key, fact in _FIXED.items() if fact(old) != fact(new)]
+    removed, added, changed = _compare(old.peers, new.peers, _is_same_peer)
+    if set(added) & {relay.peer for relay in new.relays} and "relay" not in fixed:
         fixed.append("relay")  # its session is that of the peer
     if fixed:
         raise ConfigError(tuple(Problem(str(new.path), key, _NEEDS_RESTART) for key in fixed))
-    return ConfigChanges(
-        *peers,
-        tuple(one for one, before in zip(new.endpoints, old.endpoints, strict=True) if one != before),
-        *_compare(_members(old), _members(new), lambda before, member: True),
-        tuple(
+    endpoints = [one for one, before in zip(new.endpoints, old.endpoints, strict=True) if one != before]
+    members = _compare(_members(old), _members(new), lambda before, member: True)
+    summary: dict[str, Sequence[str]] = {
+        "peers_removed": removed,
+        "peers_added": added,
+        "peers_changed": changed,
+        "endpoints_changed": [endpoint.name for endpoint in endpoints],
+        **dict(zip(("members_removed", "members_added", "members_changed"), members, strict=True)),
+        "fleet_changed": [
             field.name
             for field in fields(FleetConfig)
             if getattr(old.fleet, field.name, None) != getattr(new.fleet, field.name, None)
-        ),
+        ],
+    }
+    return ConfigChanges(
+        removed_peers=removed,
+        changed_peers=[peer for peer in new.peers if peer.name in changed],
+        changed_endpoints=endpoints,
+        summary={kind: names for kind, names in summary.items() if names},
     )
 
 
 def _compare(
     before: Iterable[_Section], now: Iterable[_Section], is_same: Callable[[_Section, _Section], bool]
-) -> tuple[tuple[str, ...], tuple[_Section, ...], tuple[_Section, ...]]:
-    """Names of the removed sections, the added ones, and those that are the same with other settings."""
-    old = {section.name: section for section in before}
-    kept = {section.name: section for section in now if section.name in old and is_same(old[section.name], section)}
+) -> tuple[list[str], list[str], list[str]]:
+    """The names of the removed sections, of the added ones, and of the same ones with other settings."""
+    old, new = ({section.name: section for section in sections} for sections in (before, now))
+    kept = [name for name in new if name in old and is_same(old[name], new[name])]
     return (
-        tuple(name for name in old if name not in kept),
-        tuple(section for section in now if section.name not in kept),
-        tuple(section for name, section in kept.items() if section != old[name]),
+        [name for name in old if name not in kept],
+        [name for name in new if name not in kept],
+        [name for name in kept if old[name] != new[name]],
     )
 
 

@@ -19,7 +19,7 @@ from uavlinkd.system.addresses import Address, overlaps
 
 
 def check(file: File) -> Found:
-    for kind in ("endpoint", "peer", "member", "network", "fleet_role"):
+    for kind in ("endpoint", "network", "fleet_role"):
         yield from unique(file[kind], "name")
     yield from unique(file.used_relays, "name")
     for kind in ("peer", "member", "relay", "contact"):
@@ -35,7 +35,7 @@ def check(file: File) -> Found:
     yield from _ports(file)
     yield from _devices(file)
     yield from fleet_rules.check(file)
-    yield from network_rules.networks(file)
+    yield from network_rules.check(file)
     for kind in ("endpoint", "peer"):
         for section in file[kind]:
             yield from policy_problems(section, policy_data(section), is_local=kind == "endpoint")

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from itertools import combinations
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Iterable
+from contextlib import suppress
+from typing import TYPE_CHECKING
 
 from uavlinkd.authority.certificates import MemberRole, fleet_id_of, is_certified, verified_bulletin
 from uavlinkd.config.build import fleet_policies, member_role, policy_data, policy_problems
@@ -66,42 +66,26 @@ def _contacts(file: File) -> Found:
             yield contact.at("public_key"), text
 
 
-class _Claim(NamedTuple):
-    """A member of this file with its name and system ids, which no other member may have."""
-
-    section: Values
-    key: bytes | None
-    name: str | None
-    systems: frozenset[int]
-
-    def place(self, what: str) -> str:
-        """Where its name or system ids are written."""
-        return self.section.at(what if self.section.kind == "peer" else "certificate")
-
-
 def _conflicts(file: File) -> Found:
-    for one, other in combinations(_claims(file), 2):  # the pinned peers come first
-        common = one.systems & other.systems
-        if other.section.kind == "peer" or one.key == other.key or not (common or one.name == other.name):
-            continue
-        key, what = ("name", "name") if one.name == other.name else ("system_ids", f"system id {min(common)}")
-        wrong, right = (one, other) if one.section.kind == "peer" else (other, one)
-        text = f"has the {what} of {right.place(key)}: write or sign another, or delete the section"
-        yield wrong.place(key), text
+    """No member of the fleet has the name or a system id of another one in this file, or of a pinned peer."""
+    owners: dict[object, Values] = {}
+    for section in (*file["peer"], file.one("fleet"), *file["contact"]):
+        for claim in _claims(section):
+            owner = owners.setdefault(claim, section)
+            if section.kind != "peer" and owner is not section and with_same_key(section, [owner]) is None:
+                what = "name" if isinstance(claim, str) else f"system id {claim}"
+                yield section.at(), f"has the {what} of {owner.at()}: write or sign another, or delete one section"
+                break
 
 
-def _claims(file: File) -> Iterator[_Claim]:
-    for peer in file["peer"]:
-        try:
-            systems = read_settings(policy_data(peer), is_local=False).systems
-        except PolicyError:
-            systems = None  # a problem of its own
-        yield _Claim(peer, peer.get("public_key"), peer.get("name"), systems or frozenset())
-    for section in (file.one("fleet"), *file["contact"]):
-        held: HeldCertificate | None = section.get("certificate")
-        if held is not None:
-            key = file.own_key if section.kind == "fleet" else section.get("public_key")
-            yield _Claim(section, key, held.certificate.name, frozenset(held.certificate.systems))
+def _claims(section: Values) -> Iterable[object]:
+    """What a section has alone: its name, if any, and its system ids. Invalid ones are a problem of their own."""
+    held: HeldCertificate | None = section.get("certificate")
+    if held is not None:
+        return held.certificate.name, *held.certificate.systems
+    with suppress(PolicyError):
+        return section.get("name"), *(read_settings(policy_data(section), is_local=False).systems or ())
+    return ()
 
 
 def _roles(file: File) -> Found:

@@ -1,4 +1,4 @@
-"""Rules about keys: each belongs to one daemon. People paste private keys, and keys of examples.
+"""Rules about keys: each belongs to one daemon. People paste private keys.
 
 No message repeats a key. A private key in a configuration is exposed, because that file is shown, copied and sent:
 the remedy is always a new key.
@@ -9,20 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 from uavlinkd.config.file import File, Found
-from uavlinkd.config.keys import encode_key, looks_private
+from uavlinkd.config.keys import looks_private
 from uavlinkd.config.section import Values
 from uavlinkd.protocol.crypto import x25519_public_key
-
-EXAMPLE_KEYS = frozenset(
-    {
-        "+GGI0JkL0+3mJYG9RxFCI7crgfpQ7epbNx8UmBAYcGQ=",
-        "Is+OSCKTa6Id2wymhOZXYuDCPcfLOHGwnYi5Ai117ls=",
-        "Ya1BcyCMNCoxhVU/dI5z9wlfOD9PHricYw/gaSC3swU=",
-        "eZPBKM+9Oztdms1v2yiR+byync+zZsR87etuOX4heHE=",
-    }
-)
-"""The public keys in README.md and configs/. Their private keys do not exist. A test compares this list with them."""
-_EXPOSED = "it is exposed: make a new one there with `uavlinkd keygen`, and write here the public key that it prints"
 
 
 def check(file: File) -> Found:
@@ -54,16 +43,11 @@ def advice(private: bytes, owners: Iterable[Values]) -> Iterator[str]:
             " `uavlinkd keygen`, unless software other than `uavlinkd` and `wg` made it"
         )
     for owner in owners:
-        key, what = owner.valid["public_key"], owner.kind
-        name = f'{what} "{owner.valid["name"]}": public_key'
-        if encode_key(key) in EXAMPLE_KEYS:
+        if looks_private(owner.valid["public_key"]):
+            what = owner.kind
             yield (
-                f"{name} is the key of an example, whose private key does not exist: write what `uavlinkd keygen` or"
-                f" `uavlinkd pubkey` printed on the {what}"
-            )
-        elif looks_private(key):
-            yield (
-                f"{name} has the form of a private key. `uavlinkd keygen` makes no such public key, `wg` one of 16:"
-                f" compare it with what `uavlinkd pubkey FILE` prints on the {what}. If it is its private key,"
-                f" {_EXPOSED}"
+                f'{what} "{owner.valid["name"]}": public_key has the form of a private key. `uavlinkd keygen` makes'
+                f" no such public key, `wg` one of 16: compare it with what `uavlinkd pubkey FILE` prints on the"
+                f" {what}. If it is its private key, it is exposed: make a new one there with `uavlinkd keygen`, and"
+                " write here the public key that it prints"
             )

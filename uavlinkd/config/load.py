@@ -153,7 +153,7 @@ def _read_secret(file: File, section: Values, key: str, environ: Mapping[str, st
     elif is_service:
         file.add(section.at(key), f"there is no file {path} and no systemd credential of that name: {_FOR_A_SERVICE}")
     else:
-        file.add(section.at(key), f"there is no file {path}: {_how_to_get(key, path, file.path)}")
+        file.add(section.at(key), f"there is no file {path}: {_how_to_get(key, path)}")
 
 
 _FOR_A_SERVICE = (
@@ -162,15 +162,9 @@ _FOR_A_SERVICE = (
 )
 
 
-def _how_to_get(key: str, path: Path, config: Path) -> str:
+def _how_to_get(key: str, path: Path) -> str:
     where = shlex.quote(str(path))
     if key == "psk_file":
-        remedy = f"copy it from the peer, or make it on one of the two with `uavlinkd psk --out {where}`"
-    else:
-        remedy = f"make it with `uavlinkd keygen --out {where}`"
-    # Folders where the systemd units look for key files that the configuration names without a folder.
-    for folder in (config.parent / "keys", config.with_suffix("")):
-        if folder.is_dir():
-            option = f"--keys {shlex.quote(str(folder))}"
-            return f"{remedy}; for a service's configuration, add `{option}` to `uavlinkd check`"
-    return remedy
+        return f"copy it from the peer, or make it on one of the two with `uavlinkd psk --out {where}`"
+    remedy = f"make it with `uavlinkd keygen --out {where}`"
+    return f"{remedy}; the keys of a service are in a folder: name it with --keys at `uavlinkd check`"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from uavlinkd.config.file import File, Found, over_ip, with_same_key
+from uavlinkd.config.file import File, Found, over_ip, unique, with_same_key
 
 MOST_MEMBERS: Final = 4000  # each has up to three sessions, of 65,535 indices
 MOST: Final = 3  # Relays of one daemon. A peer has room for the paths along so many.
@@ -22,12 +22,8 @@ def check(file: File) -> Found:
 
 def _members(file: File) -> Found:
     """Members can reach the relay. One may also be a peer, with the same key: then one session serves both."""
-    by_name = {peer.get("name"): peer for peer in file["peer"]}
-    for section in file["member"]:
-        name, peer = section.get("name"), with_same_key(section, file["peer"])
-        if section.get("public_key") and name is not None and by_name.get(name, peer) is not peer:
-            text = f"is the name of {by_name[name].at()} too, which has another key: write another name"
-            yield section.at("name"), text
+    peers = file["peer"]
+    yield from unique([*peers, *(one for one in file["member"] if with_same_key(one, peers) is None)], "name")
     if len(file["member"]) > MOST_MEMBERS:
         yield "member", f"has more than {MOST_MEMBERS:,} sections: run several relays, each on a port of its own"
     if file.is_relay and file.top.lacks("listen"):

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from uavlinkd.authority.certificates import LAST_SERIAL, parse_bulletin, parse_certificate
-from uavlinkd.authority.certificates import NAME as MEMBER_NAME
 from uavlinkd.config.keys import decode_key, is_canonical_public_key
 from uavlinkd.config.model import SERIAL, HttpsServer, PeerAddress
 from uavlinkd.config.section import Choice, Key, Keys, Kind, Number, anything, boolean, each, integer, text
@@ -32,7 +31,6 @@ if TYPE_CHECKING:
     from uavlinkd.authority.trust import HeldCertificate
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
-_INTERFACE = re.compile(r"[^\s/:]{1,15}")  # as dev_valid_name() of Linux
 # A complete or nearly complete key in base64 or hex: no message repeats it.
 _LIKE_A_KEY = re.compile(r"[A-Za-z0-9+/_-]{40,}={0,2}")
 _HTTPS = '{ listen = "0.0.0.0:443", certificate = "tls.crt", key = "tls.key" }'
@@ -143,13 +141,6 @@ def _https(value: Any) -> HttpsServer:
     return HttpsServer(parts["listen"], Path(parts["certificate"]), Path(parts["key"]))
 
 
-def _interface(value: Any) -> str:
-    name = text(value)
-    if not _INTERFACE.fullmatch(name) or not name.isprintable() or name in (".", ".."):
-        raise ValueError("is not a name of a network interface: write one of those that `ip -brief link` lists")
-    return name
-
-
 def _own_address(value: Any) -> str:
     with suppress(ValueError):
         ip = ip_address(text(value))
@@ -162,12 +153,6 @@ def _own_address(value: Any) -> str:
         'is not one address of this machine: write one, without a port, such as "10.0.0.5" or "fe80::5%wlan0", or'
         ' write interface = "wlan0" instead'
     )
-
-
-def _member_name(value: Any) -> str:
-    if not MEMBER_NAME.fullmatch(text(value)):
-        raise ValueError("is not the name of a member: names have 1 to 21 of a-z, 0-9 and -")
-    return str(value)
 
 
 def _signed(parse: Callable[[bytes], object], what: str) -> Kind:
@@ -255,14 +240,14 @@ SINGLE: Final[dict[str, Keys]] = {
         "call": Key(each(_FRAME_ROLE), None, '["operator"]'),
         "operator": Key(Choice("certificate", "pinned"), "certificate"),
         "require_bulletin": Key(integer(0, LAST_SERIAL), 0),
-        "deny": Key(each(_member_name), [], '["v3"]'),
+        "deny": Key(each(_name), [], '["v3"]'),
     },
 }
 """The sections that a file has once, such as ``[link]``."""
 REPEATED: Final[dict[str, Keys]] = {
     "network": {
         "name": Key(_name, written='"lte"'),
-        "interface": Key(_interface, None, '"wwan0"'),
+        "interface": Key(_name, None, '"wwan0"'),
         "address": Key(_own_address, None, '"10.0.0.5"'),
         "serial": Key(_line, None, '"/dev/ttyUSB0:57600"'),
         "air_bits_s": Key(integer(LEAST_BITS_S, 10_000_000), None, "24000"),

@@ -1,8 +1,8 @@
 """What a configuration file is made of: kinds of values, keys, and the values of a section.
 
 A kind is a function. It returns the value that the daemon uses, or raises ValueError with the message for the person.
-The message never repeats the value, which may be a secret in the wrong place. Nothing is converted: a number in
-quotation marks is a mistake.
+The message never repeats the value, which may be a secret in the wrong place. An example of the key follows a message
+without a remedy. Nothing is converted: a number in quotation marks is a mistake.
 """
 
 from __future__ import annotations
@@ -11,10 +11,6 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final, NamedTuple
 
 Kind = Callable[[Any], Any]
-
-
-class WrongTypeError(ValueError):
-    """The value has the wrong type. An example of the key follows the message."""
 
 
 class ListError(ValueError):
@@ -27,7 +23,7 @@ class ListError(ValueError):
 
 def boolean(value: Any) -> bool:
     if not isinstance(value, bool):
-        raise WrongTypeError("must be true or false, without quotes")
+        raise ValueError("must be true or false, without quotes")
     return value
 
 
@@ -49,7 +45,7 @@ class Number:
 
     def __call__(self, value: Any) -> float:
         if isinstance(value, bool) or not isinstance(value, int if self.is_whole else int | float):
-            raise WrongTypeError(f"must be a {'whole ' if self.is_whole else ''}number, without quotes")
+            raise ValueError(f"must be a {'whole ' if self.is_whole else ''}number, without quotes")
         if not self.least <= value <= self.most:  # also of NaN
             raise ValueError(f"must be from {self.least:.12g} to {self.most:.12g}")
         return value if self.is_whole else float(value)
@@ -78,7 +74,7 @@ def each(kind: Kind) -> Kind:
 
     def read_list(value: Any) -> list[Any]:
         if not isinstance(value, list):
-            raise WrongTypeError("must be a list")
+            raise ValueError("must be a list")
         values, messages = list[Any](), dict[int, str]()
         for index, item in enumerate(value):
             try:
@@ -159,9 +155,8 @@ def read(keys: Keys, table: Mapping[str, Any], section: str = "") -> tuple[Value
             valid[name] = key.kind(table[name])
         except ListError as error:
             problems += [(f"{name}[{index}]", message) for index, message in error.messages.items()]
-        except WrongTypeError as error:
-            problems.append((name, f"{error}: write {name} = {key.example}"))
         except ValueError as error:
-            problems.append((name, str(error)))
+            remedy = "" if "write" in str(error) else f": write {name} = {key.example}"
+            problems.append((name, f"{error}{remedy}"))
     invalid = frozenset(keys) & {place.partition("[")[0] for place, _ in problems}
     return Values(section, keys, valid, invalid), problems

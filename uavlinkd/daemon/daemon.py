@@ -208,7 +208,7 @@ class Daemon:
             report(error, most=1)
             raise
         self._write_warnings()
-        self.log.info("configuration_reloaded", **changes.summary())
+        self.log.info("configuration_reloaded", **changes.summary)
         self.carrier.arm()
 
     # Once a second.
