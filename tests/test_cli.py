@@ -176,7 +176,7 @@ url = "udpin:127.0.0.1:14550"
 name = "drone1"
 public_key = "eZPBKM+9Oztdms1v2yiR+byync+zZsR87etuOX4heHE="
 addresses = ["10.13.0.2:5790"]
-role = "swarm-member"
+role = "all"
 system_ids = [2]
 """
 
@@ -188,7 +188,7 @@ def test_check_reads_a_services_keys_from_their_folder(tmp_path: Path, capsys: p
     path = tmp_path / "drone0.toml"
     path.write_text(_SERVICE)
     assert main(["check", "--config", str(path)]) == WRONG
-    assert f"--keys {tmp_path / 'keys'}" in capsys.readouterr().err
+    assert "--keys" in capsys.readouterr().err
     assert main(["check", "--config", str(path), "--keys", str(tmp_path / "absent")]) == WRONG
     assert "--keys" in capsys.readouterr().err
     assert main(["check", "--config", str(path), "--keys", str(tmp_path / "keys")]) == OK
