@@ -152,6 +152,7 @@ BY_TLS = {**USED, "paths": [{"network": "TLS"}]}
         ),
         ({"fleet": FLEET}, {}, "1 of 2 peers up fleet k7qd2m4x: vehicle v1, serial 3; bulletin 5, but v2 has 4 "),
         ({"fleet": FLEET}, {}, "v9 waiting silent never - 0/0 0.0/0.0 drone1 up"),
+        ({}, {"paths": [{**PATH, "round_trip_s": None, "jitter_s": None}]}, "203.0.113.255:65535 best all - 12/100"),
         ({"relays": {"vps": USED}}, {}, "relay vps: up, 12 ms; drone1 bound, drone2 waiting"),
         ({"relays": {"vps": BY_TLS}}, {}, "relay vps: up by TLS, 12 ms; drone1 bound, drone2 waiting"),
     ],

@@ -99,7 +99,8 @@ def _peers(status: Status) -> Table:
 def _figures(part: Status) -> Iterator[Text]:
     """Round trip, losses and rates of a peer or a path."""
     time_s, worst = part["round_trip_s"], max(part["loss_in"], part["loss_out"])
-    jitter = f"±{_short(1000 * part['jitter_s'])}" if "jitter_s" in part else ""
+    jitter_s = part.get("jitter_s")
+    jitter = "" if jitter_s is None else f"±{_short(1000 * jitter_s)}"
     yield Text("-" if time_s is None else f"{_short(1000 * time_s)}{jitter}")
     style = "bold red" if worst > 0.2 else "yellow" if worst > 0.02 else ""
     yield Text(f"{100 * part['loss_in']:.0f}/{100 * part['loss_out']:.0f}", style=style)
