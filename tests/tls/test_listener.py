@@ -198,24 +198,6 @@ async def test_network_with_fewest_strangers_comes_first(monkeypatch: pytest.Mon
         await until(lambda: _sends(relay, member.getsockname()))
 
 
-async def test_stranger_sends_few_messages(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A member may send more, and its connection is looked at before it ends."""
-    monkeypatch.setattr(module, "STRANGER_MESSAGES", 3)
-    async with port() as relay:
-        member, stranger = await relay.open(), await relay.open()
-        await until(lambda: _sends(relay, member.getsockname()) and _sends(relay, stranger.getsockname()))
-        relay.prove(member.getsockname())
-        for number in range(9):
-            for client in (member, stranger):
-                with suppress(OSError):
-                    client.send(b"\x82\x82\0\0\0\0%d0" % number)
-            await until(lambda: sum(at == member.getsockname() for _, at in relay.received) > number)  # noqa: B023
-        assert await is_ended(stranger)
-        assert relay.refused == {"flood": 1}
-        assert sum(at == stranger.getsockname() for _, at in relay.received) <= 3
-        assert [*relay.journal.totals] == ["flood"]
-
-
 async def test_connection_without_its_proof_is_a_strangers(monkeypatch: pytest.MonkeyPatch) -> None:
     """Such as that of a member that was revoked."""
     monkeypatch.setattr(module, "STRANGER_S", 0.0)

@@ -24,7 +24,6 @@ WEB_ERRORS: Final[Mapping[str, str]] = {
     "TimeoutError": "no answer in time: open TCP port 443 at the relay; a firewall here may drop TCP too",
     "proxy_407": "the proxy wants a name and password: write HTTPS_PROXY=http://USER:PASSWORD@HOST:PORT",
     "proxy_": "the proxy refuses to connect to the relay: its owner must permit CONNECT to this host and port",
-    "proxy_closed": "the proxy closes the connection: its owner must permit CONNECT to this host and port",
     "proxy_not_http": "HTTPS_PROXY names a proxy of another kind: write http://HOST:PORT of an HTTP proxy",
     "proxy_not_understood": "HTTPS_PROXY is wrong, or no HTTP proxy answers there: write http://HOST:PORT",
     "tls": f"no TLS at this port, or a firewall that inspects TLS ends it: {_COMPARE}",
@@ -67,7 +66,6 @@ ERROR_MEANINGS: Final[Mapping[str, str]] = {
     # Connections to a relay by TLS.
     "too_many_connections": "this relay has as many connections by TLS as it may: run several relays",
     "displaced": "too many connections that no member has proved: a scan or an attack, or many members start at once",
-    "flood": "a connection that no member has proved sent too many messages: an attack",
     # Files and devices.
     "ENOENT": "there is no such file or device now: plug it in, or correct its name",
     "ENXIO": "the device has gone: plug it in again",

@@ -12,8 +12,7 @@ import ssl
 import sys
 from array import array
 from collections.abc import Callable
-from contextlib import suppress
-from typing import Any, Final, Protocol
+from typing import Final, Protocol
 
 from uavlinkd.io.ports import failure_name
 from uavlinkd.io.sockets import set_options
@@ -37,6 +36,11 @@ _OPTIONS: Final[tuple[tuple[int, str, int | bytes], ...]] = (
     (socket.IPPROTO_TCP, "TCP_NOTSENT_LOWAT", 2 * UNSENT_BYTES),
     (socket.IPPROTO_TCP, "TCP_USER_TIMEOUT", 10_000),
     (socket.IPPROTO_TCP, "TCP_CONGESTION", b"bbr"),
+    # The kernel notices an end that is gone without a word.
+    (socket.SOL_SOCKET, "SO_KEEPALIVE", 1),
+    (socket.IPPROTO_TCP, "TCP_KEEPIDLE", 30),
+    (socket.IPPROTO_TCP, "TCP_KEEPINTVL", 10),
+    (socket.IPPROTO_TCP, "TCP_KEEPCNT", 3),
 )
 
 
@@ -98,10 +102,8 @@ class TlsChannel:
         opened_in: int | None = None,
     ) -> None:
         self.bytes_sent = 0  # those that the kernel accepted, with TLS's own
-        self.bytes_received = 0
         self.is_open = True
         self.is_secure = False  # whether TLS's handshake is complete, or there is none
-        self.peername: Any = None  # None: it was reset already
         self._sock = sock
         self._fd = sock.fileno()
         self._owner = owner
@@ -110,8 +112,6 @@ class TlsChannel:
         self._is_watching = False  # the kernel reports when it has room
         self._unsent = array("i", [0])
         sock.setblocking(False)
-        with suppress(OSError):
-            self.peername = sock.getpeername()
         set_options(sock, _OPTIONS)
         self._backlog = Backlog(stall, self._fd, self._capacity, opened_in)
         self._in, self._out = ssl.MemoryBIO(), ssl.MemoryBIO()
@@ -207,7 +207,6 @@ class TlsChannel:
         except OSError as error:
             self._owner.lose(failure_name(error))
             return
-        self.bytes_received += len(data)
         self._backlog.end(len(data), is_empty=len(data) < READ_BYTES)
         has_ended = not data
         if self._tls is not None and data:

@@ -7,14 +7,13 @@ begins beside the others every :data:`AGAIN_S`. The first one that connects wins
 from __future__ import annotations
 
 import asyncio
+import os
 import socket
-from contextlib import suppress
 from typing import Any, Final
 
-from websockets.exceptions import InvalidProxy
-from websockets.http11 import Response
-from websockets.proxy import Proxy, get_proxy, parse_proxy, prepare_connect_request
-from websockets.streams import StreamReader
+from websockets.asyncio.client import HTTPProxyConnection
+from websockets.exceptions import InvalidProxy, InvalidProxyMessage, InvalidProxyStatus
+from websockets.proxy import Proxy, get_proxy, parse_proxy
 from websockets.uri import WebSocketURI, parse_uri
 
 from uavlinkd.io.sockets import connect_tcp
@@ -30,7 +29,6 @@ AGAIN_S: Final = 0.5  # between two attempts to one address
 STAGGER_S: Final = 0.25  # between attempts to different addresses, as in RFC 8305
 NAME_S: Final = 0.5  # without an answer for so long, the last addresses of the name are used
 MAX_ADDRESSES: Final = 8
-RESPONSE_BYTES: Final = 8192  # a proxy that sends more before it has connected is refused
 
 
 class WebConnectError(OSError):
@@ -137,41 +135,17 @@ def _close(attempt: asyncio.Task[socket.socket]) -> None:
 async def _reach(target: tuple[socket.AddressFamily, Any], proxy: Proxy | None, uri: WebSocketURI) -> socket.socket:
     """One attempt."""
     sock = await connect_tcp(*target)
-    if proxy is not None:
-        try:
-            await _tunnel(sock, proxy, uri)
-        except BaseException:
-            sock.close()
-            raise
-    return sock
-
-
-async def _tunnel(sock: socket.socket, proxy: Proxy, uri: WebSocketURI) -> None:
-    """Have the proxy connect to the relay."""
-    loop = asyncio.get_running_loop()
-    with suppress(OSError):
-        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    await loop.sock_sendall(sock, prepare_connect_request(proxy, uri, "uavlinkd"))
-    reader = StreamReader()
-    parser = Response.parse(reader.read_line, reader.read_exact, reader.read_to_eof, proxy=True)
-    left = RESPONSE_BYTES
+    if proxy is None:
+        return sock
+    transport, connection = await asyncio.get_running_loop().create_connection(
+        lambda: HTTPProxyConnection(uri, proxy, "uavlinkd"), sock=sock
+    )
     try:
-        while True:
-            next(parser)
-            data = await loop.sock_recv(sock, left)
-            if not data:
-                raise WebConnectError("proxy_closed")
-            left -= len(data)
-            if left <= 0:
-                raise WebConnectError("proxy_not_understood")
-            reader.feed_data(data)
-    except StopIteration as end:
-        response: Response = end.value
-    except OSError:
-        raise
-    except Exception:  # the library's many
+        await connection.response
+        return socket.socket(fileno=os.dup(transport.get_extra_info("socket").fileno()))
+    except InvalidProxyStatus as refusal:
+        raise WebConnectError(f"proxy_{refusal.response.status_code}") from None
+    except InvalidProxyMessage:
         raise WebConnectError("proxy_not_understood") from None
-    if not 200 <= response.status_code < 300:
-        raise WebConnectError(f"proxy_{response.status_code}")
-    if reader.buffer:  # a relay sends nothing before the member has
-        raise WebConnectError("proxy_not_understood")
+    finally:
+        transport.abort()  # it closes its own file descriptor only

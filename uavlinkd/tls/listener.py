@@ -10,11 +10,9 @@ from __future__ import annotations
 
 import asyncio
 import errno
-import resource
 import socket
 from collections import Counter
 from collections.abc import Callable
-from contextlib import suppress
 from ipaddress import IPv6Address
 from typing import Final
 
@@ -24,7 +22,8 @@ from uavlinkd.daemon.features import AddSender, PathKind
 from uavlinkd.daemon.journal import DaemonJournal
 from uavlinkd.daemon.networks import Receive
 from uavlinkd.io.ports import failure_name
-from uavlinkd.io.sockets import BindError, set_options
+from uavlinkd.io.reader import Datagrams
+from uavlinkd.io.sockets import BindError
 from uavlinkd.io.tcp import tcp_listener
 from uavlinkd.protocol.limits import TokenBucket
 from uavlinkd.protocol.node import Node
@@ -41,9 +40,6 @@ STRANGERS: Final = 512
 member needs a second, or less."""
 STRANGER_S: Final = 5.0
 """So long a stranger may stay."""
-STRANGER_MESSAGES: Final = 128
-"""So many messages it may send. A member needs two or three, and what it has to say until the relay's first question
-has its answer."""
 ACCEPTED_S: Final = 5000.0
 """TCP connections a second. The others wait in the kernel."""
 ACCEPTED_AT_ONCE: Final = 100
@@ -56,30 +52,21 @@ EXHAUSTED_S: Final = 1.0
 """and without a file descriptor."""
 LOOK_AGAIN_S: Final = 0.1
 """While there are too many strangers, they are looked at this often at most."""
-FILES: Final = CONNECTIONS + 512
-"""File descriptors that the daemon asks for, with those of everything else."""
 SENDER: Final = "members by TLS"
 """The name of their stale datagrams."""
 _BACKLOG: Final = 1024
 """So many wait in the kernel, for 0.2 s at most. In a shorter queue, a burst would cost a member a second."""
-_KEEPALIVE: Final = (
-    (socket.SOL_SOCKET, "SO_KEEPALIVE", 1),
-    (socket.IPPROTO_TCP, "TCP_KEEPIDLE", 30),
-    (socket.IPPROTO_TCP, "TCP_KEEPINTVL", 10),
-    (socket.IPPROTO_TCP, "TCP_KEEPCNT", 3),
-)
-"""The kernel notices a member that is gone without a word."""
 _EXHAUSTED: Final = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
 
 
 class _Connection:
     """One connection, the handler of its stream.
 
-    ``epoch``: in which its other end could first send. ``since``: when it became a stranger's. ``messages``: how many
-    it sent since then. ``stream``: None before its first bytes, and until there is a handshake for it.
+    ``epoch``: in which its other end could first send. ``since``: when it became a stranger's. ``stream``: None until
+    there is a handshake for it.
     """
 
-    __slots__ = ("_listener", "address", "epoch", "messages", "prefix", "since", "sock", "stream")
+    __slots__ = ("_listener", "address", "epoch", "prefix", "since", "sock", "stream")
 
     def __init__(self, listener: WebListener, sock: socket.socket, address: SocketAddress, epoch: int) -> None:
         self._listener = listener
@@ -88,7 +75,6 @@ class _Connection:
         self.prefix = _prefix_of(address[0])
         self.epoch = epoch
         self.since = monotonic()
-        self.messages = 0
         self.stream: WebStream | None = None
 
     def lose(self, reason: str) -> None:
@@ -104,7 +90,7 @@ class _Connection:
         self._listener.on_open(self)
 
     def on_datagrams(self, datagrams: list[bytes], now: float, epoch: int) -> None:
-        self._listener.on_datagrams(self, datagrams, now, epoch)
+        self._listener.receive([(datagram, self.address) for datagram in datagrams], now, epoch)
 
     def on_room(self) -> None:
         """What waits for a member is in the stream."""
@@ -128,7 +114,7 @@ class WebListener(PathKind):
         self._node = node
         self._stall = stall
         self._drops = drops
-        self._receive: Receive = lambda *_: None
+        self.receive: Callable[[Datagrams, float, int], None]
         self._on_change: Callable[[], None] = lambda: None
         self._every = set[_Connection]()
         self._strangers: dict[_Connection, None] = {}  # the oldest first
@@ -151,7 +137,6 @@ class WebListener(PathKind):
             raise BindError(f"relay_server.https: {error}") from None
         self._sock.listen(_BACKLOG)
         self._backlog = Backlog(self._stall, self._sock.fileno(), lambda: _BACKLOG + 1)
-        _raise_file_limit()
         self.number = add(self.send)
         self._node.facts.add_stream(self.number)
 
@@ -161,7 +146,8 @@ class WebListener(PathKind):
 
     def start(self, receive: Receive, on_change: Callable[[], None], on_room: Callable[[], None]) -> None:
         """Accept connections. ``on_change`` is called after the core lost a path."""
-        self._receive, self._on_change = receive, on_change
+        self.receive = lambda datagrams, now, epoch: receive(self.number, datagrams, now, epoch, 0.0)
+        self._on_change = on_change
         self._watch()
 
     def _watch(self) -> None:
@@ -273,7 +259,6 @@ class WebListener(PathKind):
         while self._ready and self._handshakes.take(monotonic()):
             connection = min(self._ready, key=lambda one: self._strangers_of[one.prefix])
             del self._ready[connection]
-            set_options(connection.sock, _KEEPALIVE)
             connection.stream = WebStream(
                 connection.sock, server_protocol(), self._tls, connection, self._stall, SENDER, connection.epoch
             )
@@ -300,13 +285,8 @@ class WebListener(PathKind):
             if connection.address in proved:
                 self._remove_stranger(connection)
             elif connection not in self._strangers:
-                connection.since, connection.messages = now, 0
+                connection.since = now
                 self._add_stranger(connection)
-
-    def _is_proved(self, address: SocketAddress) -> bool:
-        path = Path(self.number, address)
-        states = (peer.paths.by_path.get(path) for peer in self._node.peers.values())
-        return any(state is not None and state.is_validated for state in states)
 
     def _add_stranger(self, connection: _Connection) -> None:
         self._strangers[connection] = None
@@ -328,24 +308,6 @@ class WebListener(PathKind):
         """Datagrams may be sent."""
         self._by_address[connection.address] = connection
 
-    def on_datagrams(self, connection: _Connection, datagrams: list[bytes], now: float, epoch: int) -> None:
-        """Messages came in one read."""
-        address = connection.address
-        if connection in self._strangers and not self._may_send(connection, len(datagrams), now):
-            return
-        self._receive(self.number, [(datagram, address) for datagram in datagrams], now, epoch, 0.0)
-
-    def _may_send(self, stranger: _Connection, count: int, now: float) -> bool:
-        stranger.messages += count
-        if stranger.messages <= STRANGER_MESSAGES:
-            return True
-        if self._is_proved(stranger.address):
-            self._remove_stranger(stranger)
-            return True
-        self._drops.add("connections_failed", "flood", "", 1, now)
-        stranger.lose("flood")
-        return False
-
     def on_lost(self, connection: _Connection, reason: str) -> None:
         """The connection ended."""
         self._every.discard(connection)
@@ -358,15 +320,6 @@ class WebListener(PathKind):
         ended[reason] += 1
         if connection.stream is not None:
             self._dropped += connection.stream.dropped
-
-
-def _raise_file_limit() -> None:
-    """Each connection is a file. Services have 1,024, and may have more."""
-    least, most = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = FILES if most == resource.RLIM_INFINITY else min(FILES, most)
-    if least != resource.RLIM_INFINITY and least < wanted:
-        with suppress(OSError, ValueError):
-            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, most))
 
 
 def _prefix_of(host: str) -> object:

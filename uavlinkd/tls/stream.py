@@ -16,7 +16,7 @@ import errno
 import logging
 import socket
 from collections import deque
-from typing import Any, Final, Protocol
+from typing import Final, Protocol
 
 from websockets.client import ClientProtocol
 from websockets.exceptions import HeaderLineTooLong, PayloadTooBig, RequestLineTooLong, TooManyHeaders
@@ -120,20 +120,6 @@ class WebStream:
         self._pinged_at = monotonic()
         self._flushing: asyncio.Handle | None = None
         self._opening: asyncio.Handle | None = None
-
-    @property
-    def bytes_sent(self) -> int:
-        """Those that the kernel accepted, with HTTP's and TLS's."""
-        return self._channel.bytes_sent
-
-    @property
-    def bytes_received(self) -> int:
-        return self._channel.bytes_received
-
-    @property
-    def peername(self) -> Any:
-        """The socket address of the other end; None if it reset the connection at once."""
-        return self._channel.peername
 
     def start(self, within_s: float = OPEN_S) -> None:
         """Open it within this time."""
