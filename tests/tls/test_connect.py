@@ -215,7 +215,8 @@ async def test_address_that_was_silent_is_tried_again(secure: Loopback, monkeypa
 
     monkeypatch.setattr(web_connect, "connect_tcp", connect_tcp)
     monkeypatch.setattr(web_connect, "STAGGER_S", 0.01)
-    (await connector_to(secure).open(0.02)).close()
+    monkeypatch.setattr(web_connect, "AGAIN_S", 0.02)
+    (await connector_to(secure).open()).close()
     assert len(begun) == 4
     assert begun[3] - begun[0] >= 0.06
 

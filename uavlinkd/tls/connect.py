@@ -53,15 +53,15 @@ class Connector:
         proxy = _proxy_for(self._uri)
         return "" if proxy is None else str(Address(proxy.host, proxy.port))
 
-    async def open(self, again_s: float = AGAIN_S) -> socket.socket:
-        """A connected socket. ``again_s``: between attempts to one address.
+    async def open(self) -> socket.socket:
+        """A connected socket.
 
         Raises OSError: the kernel's error, TimeoutError, or WebConnectError.
         """
         async with asyncio.timeout(CONNECT_S):
             proxy = _proxy_for(self._uri)
             resolved = await self._resolve(self._address if proxy is None else Address(proxy.host, proxy.port))
-            return await _connect(resolved[:MAX_ADDRESSES], again_s, proxy, self._uri)
+            return await _connect(resolved[:MAX_ADDRESSES], proxy, self._uri)
 
     async def upgrade(self, sock: socket.socket, within_s: float) -> WebStream:
         """An open stream on a connected socket. Raises ConnectionError: the reason why there is none."""
@@ -102,12 +102,12 @@ def _proxy_for(uri: WebSocketURI) -> Proxy | None:
     return proxy
 
 
-async def _connect(resolved: Resolved, again_s: float, proxy: Proxy | None, uri: WebSocketURI) -> socket.socket:
+async def _connect(resolved: Resolved, proxy: Proxy | None, uri: WebSocketURI) -> socket.socket:
     """Connect to the address that answers first. An address that fails is not tried again."""
     attempts: dict[asyncio.Task[socket.socket], int] = {}  # with the number of the address
     error: OSError = WebConnectError("not_resolved")
     left = list(range(len(resolved)))
-    stagger_s = max(STAGGER_S, again_s / max(1, len(resolved)))
+    stagger_s = max(STAGGER_S, AGAIN_S / max(1, len(resolved)))
     try:
         while left:
             left.append(number := left.pop(0))

@@ -31,7 +31,7 @@ from uavlinkd.system.error_meanings import CONNECTED
 from uavlinkd.system.stall import StallWatch
 from uavlinkd.system.tasks import keep_running
 from uavlinkd.tls.connect import Connector
-from uavlinkd.tls.stream import WebStream
+from uavlinkd.tls.stream import OPEN_S, WebStream
 
 WEB_NETWORK: Final = "TLS"
 """What people see as the network of a connection."""
@@ -44,17 +44,15 @@ UDP_BACK_S: Final = 10.0
 LEAVE_S: Final = 2.5
 """Before it is closed, a connection only receives for so long: peers notice that, and use UDP."""
 LOOK_S: Final = 0.25
-RETRY_S: Final = 0.5, 4.0
-"""Between the beginnings of two attempts, at most: the first value while nothing answers. A server that answers, and
-brings no relay, gets :data:`TRIES` of these, and then each wait is twice as long, up to the second value."""
-TRIES: Final = 4
+RETRY_S: Final = 0.5
+"""Between the beginnings of two attempts, at most;"""
+RETRY_AWAY_S: Final = 4.0
+"""and after :data:`AWAY_S` without the relay."""
+AWAY_S: Final = 60.0
 SPREAD: Final = 0.2
 """Each wait is shorter by up to this share, so that the members of a relay that restarts do not come at once."""
-AWAY_S: Final = 600.0
-"""After so long without the relay, each wait is the longest one."""
-PATIENCE_S: Final = 2.0, 5.0
-"""A connection may take the first value to open, and once more until the relay answers along it. A relay with many
-members that restarted may need longer: after each connection that brought nothing twice as long, up to the second."""
+ANSWER_S: Final = 3.0
+"""A connection that opened is kept alone for so long, until the relay answers along it."""
 UDP_WORKS: Final = "udp_works"
 PROBE_S: Final = 3.0
 """The command that asks for a probe waits for 5 s."""
@@ -127,7 +125,6 @@ class WebRelay:
         self._udp_silent_at = 0.0  # it is silent from then on, if it does not work before
         self._began_at = -inf  # the last attempt
         self._spread = 1.0
-        self._unanswered = 0  # connections since the relay answered along one
         self._answer_by = self._answered_at = monotonic()
         node.facts.add_stream(self.number)
 
@@ -175,8 +172,7 @@ class WebRelay:
         try:
             proxy = self._connector.proxy
             async with asyncio.timeout(PROBE_S):
-                sock = await self._connector.open(RETRY_S[0])
-                (await self._connector.upgrade(sock, PROBE_S)).lose("probed")
+                (await self._connector.upgrade(await self._connector.open(), PROBE_S)).lose("probed")
         except OSError as failure:  # TimeoutError too
             error = _name(failure)
         return {"error": error, "proxy": proxy}
@@ -187,10 +183,7 @@ class WebRelay:
             await self._until_wanted()
             self._began_at, self._spread = monotonic(), _RNG.uniform(1.0 - SPREAD, 1.0)
             try:
-                sock = await self._connector.open(self._wait_s)
-                patience_s = min(PATIENCE_S[0] * 2.0**self._unanswered, PATIENCE_S[1])
-                self._unanswered = min(self._unanswered + 1, 32)
-                stream = await self._connector.upgrade(sock, patience_s)
+                stream = await self._connector.upgrade(await self._connector.open(), OPEN_S)
             except OSError as error:
                 before, self._error = self._error, _name(error)
                 if self._error != before and (omitted := self._take_line()) is not None:
@@ -200,14 +193,13 @@ class WebRelay:
                 if self._works:
                     stream.lose("not_needed")
                 else:
-                    self._answer_by = monotonic() + patience_s
+                    self._answer_by = monotonic() + ANSWER_S
                     self._use(stream)
 
     @property
     def _wait_s(self) -> float:
         """Between the beginnings of the last attempt and the next one."""
-        wait_s = min(RETRY_S[0] * 2.0 ** max(0, self._unanswered - TRIES), RETRY_S[1])
-        return self._spread * (RETRY_S[1] if self._began_at > self._answered_at + AWAY_S else wait_s)
+        return self._spread * (RETRY_AWAY_S if self._began_at > self._answered_at + AWAY_S else RETRY_S)
 
     async def _until_wanted(self) -> None:
         """Until an attempt is due: the relay answers neither by UDP nor along the connection."""
@@ -218,7 +210,7 @@ class WebRelay:
             if udp_since <= now:
                 self._udp_silent_at = now + UDP_SILENT_S
             if self._works:
-                self._unanswered, self._answered_at, self._answer_by = 0, now, now + LOOK_S
+                self._answered_at, self._answer_by = now, now + LOOK_S
             due_at = max(self._began_at + self._wait_s, self._udp_silent_at)
             if self._stream is not None:
                 due_at = max(due_at, self._answer_by)
