@@ -57,13 +57,13 @@ def test_credentials_of_systemd_come_first(tmp_path: Path) -> None:
 
 
 _BROKEN: list[tuple[Break, str]] = [
-    (_unlink(CERTIFICATE), "No such file or directory: `openssl req"),
-    (_unlink(TLS_KEY), f"{TLS_KEY} cannot be read: No such file"),
+    (_unlink(CERTIFICATE), "is not a file that this user sees: `openssl req"),
+    (_unlink(TLS_KEY), f"{TLS_KEY} is not a file that this user sees"),
     (lambda folder: (folder / CERTIFICATE).write_text("x"), "are not a certificate and its key, in PEM"),
     (lambda folder: (folder / TLS_KEY).write_text("x"), "are not a certificate and its key, in PEM"),
     (lambda folder: write_tls_files(folder, "other.pem"), "is not that of the certificate"),
     (lambda folder: write_tls_files(folder, passphrase=b"secret"), "without a passphrase"),
-    (_make_pipe, "is not a regular file"),
+    (_make_pipe, "is not a file that this user sees"),
 ]
 
 
@@ -98,4 +98,6 @@ def test_its_port_is_its_own(tmp_path: Path) -> None:
     """Two cannot listen on one."""
     write_tls_files(tmp_path)
     tcp = '[[endpoint]]\nname = "tcp"\nurl = "tcpin:127.0.0.1:5443"\n'
-    assert "where endpoint[1].url (tcp) listens too" in refused(tmp_path, _RELAY + tcp + HTTPS)["relay_server.https"]
+    assert (
+        "has the port of endpoint[1].url (tcp) too" in refused(tmp_path, _RELAY + tcp + HTTPS)["relay_server.https"]
+    )

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from uavlinkd.authority.certificates import MemberRole
 from uavlinkd.config.model import ConfigError, PeerAddress, Problem
-from uavlinkd.config.schema import SECTIONS, SINGLE, TITLES, TOP
+from uavlinkd.config.schema import POLICY, SECTIONS, SINGLE, TITLES, TOP
 from uavlinkd.config.section import Keys, Values, read
 from uavlinkd.mavlink.policy.settings import INSTEAD_OF_DENIAL
 
@@ -135,8 +135,8 @@ _BARE_KEY = re.compile(r"[A-Za-z0-9_-]{1,32}")
 
 
 def example_of(key: str) -> str | None:
-    """A value of a key as it is written in TOML; None if no section has the key."""
-    return next((keys[key].example for keys in (TOP, *SECTIONS.values()) if key in keys), None)
+    """A value of a key as it is written in TOML; None if no section has the key, or a policy has it."""
+    return next((keys[key].example for keys in (TOP, *SECTIONS.values()) if key in keys and key not in POLICY), None)
 
 
 _IN_A_FILE = "the name of a file that holds the key: this file never contains a key"

@@ -34,7 +34,8 @@ def _members(file: File) -> Found:
 
 
 def _relays(file: File) -> Found:
-    """Each relay has an address over IP, and a key that is not a member's."""
+    """Each relay has a name of its own, an address over IP, and a key that is not a member's."""
+    yield from unique(file.used_relays, "name")
     if len(file.used_relays) > MOST:
         count = f"{len(file.used_relays)} sections, with each [[contact]] that relays"
         yield "relay", f"has {count}: write at most {MOST}, the most reliable ones"

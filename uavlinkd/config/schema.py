@@ -205,14 +205,7 @@ LINK: Final[Keys] = {
     "idle_probe_s": _seconds(c.PROBE_IDLE_S, 0, 3600),
 }
 """``[link]``, and the same keys in ``[[peer]]``: how to communicate with peers."""
-_POLICY_EXAMPLES: Final = {
-    "role": '"swarm-member"',
-    "system_ids": "[2]",
-    **dict.fromkeys(("allow_in", "allow_out"), '["heartbeat", "telemetry"]'),
-    **dict.fromkeys(("rate_in", "rate_out"), "{ ATTITUDE = 10 }"),
-    **dict.fromkeys(("mavlink1", "ground_station"), "false"),
-}
-POLICY: Final[Keys] = {key: Key(anything, None, _POLICY_EXAMPLES[key]) for key in POLICY_KEYS}
+POLICY: Final[Keys] = dict.fromkeys(POLICY_KEYS, Key(anything, None))
 """The keys that limit messages. :func:`uavlinkd.mavlink.policy.settings.read_settings` checks them together."""
 _WITH_KEY: Final[Keys] = {
     "name": Key(_name, written='"drone1"'),

@@ -108,7 +108,7 @@ class Key(NamedTuple):
             return self.written
         if isinstance(self.default, bool):
             return str(not self.default).lower()
-        return f"{self.default:g}" if isinstance(self.default, int | float) else f'"{self.default}"'
+        return str(self.default) if isinstance(self.default, int | float) else f'"{self.default}"'
 
 
 Keys = Mapping[str, Key]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -37,19 +38,16 @@ def load_tls(certificate: Path, key: Path) -> SSLContext:
     """What a server of TLS needs. Raises TlsFileError if the files cannot be used."""
     from uavlinkd.tls.channel import server_context  # noqa: PLC0415  only if configured
 
-    for what, path in (("certificate", certificate), ("key", key)):
-        try:
-            if path.exists() and not path.is_file():  # opening a pipe would wait for its writer
-                raise TlsFileError(f"{what} {path} is not a regular file: {_MAKE}")
-            path.open("rb").close()
-        except OSError as error:
-            remedy = _MAKE if isinstance(error, FileNotFoundError) else "the daemon's user has to read it"
-            raise TlsFileError(f"{what} {path} cannot be read: {error.strerror}: {remedy}") from None
+    for path in (certificate, key):
+        if not os.path.isfile(path):  # opening a pipe would wait for its writer
+            raise TlsFileError(f"{path} is not a file that this user sees: {_MAKE}")
     try:
         return server_context(str(certificate), str(key))
+    except PermissionError:
+        text = f"{certificate} or {key} cannot be read: the daemon's user has to read both"
     except (OSError, ValueError) as error:
         if getattr(error, "reason", "") == "KEY_VALUES_MISMATCH":
             text = f"key {key} is not that of the certificate {certificate}: write the two that were made together"
         else:
             text = f"{certificate} and {key} are not a certificate and its key, in PEM without a passphrase: {_MAKE}"
-        raise TlsFileError(text) from None
+    raise TlsFileError(text)

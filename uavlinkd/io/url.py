@@ -54,6 +54,10 @@ class NetworkUrl:
         return self.kind in _LISTENING
 
     @property
+    def is_udp(self) -> bool:
+        return self.kind in (EndpointKind.UDPIN, EndpointKind.UDPOUT)
+
+    @property
     def is_exposed(self) -> bool:
         """Whether its plain MAVLink can leave this machine, or arrive from another one."""
         return not self.address.is_loopback
