@@ -105,7 +105,7 @@ def test_a_budget_that_comes_with_a_reload_pays_for_nothing_before_it() -> None:
     outputs: list[Output] = []
     config = Peer(PeerSettings("alpha", KEY_A.public, None, link), (), TRUSTED)
     peer_link = link_of(pair.b, config, outputs.extend)
-    while pair.b.peer.traffic.bytes_sent < 1_000_000:
+    while pair.b.peer.paths.totals.bytes_sent < 1_000_000:
         peer_link.send(heartbeat() * 20, PASSES, 1.0, 0.0)
     peer_link.change(replace(config, egress=EgressSettings(budget_bits_s=BUDGET_BITS_S)), 2.0)
     outputs.clear()

@@ -511,13 +511,13 @@ def test_memory_for_initiations_is_bounded_and_belongs_to_each_peer(monkeypatch:
 def test_bytes_to_other_addresses_are_counted_apart() -> None:
     """Responses to replayed initiations take nothing from a link's budget."""
     pair = established()
-    traffic = pair.b.peer.traffic
-    before, elsewhere = (traffic.datagrams_sent, traffic.bytes_sent), traffic.bytes_elsewhere
+    traffic, paths = pair.b.peer.traffic, pair.b.peer.paths
+    before, elsewhere = paths.totals, traffic.bytes_elsewhere
     answer = only(datagrams(pair.b.receive(made_initiation(), 1.0, ELSEWHERE), wire.RESPONSE))
-    assert (traffic.datagrams_sent, traffic.bytes_sent) == before
+    assert paths.totals == before
     assert traffic.bytes_elsewhere - elsewhere == len(answer)
     answer = only(datagrams(pair.b.receive(made_initiation(), 1.0), wire.RESPONSE))
-    assert (traffic.datagrams_sent, traffic.bytes_sent) == (before[0] + 1, before[1] + len(answer))
+    assert paths.totals[:2] == (before.datagrams_sent + 1, before.bytes_sent + len(answer))
 
 
 # Cookies under load.

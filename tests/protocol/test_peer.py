@@ -214,25 +214,29 @@ def test_silent_peer_is_lost_although_the_last_counter_is_used(watchful: Pair) -
 
 def test_traffic_is_counted(pair: Pair) -> None:
     """Envelopes and bytes are counted at both ends, and agree."""
-    ours, theirs = pair.a.peer.traffic, pair.b.peer.traffic
-    before = (ours.envelopes_sent, ours.bytes_sent, theirs.envelopes_received, theirs.bytes_received)
+    ours, theirs = pair.a.peer, pair.b.peer
+
+    def counts() -> tuple[int, ...]:
+        of_envelopes = ours.envelopes_sent, theirs.envelopes_received
+        return *of_envelopes, ours.paths.totals.bytes_sent, theirs.paths.totals.bytes_received
+
+    before = counts()
     sent = datagrams(pair.a.send(1.0)) + datagrams(pair.a.send(1.0))
     for datagram in sent:
         pair.b.receive(datagram, 1.0)
-    after = (ours.envelopes_sent, ours.bytes_sent, theirs.envelopes_received, theirs.bytes_received)
     size = sum(map(len, sent))
-    assert [late - early for late, early in zip(after, before, strict=True)] == [2, size, 2, size]
-    assert ours.handshakes == theirs.handshakes == 1
+    assert [late - early for late, early in zip(counts(), before, strict=True)] == [2, 2, size, size]
+    assert ours.traffic.handshakes == theirs.traffic.handshakes == 1
 
 
 def test_copy_that_is_not_sent_is_not_counted_and_one_that_waited_is_counted_later(pair: Pair) -> None:
     """In the totals of the path and of the peer, for which a budget is charged. They never go below zero."""
     pair.a.send(1.0)
-    peer, traffic = pair.a.peer, pair.a.peer.traffic
+    peer = pair.a.peer
     state = peer.paths.by_path[AT_B]
 
     def totals() -> tuple[int, ...]:
-        return state.sent, state.datagrams_sent, state.bytes_sent, traffic.datagrams_sent, traffic.bytes_sent
+        return state.sent, state.datagrams_sent, state.bytes_sent, *peer.paths.totals[:2]
 
     before, size = totals(), len(FRAME)
     peer.recount(AT_B, -1, -size)

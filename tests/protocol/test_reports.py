@@ -160,11 +160,11 @@ def test_a_report_asks_for_nothing_and_goes_where_the_traffic_goes() -> None:
     pair.b.receive(pair.a.envelope(1.0), 1.0, ELSEWHERE)
     peer.unanswered_since = None
     peer.timers.stop(Timer.SILENCE)
-    before = peer.traffic.bytes_sent
+    before = peer.paths.totals.bytes_sent
     sent = only(of(pair.b.node.report_refusals(peer, [ARM], 1.0), Transmit))
     assert sent.path == AT_A
     assert unsealed(pair.a.session, sent.datagram) == RefusalReport((ARM,)).encode()
-    assert peer.traffic.bytes_sent == before + len(sent.datagram)
+    assert peer.paths.totals.bytes_sent == before + len(sent.datagram)
     assert peer.unanswered_since is None
     assert peer.timers.deadlines[Timer.SILENCE] == c.NEVER
     assert pair.a.receive(sent.datagram, 1.0) == []
@@ -229,7 +229,6 @@ def test_a_claim_changes_nothing_else(report_of: Callable[[int], Report]) -> Non
         assert len(claims(pair.b)) == c.REFUSALS_KEPT
     else:
         assert pair.b.peer.claims.problems == ((249, 255), 1.0)
-    pair.b.peer.traffic.bytes_received = twin.b.peer.traffic.bytes_received
     for name in ("timers", "traffic", "path", "is_up", "received_at", "unanswered_since"):
         ours, theirs = (state_of(getattr(side.peer, name)) for side in (pair.b, twin.b))
         assert ours == theirs, name

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import repeat
 from typing import Final
 
 from uavlinkd.daemon.journal import DaemonJournal, ShellReason
@@ -189,7 +190,9 @@ class Line:
             switch.refresh(now)
         known = switch.ports[source]
         flows, sendings = known.flows, switch.router.sendings
+        is_alone = len(frames) == 1
         batches: dict[Port, list[Frame]] = {}
+        of_one: Iterable[tuple[Port, Sequence[Frame]]] = ()
         for frame in frames:
             try:
                 raw, header = frame
@@ -212,17 +215,20 @@ class Line:
             except Exception as error:  # a fault costs this frame: no policy let it pass
                 report(error)
                 continue
+            if is_alone:
+                of_one = zip(ports, repeat(frames))
+                break
             for port in ports:
                 if port in batches:
                     batches[port].append(frame)
                 else:
                     batches[port] = [frame]
-        for port, batch in batches.items():
+        for port, batch in of_one if is_alone else batches.items():
             try:
                 if isinstance(port, PeerLink) and port.output.is_plain and not port.peer.paths.is_multiple:
                     peer = port.peer
                     port.frames_sent += len(batch)
-                    out = send_frames(peer, list(map(RAW, batch)), now, STREAM)
+                    out = send_frames(peer, [raw] if is_alone else list(map(RAW, batch)), now, STREAM)
                     timers = peer.timers
                     if timers.next_at < timers.scheduled_at:  # as Node.send() does, without a call
                         self._schedule.update(peer)

@@ -52,7 +52,8 @@ class Rates:
         totals: dict[Peer | PathState, tuple[int, int]] = {
             state: (state.bytes_received, state.bytes_sent) for state in peer.paths.states
         }
-        totals[peer] = peer.traffic.bytes_received, peer.traffic.bytes_sent
+        _, sent, received = peer.paths.totals
+        totals[peer] = received, sent
         self._rates = {
             one: ((received - self._totals[one][0]) / elapsed_s, (sent - self._totals[one][1]) / elapsed_s)
             for one, (received, sent) in totals.items()

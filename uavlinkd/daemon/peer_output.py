@@ -120,7 +120,7 @@ class PeerOutput:
             self.egress.spend(size, now, datagrams=datagrams)
 
     def _sent(self) -> tuple[int, int]:
-        return self._peer.traffic.datagrams_sent, self._peer.traffic.bytes_sent
+        return self._peer.paths.totals[:2]
 
     # Changes.
 

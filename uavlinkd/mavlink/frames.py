@@ -146,7 +146,7 @@ def parse_frames(
     Returns where they end, and why no frame is there: None at the end of the data, TRUNCATED if the bytes could
     become one with more bytes. If no frame ``is_expected`` at the first place, a frame there must be known.
     """
-    size, before = len(data), len(frames)
+    size = len(data)
     fault: FrameFault | None = None
     while position < size:
         # What is missing at the end counts as 0: no frame is complete there.
@@ -183,9 +183,9 @@ def parse_frames(
         elif header is None:
             header = targeted_header(key, message, data[payload_at:checksum_at])
         frames.append(_new_frame(Frame, (data[position:end], header)))
+        counters.frames += 1
         position = end
         is_expected = True
-    counters.frames += len(frames) - before
     return position, fault
 
 

@@ -178,7 +178,7 @@ def peer_status(link: PeerLink, now: float, way_of: WayOf) -> dict[str, object]:
     """The status of a peer."""
     peer = link.peer
     session = peer.sessions.current
-    traffic = peer.traffic
+    traffic, totals = peer.traffic, peer.paths.totals
     expected_there, received_there = traffic.reported
     return _peer_now(link, now) | {
         "public_key": encode_key(peer.settings.public_key),
@@ -198,11 +198,11 @@ def peer_status(link: PeerLink, now: float, way_of: WayOf) -> dict[str, object]:
             "lost_out": expected_there - received_there,
         },
         "handshakes": traffic.handshakes,
-        "envelopes_sent": traffic.envelopes_sent,
-        "envelopes_received": traffic.envelopes_received,
-        "bytes_sent": traffic.bytes_sent,
+        "envelopes_sent": peer.envelopes_sent,
+        "envelopes_received": peer.envelopes_received,
+        "bytes_sent": totals.bytes_sent,
         "bytes_elsewhere": traffic.bytes_elsewhere,
-        "bytes_received": traffic.bytes_received,
+        "bytes_received": totals.bytes_received,
         **{problem.value: count for problem, count in link.problems(now).items()},
         "role": link.config.policy.get("role"),
         "frames_sent": link.frames_sent,
@@ -267,8 +267,8 @@ def used_relay_status(relay: RelayLink, daemon: DaemonParts, now: float) -> dict
             for link in daemon.links.values()
             if relay.config.name in link.config.relays
         },
-        "bytes_received": peer.traffic.bytes_received,
-        "bytes_sent": peer.traffic.bytes_sent,
+        "bytes_received": peer.paths.totals.bytes_received,
+        "bytes_sent": peer.paths.totals.bytes_sent,
         "drops": _counts(peer.traffic.drops),
     }
 

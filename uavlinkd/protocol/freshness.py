@@ -122,6 +122,8 @@ def end(peer: Peer, sessions: list[Session]) -> list[Output]:
         out += _drop_held(peer, session)
         peer.echo_requests.forget(session)
         peer.traffic.missing += session.missing(c.NEVER)
+        peer.traffic.sealed += session.send_counter
+        peer.traffic.opened += session.received
     return out
 
 

@@ -12,6 +12,14 @@ from uavlinkd.protocol.path_state import PathState
 from uavlinkd.protocol.session import Session
 
 
+class Totals(NamedTuple):
+    """The datagrams along all paths to one peer: envelopes, and the handshake messages that this end sent."""
+
+    datagrams_sent: int
+    bytes_sent: int
+    bytes_received: int
+
+
 class Outlet(NamedTuple):
     """How the next frame of a stream leaves along the only path: decided once, for as long as nothing changes."""
 
@@ -37,6 +45,7 @@ class PathSlots:
         """The slots in use: the configured paths first, then the oldest."""
         self.best: PathState | None = None
         """Where frames go; a path that failed stays the best while there is no other."""
+        self._departed = Totals(0, 0, 0)
         self.outlet: Outlet | None = None
         """None where :func:`.send_frames` must decide: about classes, questions, long frames, the probe's timer."""
         self.unproven = 0
@@ -49,6 +58,12 @@ class PathSlots:
     def states(self) -> list[PathState]:
         """Every slot in use, the configured paths first."""
         return list(self.by_path.values())
+
+    @property
+    def totals(self) -> Totals:
+        """What went along these paths, and along those that there were before. It only grows."""
+        rows = [(state.datagrams_sent, state.bytes_sent, state.bytes_received) for state in self.by_path.values()]
+        return Totals(*map(sum, zip(self._departed, *rows, strict=True)))
 
     @property
     def has_several(self) -> bool:
@@ -150,6 +165,8 @@ class PathSlots:
         return PathState(path, number, now, is_configured=is_configured, is_metered=is_metered, is_stream=is_stream)
 
     def _drop(self, state: PathState) -> None:
+        sent, size, received = self._departed
+        self._departed = Totals(sent + state.datagrams_sent, size + state.bytes_sent, received + state.bytes_received)
         self.unproven += not (state.is_validated or state.is_configured)
         if not state.is_known:
             return

@@ -33,16 +33,13 @@ from uavlinkd.protocol.timers import Timer, TimerTable
 class Traffic:
     """Counters that only grow, as long as the daemon runs."""
 
-    datagrams_sent: int = 0
-    """Envelopes and handshake messages; ``bytes_sent`` are theirs."""
-    bytes_sent: int = 0
     bytes_elsewhere: int = 0
     """Of responses to addresses where the peer is not known to be. An attacker that replays its handshakes causes
-    them, so ``bytes_sent``, which a link's budget pays for, does not include them."""
-    envelopes_sent: int = 0
-    envelopes_received: int = 0
-    bytes_received: int = 0
-    """Of the envelopes."""
+    them, so the totals of paths, which a link's budget pays for, do not include them."""
+    sealed: int = 0
+    """Envelopes to the peer, of sessions that have ended."""
+    opened: int = 0
+    """Envelopes of the peer that were accepted, of sessions that have ended."""
     handshakes: int = 0
     drops: Counter[DropReason] = field(default_factory=Counter)
     missing: int = 0
@@ -160,6 +157,16 @@ class Peer:
         """The best path: the stream goes there."""
         return None if self.paths.best is None else self.paths.best.path
 
+    @property
+    def envelopes_sent(self) -> int:
+        """Envelopes to the peer on all sessions so far."""
+        return self.traffic.sealed + sum(session.send_counter for session in self.sessions.confirmed)
+
+    @property
+    def envelopes_received(self) -> int:
+        """Envelopes of the peer that were accepted, on all sessions so far."""
+        return self.traffic.opened + sum(session.received for session in self.sessions.confirmed)
+
     def missing(self, now: float) -> int:
         """Envelopes that the peer sent and that were not accepted, on all sessions so far; it only grows.
 
@@ -186,8 +193,6 @@ class Peer:
         """Datagrams with so many bytes together were sent along a path."""
         state.datagrams_sent += datagrams
         state.bytes_sent += size
-        self.traffic.datagrams_sent += datagrams
-        self.traffic.bytes_sent += size
 
     def recount(self, path: Path, datagrams: int, size: int) -> None:
         """A copy that :meth:`Node.send` returned waits or is dropped (-1 datagram), or is sent after it waited (1).

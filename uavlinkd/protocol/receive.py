@@ -102,9 +102,7 @@ class DatagramReceiver:
                 self.schedule.update(peer)
                 return copied
             out: list[Output] = []
-            sessions, traffic = peer.sessions, peer.traffic
-            traffic.envelopes_received += 1
-            traffic.bytes_received += size
+            sessions = peer.sessions
             state = peer.paths.by_path.get(path)
             is_candidate = False
             if state is None or sessions.unconfirmed:
@@ -134,7 +132,7 @@ class DatagramReceiver:
                 pass
             elif payload[0] >= FRAMES_FROM and is_new and peer.early is None and now < session.verification.look_at:
                 if counter != session.window.highest:
-                    traffic.out_of_order += 1
+                    peer.traffic.out_of_order += 1
                 order = 0 if session.arrivals is None else session.order_base + counter
                 out.append(new_tuple(Deliver, (peer, payload, order)))
             else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import Final
 
 from uavlinkd.protocol import constants as c
 from uavlinkd.protocol import wire
@@ -20,6 +21,8 @@ from uavlinkd.protocol.settings import Class
 from uavlinkd.protocol.timers import Timer
 from uavlinkd.protocol.wire import QUESTION_BYTES
 
+_NEARLY_WORN_OUT: Final = c.REKEY_AFTER_ENVELOPES - 4096
+"""From this counter on each call looks whether the keys may seal all of its payloads, which are fewer than the rest."""
 STREAM, CRITICAL, PROBE, SILENCE = Class.STREAM, Class.CRITICAL, Timer.PROBE, Timer.SILENCE
 """Members that each frame needs. The class of an enumeration looks them up by a Python function."""
 
@@ -171,22 +174,18 @@ def send_payloads(
     They expect an answer, unless they are one: two ends must not answer each other endlessly.
     """
     out: list[Output] = []
-    traffic = peer.traffic
     is_counted = session is peer.sessions.current
-    if session.send_counter + len(payloads) >= c.REKEY_AFTER_ENVELOPES:
+    if session.send_counter > _NEARLY_WORN_OUT:
         payloads = _limited(peer, session, payloads, now, out)
     for payload in payloads:
         datagram = session.seal(payload, now)
         size, is_copy = len(datagram), False
-        traffic.envelopes_sent += 1
         for state in route:
             if (is_copy and not peer.paths.carries(state, size)) or not (state.is_proven or state.allows(size)):
                 continue
             state.sent += is_counted
             state.datagrams_sent += 1
             state.bytes_sent += size
-            traffic.datagrams_sent += 1
-            traffic.bytes_sent += size
             out.append(new_tuple(Transmit, (datagram, state.path, is_copy)))
             is_copy = True
     if not payloads:
@@ -204,7 +203,7 @@ def _limited(
     peer: Peer, session: Session, payloads: Sequence[bytes], now: float, out: list[Output]
 ) -> Sequence[bytes]:
     """The payloads that the keys may still seal. From :data:`c.REKEY_AFTER_ENVELOPES` on there are to be new keys."""
-    if session.send_counter < c.REKEY_AFTER_ENVELOPES:
+    if session.send_counter < c.REKEY_AFTER_ENVELOPES <= session.send_counter + len(payloads):
         peer.timers.set(Timer.INITIATE, now)
     left = c.SESSION_ENVELOPE_LIMIT - session.send_counter
     out += peer.drop(DropReason.NO_SESSION, max(0, len(payloads) - left))

@@ -131,14 +131,14 @@ class Session:
     def seal(self, payload: bytes, now: float) -> bytes:
         """The next envelope: header, payload, tag. A counter is never used twice."""
         counter = self.send_counter
-        assert counter < c.SESSION_ENVELOPE_LIMIT
         if now >= self._sent_history.next_at:
             self._sent_history.note(counter - 1, counter, now)
-        self.send_counter = counter + 1
         if counter < c.SHORT_COUNTER_LIMIT:
             header = _pack_short(wire.SHORT_ENVELOPE, self.remote_index, counter)
         else:
+            assert counter < c.SESSION_ENVELOPE_LIMIT
             header = wire.envelope_header(self.remote_index, counter)
+        self.send_counter = counter + 1
         key = self._send
         if isinstance(key, AeadKey):
             return header + key.seal(counter, payload, header)

@@ -241,7 +241,7 @@ class Relays(Feature):
             silence = self._silences[link] = silences.get(link) or _Silence(now)
             received_at = -NEVER if peer.received_at is None else peer.received_at
             binds = silence.asked_at < received_at or not peer.is_up
-            if silence.look(peer.traffic.envelopes_received, received_at, now):
+            if silence.look(peer.envelopes_received, received_at, now):
                 for path in link.relayed:
                     if (relay := self._relay_of(path)) is not None:
                         relay.ask(path, binds=binds)
