@@ -88,6 +88,7 @@ class Scene:
             link_of={self.peer: self.link},
             peer_sockets=SimpleNamespace(budgets={}, senders=[]),
             features=[],
+            fleet=None,
             config=SimpleNamespace(fleet=None),
             journal=drops,
             evidence=SimpleNamespace(add_dropped=lambda *_: None),
