@@ -74,13 +74,3 @@ def test_broadcast_addresses_of_this_machine(lacks: Lacks) -> None:
     need(sys.platform == "linux", "Linux")
     for line in lacks(url="udpout:127.255.255.255:14550", address="127.255.255.255:5790"):
         assert re.match(r'(endpoint|peer) ".*": 127.255.255.255:\d+ is a broadcast address: write the address', line)
-
-
-def test_a_network_that_is_absent(tmp_path: Path) -> None:
-    """Its interface may be plugged in later."""
-    need(sys.platform == "linux", "Linux")
-    networks = "".join(f'[[network]]\nname = "{name}"\ninterface = "{name}"\n' for name in ("lo", "absent0"))
-    config = load(tmp_path, TOP + networks + PEER.replace(ADDRESSES, '["203.0.113.7:5790"]'))
-    assert [lack for lack in surroundings.look_around(config) if "network" in lack] == [
-        'network "absent0": there is no interface absent0 now: the daemon uses it as soon as it is there'
-    ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import asyncio.sslproto
+import gc
 import os
 import socket
 import ssl
@@ -19,8 +20,10 @@ from tests.needs import need
 from tests.tls_files import CERTIFICATE, TLS_KEY, write_tls_files
 from tests.waiting import PATIENCE_S, until
 from tests.web.served import PASSWORD, Events, Served, basic, is_answered, page_of, parsed
+from tests.web.statuses import overview
 from uavlinkd.config.tls_files import load_tls
-from uavlinkd.web import server
+from uavlinkd.ops.control import Answer
+from uavlinkd.web import server, watch
 from uavlinkd.web.server import MAX_HEADER_BYTES, MOST_CONNECTIONS
 
 STRANGER, OTHER = "127.0.0.2", "127.0.0.3"
@@ -125,6 +128,26 @@ async def test_half_a_tls_handshake_ends_the_connection(tmp_path: Path, rest: by
             writer.write(rest)
             assert (await page.ask()).status == 200
             assert await ended(reader) == b""
+
+
+@pytest.mark.long
+async def test_ended_connections_by_tls_do_not_fill_the_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each one leaves a circle of objects with a buffer of 256 kB."""
+    monkeypatch.setattr(server, "COLLECTED_EVERY", 8)
+    write_tls_files(tmp_path)
+    async with page_of(tls=load_tls(tmp_path / CERTIFICATE, tmp_path / TLS_KEY)) as page:
+        gc.disable()
+        try:
+            for _ in range(80):
+                async with connected(Served(page.address, None)) as (reader, writer):
+                    writer.write(b"no TLS, but enough bytes to be refused as such")
+                    await ended(reader)
+            left = sum(isinstance(one, asyncio.sslproto.SSLProtocol) for one in gc.get_objects())
+        finally:
+            gc.enable()
+        assert left < 20
 
 
 # Too many connections.
@@ -288,3 +311,37 @@ async def test_no_path_leads_to_a_file(page: Served, target: str) -> None:
 
 
 # Browsers.
+
+
+class BusyDaemon:
+    """A daemon of 200 peers that is asked all the time, and counts in its name how often it answered."""
+
+    def __init__(self) -> None:
+        self.answers = 0
+
+    def answer(self, request: str) -> Answer:
+        if request == "problems":
+            return {"problems": []}
+        self.answers += 1
+        return overview([f"drone{number}" for number in range(200)], name=f"answer {self.answers}")
+
+
+@pytest.fixture
+def busy(monkeypatch: pytest.MonkeyPatch) -> BusyDaemon:
+    monkeypatch.setattr(watch, "SHORTEST_S", 0.001)
+    monkeypatch.setattr(watch, "SHARE", 1.0)
+    return BusyDaemon()
+
+
+@pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="needs TCP_USER_TIMEOUT")
+async def test_a_browser_that_never_reads_is_gone_in_the_end(
+    monkeypatch: pytest.MonkeyPatch, busy: BusyDaemon
+) -> None:
+    """The kernel ends its connection."""
+    sooner = (socket.IPPROTO_TCP, "TCP_USER_TIMEOUT", 300)
+    monkeypatch.setattr(server, "_OPTIONS", [*server._OPTIONS, sooner])
+    monkeypatch.setattr(server, "MOST_CONNECTIONS", 1)
+    async with page_of(busy.answer) as page, crowd(page, 1, page.request("/events")):
+        await until(lambda: busy.answers > 10)
+        assert (await page.ask()).status == 0, "it has the only place"
+        await until_served(page)

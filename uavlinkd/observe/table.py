@@ -1,4 +1,4 @@
-"""The table of findings: cause, severity, certainty, sign, sentence, remedy, exit status.
+"""The table of findings: cause, severity, sign, sentence, remedy, exit status.
 
 The log, ``status``, its exit status, the page, the metrics and the table in ops/README.md read these rows. To add a
 finding, write its sign in :mod:`.signs` or :mod:`.traffic_signs` and a row here, where it belongs in the order.
@@ -20,20 +20,6 @@ from uavlinkd.protocol.drops import DropReason
 SECURITY, FAULT, WARNING = Severity
 
 
-class Certainty(Enum):
-    """How sure a finding is, and who can cause it."""
-
-    CERTAIN = "certain"
-    KEY_HOLDER = "needs a private key"
-    HINT = "a hint"
-    CLAIM = "what the peer says"
-    SILENCE = "silence for 3 s"
-    GUESS = "a guess from the kind of frames"
-
-
-CERTAIN, KEY_HOLDER, HINT, CLAIM, SILENCE, GUESS = Certainty
-
-
 class Exit(Enum):
     """What a finding means for the exit status of ``status``."""
 
@@ -48,7 +34,6 @@ class Row(NamedTuple):
 
     cause: str
     severity: Severity
-    certainty: Certainty
     sign: Callable[[Any], Iterable[Fields]]
     text: str
     remedy: str
@@ -74,94 +59,94 @@ _RELAY_SILENT: Final = (
 
 OF_DAEMON: Final = (
     Row(
-        *("own_key_elsewhere", SECURITY, KEY_HOLDER, signs.own_key_elsewhere),
+        *("own_key_elsewhere", SECURITY, signs.own_key_elsewhere),
         "a sender at {at} uses this daemon's private key, or an attacker replays an old recording",
         "if a card was copied, run `uavlinkd keygen` on one machine; else the key may be stolen: replace it",
         code=11,
     ),
     Row(
-        *("key_on_two_machines", SECURITY, KEY_HOLDER, signs.own_key_twice, *_TWO_MACHINES),
+        *("key_on_two_machines", SECURITY, signs.own_key_twice, *_TWO_MACHINES),
         Exit.RECENT,
         code=11,
     ),
     Row(
-        *("listen_address_missing", FAULT, CERTAIN, signs.listen_address_missing),
+        *("listen_address_missing", FAULT, signs.listen_address_missing),
         "no interface has {addresses}, which is in listen",
         "write an address of this machine (`ip -brief address`) or {wildcard}; or wait for the network",
         code=7,
     ),
     Row(
-        *("network_absent", FAULT, CERTAIN, signs.network_absent),
+        *("network_absent", FAULT, signs.network_absent),
         *("no peer is reached along {networks}", "{advice}"),
         code=7,
     ),
     Row(
-        *("raw_mavlink", WARNING, HINT, signs.raw_mavlink),
+        *("raw_mavlink", WARNING, signs.raw_mavlink),
         "bare MAVLink arrives from {at} at the port for peers, and is dropped",
         "let the autopilot or ground station send to the port of an [[endpoint]]",
     ),
     Row(
-        *("fault_inside", WARNING, CERTAIN, signs.fault_inside),
+        *("fault_inside", WARNING, signs.fault_inside),
         "the daemon caught faults of its own: {places}",
         "send what `uavlinkd status --json` prints, and the log, to the developers; frames pass meanwhile",
     ),
     Row(
-        *("configuration_refused", WARNING, CERTAIN, signs.configuration_refused),
+        *("configuration_refused", WARNING, signs.configuration_refused),
         "the last reload was refused, and the configuration before is in force: {problems}",
         "correct what `uavlinkd check --config {file}` prints, and run `uavlinkd reload`",
     ),
     Row(
-        *("frames_in_circle", WARNING, CERTAIN, signs.frames_in_circle),
+        *("frames_in_circle", WARNING, signs.frames_in_circle),
         "frames that went to {ways} came back from {back}, and are dropped: a client, a bridge or a radio joins both,"
         " or a sender there repeats equal frames",
         "let what joins them no longer forward from one to the other; give each sender its own system id",
     ),
     Row(
-        *("own_certificate_revoked", FAULT, CERTAIN, signs.own_certificate_revoked),
+        *("own_certificate_revoked", FAULT, signs.own_certificate_revoked),
         "the bulletin {number} revokes the certificate of this daemon (serial {serial}): members refuse it",
         "if this machine was not captured, run `uavlinkd enroll` here again and let the authority sign its line",
     ),
     Row(
-        *("bulletin_awaited", FAULT, CERTAIN, signs.bulletin_awaited),
+        *("bulletin_awaited", FAULT, signs.bulletin_awaited),
         "this daemon accepts no member by certificate: its bulletin is {number}, and require_bulletin is {required}",
         "run `uavlinkd fleet publish` where this daemon is reachable, or connect it to a pinned peer that has it",
     ),
     Row(
-        *("fleet_state_degraded", WARNING, CERTAIN, signs.fleet_state_degraded),
+        *("fleet_state_degraded", WARNING, signs.fleet_state_degraded),
         "{problem}: since the last restart, or after the next one, this daemon may accept revoked members",
         "let the daemon's user write there, and make room on the disk; then restart the daemon",
     ),
     Row(
-        *("bulletin_conflict", SECURITY, KEY_HOLDER, signs.bulletin_conflict),
+        *("bulletin_conflict", SECURITY, signs.bulletin_conflict),
         "{by} has another bulletin of the same number, or a newer one that accepts revoked members again: two copies"
         " of the authority's key are in use, or it is stolen. This daemon keeps its own one",
         "compare both folders of the authority; publish one with a higher number that revokes what both do",
     ),
     Row(
-        *("bulletin_rolled_back", WARNING, CLAIM, signs.bulletin_rolled_back),
+        *("bulletin_rolled_back", WARNING, signs.bulletin_rolled_back),
         "{by} has an older bulletin than it had: its disk was restored, or a second machine has its key",
         "it gets the newest one now: compare the machine, and replace its key if two have it",
     ),
     Row(
-        *("bad_certificate", WARNING, HINT, signs.member_refused(DropReason.BAD_CERTIFICATE)),
+        *("bad_certificate", WARNING, signs.member_refused(DropReason.BAD_CERTIFICATE)),
         "the authority of this fleet did not sign the certificate of {senders}",
         "if the sender is yours, run `uavlinkd enroll` there again, for this fleet; else it is an attacker",
     ),
     Row(
-        *("certificate_revoked", WARNING, HINT, signs.member_refused(DropReason.CERTIFICATE_REVOKED)),
+        *("certificate_revoked", WARNING, signs.member_refused(DropReason.CERTIFICATE_REVOKED)),
         "refused, because the bulletin revokes it, or `deny` in this file names it: {senders}",
         "none if it was captured; else let the authority sign it again",
     ),
     Row(
-        *("not_a_member", WARNING, HINT, signs.not_a_member),
+        *("not_a_member", WARNING, signs.not_a_member),
         "a sender has a key of no member here: {senders}",
         "if it is yours, run `uavlinkd pubkey` there, write into its [[member]] what that prints, and run `uavlinkd"
         " reload` here: a key that arrives proves nothing. Of a fleet, `uavlinkd fleet list` shows whose key it is:"
         " let a member of yours run `uavlinkd enroll` again, and leave a revoked one out",
     ),
-    Row("relay_not_answering", WARNING, SILENCE, signs.spare_relay_silent, *_RELAY_SILENT),
+    Row("relay_not_answering", WARNING, signs.spare_relay_silent, *_RELAY_SILENT),
     Row(
-        *("line_noise", WARNING, CERTAIN, signs.line_noise),
+        *("line_noise", WARNING, signs.line_noise),
         "on the serial network {network}, {noise} of {pieces} pieces of the last 10 s are damaged",
         "compare the baud rate ({baud} here) with the modem's; set MAVLINK=0 on both SiK modems; let no other process"
         " and no autopilot use the line; else the radio is at its limit",
@@ -171,7 +156,7 @@ OF_DAEMON: Final = (
 
 _PART: Final = (
     Row(
-        *("hidden_frame", SECURITY, CERTAIN, traffic_signs.hidden_frame),
+        *("hidden_frame", SECURITY, traffic_signs.hidden_frame),
         "{count:,} of its frames hid a forbidden frame, and were refused: more than by accident, outside of files",
         "treat {who} as captured",
     ),
@@ -179,20 +164,20 @@ _PART: Final = (
 """A peer or an endpoint."""
 
 OF_PEER: Final = (
-    Row("key_on_two_machines", SECURITY, KEY_HOLDER, signs.peers_key_twice, *_TWO_MACHINES, Exit.RECENT),
+    Row("key_on_two_machines", SECURITY, signs.peers_key_twice, *_TWO_MACHINES, Exit.RECENT),
     *_PART,
     Row(
-        *("refused_there", WARNING, CLAIM, traffic_signs.refused_there),
+        *("refused_there", WARNING, traffic_signs.refused_there),
         "it reports that it refuses {kinds}",
         "if these frames are needed, change the role, lists or system_ids for {here} in {who}'s file; a client here"
         f" with a foreign system id sets {SYSTEM_ID}",
     ),
     Row(
-        *("problems_there", WARNING, CLAIM, traffic_signs.problems_there),
+        *("problems_there", WARNING, traffic_signs.problems_there),
         *("it says about itself: {meanings}", "run `uavlinkd status` there"),
     ),
     Row(
-        *("revoked_but_pinned", WARNING, CLAIM, signs.revoked_but_pinned),
+        *("revoked_but_pinned", WARNING, signs.revoked_but_pinned),
         "the bulletin revokes its certificate (serial {serial}), but its [[peer]] in this file lets it in",
         "if it was captured, delete that section and run `uavlinkd reload`",
     ),
@@ -201,7 +186,7 @@ OF_PEER: Final = (
 
 _REFUSED: Final = (
     Row(
-        *("foreign_system", FAULT, CERTAIN, traffic_signs.foreign_system),
+        *("foreign_system", FAULT, traffic_signs.foreign_system),
         "{which} of its frames are of system {systems}; its system_ids {where} are {ids}",
         f"set {SYSTEM_ID} of its autopilot to {{ids}}; or, only if you know that {{who}} has this id, and no other"
         " has it, {how}; else a client there forwards such frames, or treat {who} as captured",
@@ -209,7 +194,7 @@ _REFUSED: Final = (
         code=1,
     ),
     Row(
-        *("all_refused", FAULT, CERTAIN, traffic_signs.all_refused),
+        *("all_refused", FAULT, traffic_signs.all_refused),
         "{rule} refuses every frame {which}: {reasons}",
         "`uavlinkd check` prints what passes: write the role that the other end has, or allow what it needs",
         Exit.FAILED,
@@ -217,7 +202,7 @@ _REFUSED: Final = (
         code=1,
     ),
     Row(
-        *("commands_withheld", WARNING, CERTAIN, traffic_signs.commands_withheld),
+        *("commands_withheld", WARNING, traffic_signs.commands_withheld),
         "{commands} withheld: {rule}",
         "intended, if {rule} is right; else write another role, or allow the command",
     ),
@@ -226,31 +211,31 @@ _REFUSED: Final = (
 
 OF_PEER_UP: Final = (
     Row(
-        *("freshness_unverified", FAULT, CERTAIN, traffic_signs.freshness_unverified),
+        *("freshness_unverified", FAULT, traffic_signs.freshness_unverified),
         "freshness unverified for {age_s:.0f} s: the peer's frames arrive, its echo replies do not: the direction"
         " from here to it is blocked, or an attacker delays frames. Commands, missions, parameters and manual control"
         " are held and dropped; reports pass and may be old",
         "fly by other means until answers return; look for a bad radio or a firewall in the direction to it",
     ),
     Row(
-        *("high_loss", WARNING, CERTAIN, traffic_signs.high_loss),
+        *("high_loss", WARNING, traffic_signs.high_loss),
         "many datagrams are lost: {losses}",
         "look for a bad radio, a full network or a rate limit in this direction",
     ),
     Row(
-        *("long_datagrams_dropped", WARNING, CERTAIN, traffic_signs.long_datagrams_dropped),
+        *("long_datagrams_dropped", WARNING, traffic_signs.long_datagrams_dropped),
         "the path to {path} drops datagrams of {dropped:,} bytes: frames share shorter ones, up to {limit:,} bytes",
         "nothing is lost by that; if the path should carry more, look for a tunnel with a small MTU",
     ),
     Row(
-        *("frames_unsent", WARNING, CERTAIN, traffic_signs.frames_unsent),
+        *("frames_unsent", WARNING, traffic_signs.frames_unsent),
         "{count:,} frames to it waited here for room on its network, and were dropped: clients here send more than"
         " the network, the connection by TLS or budget_bits_s carries",
         "lower the message rates of the clients here, end a log download, or raise a budget below what the network"
         " carries",
     ),
     Row(
-        *("roles_exchanged", FAULT, GUESS, traffic_signs.roles_exchanged),
+        *("roles_exchanged", FAULT, traffic_signs.roles_exchanged),
         'role = "vehicle" says that it is a vehicle, but it sends a ground station\'s heartbeat: the roles may be'
         " exchanged",
         "{advice}",
@@ -263,62 +248,62 @@ _down: Final = partial(Row, exit=Exit.FAILED)
 
 OF_PEER_DOWN: Final = (
     _down(
-        *("name_not_resolved", FAULT, CERTAIN, signs.name_not_resolved),
+        *("name_not_resolved", FAULT, signs.name_not_resolved),
         "{names} has no address now",
         "see `getent hosts {first}`, or write an IP address; the daemon tries again each second",
     ),
     _down(
-        *("firewall_here", FAULT, CERTAIN, signs.firewall_here),
+        *("firewall_here", FAULT, signs.firewall_here),
         "this machine refuses to send to {at} (EPERM)",
         "allow outgoing UDP from the daemon's port: see `sudo nft list ruleset`",
     ),
     _down(
-        *("no_route", FAULT, CERTAIN, signs.no_route),
+        *("no_route", FAULT, signs.no_route),
         *("this machine cannot send to {at} ({why})", "{advice}"),
     ),
     _down(
-        *("not_bound", FAULT, CERTAIN, signs.not_bound),
+        *("not_bound", FAULT, signs.not_bound),
         "{who} is not bound at the {relay}: it is off, cannot reach the relay (UDP blocked there), is not a member,"
         " does not use it, or keys differ",
         "start {who}; `uavlinkd status` there and at the relay names the cause; {advice}",
     ),
-    _down("relay_not_answering", FAULT, SILENCE, signs.relay_silent, *_RELAY_SILENT),
+    _down("relay_not_answering", FAULT, signs.relay_silent, *_RELAY_SILENT),
     _down(
-        *("wrong_key_here", FAULT, HINT, signs.wrong_key_here),
+        *("wrong_key_here", FAULT, signs.wrong_key_here),
         "a sender uses {keys}, which this file does not have",
         "run `uavlinkd pubkey` at {who}, and write into this file what that prints: a key that arrives proves"
         " nothing. After a change of keys, restart it with its new files; if the former key was stolen, this may be"
         " the thief",
     ),
     _down(
-        *("other_version", FAULT, HINT, signs.other_version),
+        *("other_version", FAULT, signs.other_version),
         "a sender at {at} speaks {versions}, this daemon uavlink/{ours}: the two cannot link",
         "update uavlinkd at {older}: it is older",
     ),
     _down(
-        *("wrong_key_there", FAULT, HINT, signs.wrong_key_there),
+        *("wrong_key_there", FAULT, signs.wrong_key_there),
         "a sender at {at} does not know this daemon's public key: that end may have another key for it",
         "{advice}",
         unless=frozenset({"other_version"}),
     ),
     _down(
-        *("wrong_psk", FAULT, HINT, signs.wrong_psk),
+        *("wrong_psk", FAULT, signs.wrong_psk),
         "the response from {sender} does not authenticate: the PSKs differ, or only one end has one",
         "give both ends the same psk_file; never remove a PSK: the message may be forged",
     ),
     _down(
-        *("no_common_suite", FAULT, HINT, signs.no_common_suite),
+        *("no_common_suite", FAULT, signs.no_common_suite),
         "it offers the suite {offered}; this end accepts {accepted}",
         "write this end's suites at {who}, or stronger ones at both ends; never weaker ones: an old recording can"
         " cause this",
     ),
     _down(
-        *("no_listener", FAULT, HINT, signs.no_listener),
+        *("no_listener", FAULT, signs.no_listener),
         "no process listens at {at}, or a firewall there rejects (ICMP)",
         "start uavlinkd at {who}, and compare its `listen` with `addresses` here",
     ),
     _down(
-        *("not_confirmed", FAULT, HINT, signs.not_confirmed),
+        *("not_confirmed", FAULT, signs.not_confirmed),
         "its initiations arrive, and it does not confirm this daemon's responses: these do not reach it, the PSKs"
         " differ, or an attacker replays old initiations",
         "let UDP from this daemon through the firewall at {who}; compare the PSKs",
@@ -328,12 +313,12 @@ OF_PEER_DOWN: Final = (
 
 OF_PEER_SILENT: Final = (
     _down(
-        *("closed_by_peer", FAULT, CERTAIN, signs.closed_by_peer),
+        *("closed_by_peer", FAULT, signs.closed_by_peer),
         "closed by the peer, {age_s:.0f} s ago: its daemon was stopped, or its file no longer has this daemon",
         "none if that is meant; else start uavlinkd at {who}",
     ),
     _down(
-        *("no_answer", FAULT, SILENCE, signs.no_answer),
+        *("no_answer", FAULT, signs.no_answer),
         "no answer from {places}: it is off or out of range, a firewall drops UDP here, there or between, or"
         " addresses, keys, PSKs or protocol versions differ{more}",
         "run `uavlinkd status` at {who}: it names the cause if datagrams arrive there; else open its firewall; of a"
@@ -341,7 +326,7 @@ OF_PEER_SILENT: Final = (
         unless=frozenset({"closed_by_peer"}),
     ),
     _down(
-        *("not_connecting", FAULT, SILENCE, signs.not_connecting),
+        *("not_connecting", FAULT, signs.not_connecting),
         "{who} has not connected, and this file has no address of it",
         "start {who}, and write this daemon's address into its file, or its address into this one, or a [[relay]]"
         " into both",
@@ -353,43 +338,43 @@ OF_ENDPOINT: Final = (
     *_PART,
     *_REFUSED,
     Row(
-        *("garbage", WARNING, CERTAIN, traffic_signs.is_silent_by("garbage")),
+        *("garbage", WARNING, traffic_signs.is_silent_by("garbage")),
         "bytes arrive at {url}, and none of them is MAVLink",
         "correct the baud rate, set the port of the autopilot to MAVLink, and let only this daemon read it",
         Exit.EVERYWHERE,
         code=6,
     ),
     Row(
-        *("client_silent", WARNING, CERTAIN, traffic_signs.is_silent_by("client_silent")),
+        *("client_silent", WARNING, traffic_signs.is_silent_by("client_silent")),
         "the client {clients} has sent no MAVLink for {silent_s:.0f} s",
         "check that it runs, speaks MAVLink here and sends, not only listens; then power, wiring and baud rate",
         code=4,
     ),
     Row(
-        *("device_unavailable", FAULT, CERTAIN, traffic_signs.is_silent_by("device_unavailable")),
+        *("device_unavailable", FAULT, traffic_signs.is_silent_by("device_unavailable")),
         *("{url} cannot be opened{error}", "{meaning}"),
         Exit.EVERYWHERE,
         code=5,
     ),
     Row(
-        *("no_client", WARNING, CERTAIN, traffic_signs.is_silent_by("no_client")),
+        *("no_client", WARNING, traffic_signs.is_silent_by("no_client")),
         "no client has sent MAVLink to {url} within {silent_s:.0f} s",
         "let the autopilot or ground station send there",
         Exit.EVERYWHERE,
         code=3,
     ),
     Row(
-        *("client_unreachable", WARNING, CERTAIN, traffic_signs.is_silent_by("client_unreachable")),
+        *("client_unreachable", WARNING, traffic_signs.is_silent_by("client_unreachable")),
         *("{url} cannot be reached: {why}", "{meaning}"),
         Exit.EVERYWHERE,
         code=3,
     ),
     Row(
-        *("send_fails", WARNING, CERTAIN, traffic_signs.send_fails),
+        *("send_fails", WARNING, traffic_signs.send_fails),
         *("datagrams to clients of {url} are lost ({error})", "{meaning}"),
     ),
     Row(
-        *("other_port", WARNING, CERTAIN, traffic_signs.other_port),
+        *("other_port", WARNING, traffic_signs.other_port),
         "datagrams from {other} are dropped: the client is {url}, at another port",
         "let the client send from that port; or write udpin:HOST:PORT here, and let the client send there",
     ),

@@ -25,7 +25,7 @@ _SERIAL_DEVICES = ("serial/by-id/*", "ttyACM*", "ttyUSB*", "serial0")
 
 def look_around(config: Config) -> list[str]:
     """Sentences for a person. The daemon may run in spite of them, now or later."""
-    lacks = _serial, _listening, _others, _control_socket, _networks
+    lacks = _serial, _listening, _others, _control_socket
     return [line for look_for in lacks for line in look_for(config)]
 
 
@@ -107,9 +107,3 @@ def _control_socket(config: Config) -> Iterator[str]:
             yield f"control_socket: the folder {path.parent} does not exist: run `mkdir -p {path.parent}`"
     elif not os.access(path.parent, os.W_OK | os.X_OK):
         yield f"control_socket: this user may not write to {path.parent}: the daemon's user needs to"
-
-
-def _networks(config: Config) -> Iterator[str]:
-    for network in config.networks:
-        if network.serial is None and not (presence := look(network.interface, network.address)).hosts:
-            yield f'network "{network.name}": {presence.reason} now: the daemon uses it as soon as it is there'

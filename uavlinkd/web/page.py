@@ -1,26 +1,53 @@
-"""The page of one daemon: what asks the daemon, what answers browsers, and the socket at which it does."""
+"""The page of one daemon: its resources, what asks the daemon, and the socket at which it answers browsers."""
 
 from __future__ import annotations
 
 import asyncio
 import ssl
 from collections.abc import Sequence
+from importlib.resources import files
 from pathlib import Path
 from socket import gethostname
 from types import TracebackType
 from typing import Any
 
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import Response, StreamingResponse
 from starlette.routing import BaseRoute, Route
 
 from uavlinkd.io.tcp import tcp_listener
 from uavlinkd.ops.control import ask
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic
-from uavlinkd.web.app import make_app
 from uavlinkd.web.guard import Guard
 from uavlinkd.web.scrapes import Scrapes
 from uavlinkd.web.server import WebServer
 from uavlinkd.web.watch import PATIENCE_S, Watcher
+
+_TYPES = {"page.js": "text/javascript", "page.css": "text/css", "icon.svg": "image/svg+xml"}
+
+
+def make_app(watch: Watcher, more: Sequence[BaseRoute]) -> Starlette:
+    """The resources, ``more`` before the page's own. Content is read once: no path of a request leads to a file."""
+    folder = files("uavlinkd.web") / "static"
+
+    def fixed(path: str, name: str, media_type: str) -> Route:
+        return Route(path, Response((folder / name).read_bytes(), media_type=media_type), methods=["GET"])
+
+    async def events(request: Request) -> Response:
+        peer = request.query_params.get("peer", "")
+        unbuffered = {"X-Accel-Buffering": "no"}  # nginx would collect events
+        return StreamingResponse(watch.messages(peer), headers=unbuffered, media_type="text/event-stream")
+
+    return Starlette(
+        routes=[
+            *more,
+            *(fixed(path, "index.html", "text/html") for path in ("/", "/peer/{name}")),
+            *(fixed(f"/{name}", name, media_type) for name, media_type in _TYPES.items()),
+            Route("/events", events),
+        ]
+    )
 
 
 class Page:

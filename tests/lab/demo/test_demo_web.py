@@ -21,7 +21,7 @@ import pytest
 from tests.processes.test_demo import ENDED_S, demo
 from tests.waiting import PATIENCE_S, until
 from uavlinkd.lab.demo.web import ATTACKS
-from uavlinkd.web.app import make_app
+from uavlinkd.web.page import make_app
 from uavlinkd.web.watch import Watcher
 
 NAMES = [spec.name for spec in ATTACKS.values()]
