@@ -40,7 +40,6 @@ from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.protocol import constants as c
 from uavlinkd.protocol.settings import Link, Redundancy, Timers
 from uavlinkd.protocol.suites import SUITES_BY_NAME
-from uavlinkd.relay.forwarding import RelayLimits
 from uavlinkd.system.addresses import Address
 
 
@@ -290,9 +289,9 @@ def test_relay_needs_members_and_little_else(tmp_path: Path) -> None:
     assert config.is_only_relay
     assert config.relay_server is not None
     (one,) = config.relay_server.members
-    assert (one.name, one.most_peers, one.limits) == ("b", 256, RelayLimits(9, 90_000))
+    assert (one.name, one.most_peers, one.bits_s) == ("b", 256, 90_000)
     assert one.peer.link.features & c.FEATURE_RECORDS
-    assert config.relay_server.limits == RelayLimits(10**6, 10**10)
+    assert config.relay_server.bits_s == 10**10
 
 
 # Warnings.

@@ -26,7 +26,6 @@ from uavlinkd.config.members import relay_member
 from uavlinkd.config.model import ConfigError, FleetConfig, PeerAddress
 from uavlinkd.protocol import constants as c
 from uavlinkd.protocol.settings import Link
-from uavlinkd.relay.forwarding import RelayLimits
 from uavlinkd.system.addresses import parse_address
 from uavlinkd.system.base64_text import to_base64
 
@@ -118,7 +117,7 @@ def test_relay_needs_no_member_sections(tmp_path: Path) -> None:
     assert config.relay_server.members == ()
     assert config.fleet is not None
     made = relay_member(config.fleet, bytes(32), Certificate(bytes(4), 9, _VEHICLE, (1, 1), "v1"))
-    assert (made.name, made.most_peers, made.limits) == ("v1", 256, RelayLimits(7, 70_000))
+    assert (made.name, made.most_peers, made.bits_s) == ("v1", 256, 70_000)
     assert (made.peer.is_certified, made.peer.initiates, made.peer.link.features) == (True, False, _BOTH)
 
 

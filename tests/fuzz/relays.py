@@ -33,13 +33,13 @@ from uavlinkd.protocol.relay_records import (
 from uavlinkd.protocol.settings import PeerSettings
 from uavlinkd.protocol.suites import SUITES_BY_NAME
 from uavlinkd.relay.bindings import QUARANTINED_PER_MEMBER, ConnectionEnd
-from uavlinkd.relay.forwarding import MemberSettings, RelayLimits
+from uavlinkd.relay.forwarding import MemberSettings
 from uavlinkd.relay.service import RelayService, RelayShell
 
 MOST_PEERS: Final = 3
 """The highest limit that a script sets. It begins with one."""
-LIMITS: Final = RelayLimits(200, 400_000)
-TOTAL: Final = RelayLimits(400, 800_000)
+LIMITS: Final = 2_000_000
+TOTAL: Final = 4_000_000
 PRIVATE: Final = tuple(bytes([number]) * c.KEY_BYTES for number in (11, 12, 13, 14))
 """Of the relay, and of three members."""
 RELAY_AT: Final = (

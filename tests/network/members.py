@@ -36,7 +36,7 @@ from uavlinkd.relay.bindings import QUARANTINED_PER_MEMBER
 from uavlinkd.relay.client_link import RelayLink
 from uavlinkd.relay.clients import Relays
 from uavlinkd.relay.direct_search import OwnSocket
-from uavlinkd.relay.forwarding import MemberSettings, RelayLimits
+from uavlinkd.relay.forwarding import MemberSettings
 from uavlinkd.relay.service import RelayService, RelayShell
 from uavlinkd.system import addresses
 
@@ -45,7 +45,7 @@ MOST_PEERS: Final = 8
 FEATURES: Final = c.KNOWN_FEATURES
 LINK: Final = Link(features=FEATURES)
 BULLETIN: Final = bulletin(1 << 24)
-_LIMITS: Final = RelayLimits(datagrams_s=20_000, bits_s=100_000_000)
+_LIMITS: Final = 200_000_000
 _REMEMBERED_S: Final = c.BIND_LIFETIME_S + c.QUESTION_LIFETIME_S + HOUSEKEEPING_S
 """A bind has no effect later than this."""
 _QUIET: Final = structlog.make_filtering_bound_logger("critical")

@@ -20,12 +20,12 @@ from uavlinkd.protocol.path import Path
 from uavlinkd.protocol.peer import Peer
 from uavlinkd.protocol.relay_records import Bind, Bound, CertificateRecord, Record, Who
 from uavlinkd.protocol.settings import PeerSettings
-from uavlinkd.relay.forwarding import MemberSettings, RelayLimits
+from uavlinkd.relay.forwarding import MemberSettings
 from uavlinkd.relay.service import RelayService, RelayShell
 
 RELAY_AT = Path(0, ("192.0.2.100", 5790))
 LINK = quiet(features=c.FEATURE_RECORDS | c.FEATURE_FLEET)
-LIMITS = RelayLimits(1000, 10_000_000)
+LIMITS = 10_000_000
 BULLETIN = published(Bulletin(FLEET, 1 << 24, 1, ()))
 PRIVATE = bytes([200]) * c.KEY_BYTES
 STEP_S = 0.1

@@ -21,13 +21,13 @@ from uavlinkd.relay.bindings import (
     ConnectionEnd,
     MemberConnection,
 )
-from uavlinkd.relay.forwarding import Forwarding, Meter, RelayLimits
+from uavlinkd.relay.forwarding import Forwarding, Meter
 
 A, B, C, D = (bytes([number]) * c.KEY_BYTES for number in range(1, 5))
 STRANGER = bytes([9]) * c.KEY_BYTES
 MEMBERS = (A, B, C, D)
 DATA = b"\x40datagram"
-UNLIMITED = RelayLimits(10**9, 10**12)
+UNLIMITED = 10**13
 PATHS = {
     member: [Path(socket, (f"192.0.2.{1 + MEMBERS.index(member)}", port)) for socket in (0, 1) for port in (1, 2, 3)]
     for member in MEMBERS

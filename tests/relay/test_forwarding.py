@@ -10,26 +10,26 @@ from uavlinkd.protocol.drops import DropReason
 from uavlinkd.protocol.path import Path
 from uavlinkd.protocol.relay_records import INNER_STARTS, wrap
 from uavlinkd.relay.bindings import ConnectionEnd, MemberConnection
-from uavlinkd.relay.forwarding import BURST_S, Forwarding, Meter, RelayLimits, RelayReason
+from uavlinkd.relay.forwarding import BURST_S, LEAST_BYTES, Forwarding, Meter, RelayReason
 
 AT_A, AT_B = Path(0, ("192.0.2.1", 1000)), Path(1, ("2001:db8::2", 2000, 0, 0))
 A, B = ConnectionEnd(b"a" * 32, AT_A, 0x1111), ConnectionEnd(b"b" * 32, AT_B, 0x2222)
 DATAGRAM = b"\x40datagram"
-DEFAULT = RelayLimits(2000, 20_000_000)
-AMPLE = RelayLimits(1_000_000, 10**10)
+DEFAULT = 20_000_000
+AMPLE = 10**10
 STRANGER = ("198.51.100.9", 4000)
 
 
 class Relay:
     """A forwarding with one connection, and what it sent."""
 
-    def __init__(self, limits: RelayLimits = DEFAULT, total: RelayLimits = AMPLE) -> None:
+    def __init__(self, bits_s: int = DEFAULT, total: int = AMPLE) -> None:
         self.now = 0.0
         self.sent: list[tuple[bytes, Path]] = []
         self.forwarding = Forwarding(
             lambda datagram, path: self.sent.append((datagram, path)), lambda: self.now, total
         )
-        self.meters = Meter(limits), Meter(limits)
+        self.meters = Meter(bits_s), Meter(bits_s)
         self.forwarding.open(MemberConnection(A, B), self.meters)
 
     def arrive(self, *datagrams: bytes, path: Path = AT_A, now: float = 0.0) -> None:
@@ -123,7 +123,7 @@ def test_address_that_another_member_has_now_keeps_its_route() -> None:
 
 def test_member_over_its_limit_slows_only_itself() -> None:
     """The rest of what it sends is dropped and counted as its own; the other member is not affected."""
-    relay = Relay(RelayLimits(1000, 1_000_000_000))
+    relay = Relay(10_000_000)
     for tick in range(1000):
         relay.arrive(*[wrap(A.handle, DATAGRAM)] * 10, now=tick / 1000)
         relay.arrive(wrap(B.handle, DATAGRAM), path=AT_B, now=tick / 1000)
@@ -137,20 +137,20 @@ def test_member_over_its_limit_slows_only_itself() -> None:
 
 def test_bits_are_limited_too() -> None:
     """By the length of the datagrams."""
-    meter = Meter(RelayLimits(1_000_000, 1_000_000))
-    passed = sum(1000 for tick in range(1000) if meter.take(1000, tick / 1000))
-    assert passed * 8 == pytest.approx(1_000_000 * (1 + BURST_S), abs=8 * 1500)
+    meter = Meter(1_000_000)
+    passed = sum(2000 for tick in range(1000) if meter.take(2000, tick / 1000))
+    assert passed * 8 == pytest.approx(1_000_000 * (1 + BURST_S), abs=8 * 2000)
 
 
 def test_lowest_limits_let_single_datagrams_pass() -> None:
     """Although their rate has none in a burst's time."""
-    meter = Meter(RelayLimits(1, 1000))
+    meter = Meter(1000)
     assert [meter.take(1232, now) for now in (0.0, 1.0, 10.0, 20.0)] == [True, False, True, True]
 
 
 def test_silence_saves_up_no_more_than_a_burst() -> None:
     """A bucket, not an account."""
-    meter = Meter(RelayLimits(1000, 1_000_000_000))
+    meter = Meter(10_000_000)
     meter.take(10, 0.0)
     assert sum(meter.take(10, 3600.0) for _ in range(1000)) == pytest.approx(1000 * BURST_S, abs=1)
 
@@ -167,7 +167,7 @@ def test_log_download_survives_a_pause() -> None:
 
 def test_limit_of_all_members_together() -> None:
     """A datagram that exceeds it is counted for no member. Beside it the limits of a member hold again later."""
-    relay = Relay(total=RelayLimits(1000, 10**9))
+    relay = Relay(total=10_000_000)
     for _ in range(400):
         relay.arrive(wrap(A.handle, DATAGRAM))
         relay.arrive(wrap(B.handle, DATAGRAM), path=AT_B)
@@ -176,24 +176,24 @@ def test_limit_of_all_members_together() -> None:
     assert all(abs(meter.datagrams - half) <= 1 for meter in relay.meters)
     assert [meter.over_limit for meter in relay.meters] == [0, 0]
     assert relay.forwarding.dropped == {RelayReason.OVER_TOTAL: 800 - len(relay.sent)}
-    relay.forwarding.total.set_limits(AMPLE)
+    relay.forwarding.total.set_limit(AMPLE)
     relay.arrive(*[wrap(A.handle, DATAGRAM)] * 1000, now=1.0)
-    assert relay.meters[0].datagrams - half == pytest.approx(DEFAULT.datagrams_s * BURST_S, abs=2)
+    assert relay.meters[0].datagrams - half == pytest.approx(DEFAULT / (8 * LEAST_BYTES) * BURST_S, abs=2)
 
 
 def test_member_above_its_limit_uses_up_nothing_of_the_others() -> None:
     """The limit of all members together has room for both. One of them sends more than all may."""
-    limits = RelayLimits(200, 10**9)
-    relay = Relay(limits, total=RelayLimits(1000, 10**9))
+    bits_s = 2_000_000
+    relay = Relay(bits_s, total=10_000_000)
     relay.arrive(*[wrap(A.handle, DATAGRAM)] * 1000)
     relay.arrive(*[wrap(B.handle, DATAGRAM)] * 1000, path=AT_B)
-    assert [meter.datagrams for meter in relay.meters] == pytest.approx([limits.datagrams_s * BURST_S] * 2, abs=1)
+    assert [meter.datagrams for meter in relay.meters] == pytest.approx([200 * BURST_S] * 2, abs=1)
     assert RelayReason.OVER_TOTAL not in relay.forwarding.dropped
 
 
 def test_limits_can_change() -> None:
     """From then on."""
-    meter = Meter(RelayLimits(1000, 1_000_000_000))
+    meter = Meter(10_000_000)
     meter.take(10, 0.0)
-    meter.set_limits(RelayLimits(100_000, 1_000_000_000))
+    meter.set_limit(1_000_000_000)
     assert sum(meter.take(10, 1.0) for _ in range(100_000)) == pytest.approx(100_000 * BURST_S, abs=1)

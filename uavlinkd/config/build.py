@@ -36,7 +36,6 @@ from uavlinkd.system.addresses import IPV6_UDP_BYTES
 
 if TYPE_CHECKING:
     from uavlinkd.authority.trust import HeldCertificate
-    from uavlinkd.relay.forwarding import RelayLimits
 
 VERIFYING_SHARE: Final = 0.05
 """Share of the budget that the echo requests and replies of one end may use."""
@@ -47,8 +46,6 @@ _PEERS_OF_MEMBER: Final = 256
 """Members that one member may ask for."""
 _RETRIES_BEFORE_REJECT: Final = 2
 """The ends need time to make new keys before they drop the old ones."""
-_BITS_OF_DATAGRAM: Final = 10_000
-"""A relay passes one datagram for each so many bits that it may pass: almost the largest that fits Ethernet."""
 # A policy's messages repeat a group, a message, a command or a number, so that a person can search for it.
 # Any other text may be a secret, or control a terminal, or have a million digits.
 _WORD = re.compile(r"[A-Za-z0-9_:. -]{1,32}|[A-Z][A-Z0-9_]{0,55}|command:[A-Z0-9_]{1,55}")
@@ -97,7 +94,7 @@ def _fleet(file: File, states: Path) -> FleetConfig:
         policies=MappingProxyType(policies),
         relays=tuple(relay.get("name") for relay in file.used_relays),
         state_file=states / f"{file.top.get('name')}.fleet-state",
-        member_limits=_limits(file.one("relay_server").get("member_bits_s")),
+        member_bits_s=file.one("relay_server").get("member_bits_s"),
     )
 
 
@@ -264,19 +261,12 @@ def _relay_server(file: File) -> RelayServer:
 
     keys, link = file.one("relay_server"), replace(_link(file.one("link")), features=c.FEATURE_RECORDS)
     link = fleet_link(link) if file["fleet"] else link
-    limits = _limits(keys.get("member_bits_s"))
     members = (
         PeerSettings(one.get("name"), one.get("public_key"), one.get("psk_file"), link, initiates=False)
         for one in file["member"]
     )
     return RelayServer(
-        members=tuple(MemberSettings(peer, _PEERS_OF_MEMBER, limits) for peer in members),
-        limits=_limits(keys.get("bits_s")),
+        members=tuple(MemberSettings(peer, _PEERS_OF_MEMBER, keys.get("member_bits_s")) for peer in members),
+        bits_s=keys.get("bits_s"),
         https=keys.get("https"),
     )
-
-
-def _limits(bits_s: int) -> RelayLimits:
-    from uavlinkd.relay.forwarding import RelayLimits  # noqa: PLC0415  only if configured
-
-    return RelayLimits(max(1, bits_s // _BITS_OF_DATAGRAM), bits_s)

@@ -91,4 +91,4 @@ def relay_member(fleet: FleetConfig, key: bytes, certificate: Certificate) -> Me
 
     link = replace(fleet.link, features=c.FEATURE_RECORDS | c.FEATURE_FLEET)
     peer = PeerSettings(certificate.name, key, None, link, initiates=False, is_certified=True)
-    return MemberSettings(peer, CERTIFIED_PEERS, fleet.member_limits)
+    return MemberSettings(peer, CERTIFIED_PEERS, fleet.member_bits_s)

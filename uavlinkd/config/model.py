@@ -20,7 +20,7 @@ from uavlinkd.system.terminal import UsageError
 
 if TYPE_CHECKING:
     from uavlinkd.authority.trust import HeldCertificate
-    from uavlinkd.relay.forwarding import MemberSettings, RelayLimits
+    from uavlinkd.relay.forwarding import MemberSettings
 
 SERIAL = Address(SERIAL_HOST, 0)  # the other end of a serial network
 PolicyData = Mapping[str, object]
@@ -160,10 +160,10 @@ class HttpsServer:
 
 @dataclass(frozen=True, slots=True)
 class RelayServer:
-    """This daemon is a relay. ``limits``: of all members together."""
+    """This daemon is a relay. ``bits_s``: what all members together may send."""
 
     members: tuple[MemberSettings, ...]
-    limits: RelayLimits
+    bits_s: int
     https: HttpsServer | None = None
 
     @property
@@ -206,7 +206,7 @@ class FleetConfig:
 
     ``policies``: what a member of a role may send here; without one it makes no link. ``call``: the roles to which
     this daemon initiates. ``relays``: the names of all relays. ``state_file``: the newest bulletin and certificate.
-    ``member_…``: limits of each member if this daemon is a relay.
+    ``member_bits_s``: the limit of each member if this daemon is a relay.
     """
 
     authority: AuthorityKey
@@ -221,7 +221,7 @@ class FleetConfig:
     policies: Mapping[MemberRole, PolicyData]
     relays: tuple[str, ...]
     state_file: Path
-    member_limits: RelayLimits
+    member_bits_s: int
 
     def contact(self, key: bytes) -> ContactConfig | None:
         return next((contact for contact in self.contacts if contact.key == key), None)

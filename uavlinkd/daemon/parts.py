@@ -97,7 +97,7 @@ class DaemonParts:
 
         line, sockets = self.line, self.peer_sockets
         shell = RelayShell(os.urandom, monotonic, line.perform, sockets.send, self.journal.write)
-        service = RelayService(self.node, server.limits, shell)
+        service = RelayService(self.node, server.bits_s, shell)
         self.features.append(service)
         line.unwrap, line.on_read = service.forwarding.take, service.on_read
         sockets.pause_s = 0.0

@@ -141,7 +141,7 @@ class Peers:
             return
         peers = {link.key: link.peer for link in self._parts.links.values()}
         relay.set_members(server.by_key, peers, monotonic())
-        relay.forwarding.total.set_limits(server.limits)
+        relay.forwarding.total.set_limit(server.bits_s)
 
     def _note_delays(self) -> None:
         gather_s = min((link.gather_s for link in self._parts.links.values()), default=0.0)

@@ -53,7 +53,7 @@ def _facts(config: Config) -> Iterator[str]:
         members = [
             (
                 *(one.name, _whole(one.peer.public_key), _yes(one.peer.psk)),
-                *(f"{one.most_peers:,}", f"{one.limits.bits_s / 1000:,.0f}"),
+                *(f"{one.most_peers:,}", f"{one.bits_s / 1000:,.0f}"),
             )
             for one in config.relay_server.members
         ]

@@ -21,23 +21,17 @@ BURST_S = 0.3
 such a pause of the relay, or of the member: what it sent meanwhile comes at once."""
 BURST_BYTES = 1500
 """A member may send at least one datagram of this length at once."""
-
-
-@dataclass(frozen=True, slots=True)
-class RelayLimits:
-    """What one member, or all members together, may send through the relay. ``bits_s``: of UDP payload."""
-
-    datagrams_s: int
-    bits_s: int
+LEAST_BYTES = 1250
+"""A shorter datagram counts as one of this length: it costs the relay as much."""
 
 
 @dataclass(frozen=True, slots=True)
 class MemberSettings:
-    """A member: who it is, how many members it may ask for, and what it may send."""
+    """A member: who it is, how many members it may ask for, and the bits of UDP payload that it may send a second."""
 
     peer: PeerSettings
     most_peers: int
-    limits: RelayLimits
+    bits_s: int
 
     @property
     def name(self) -> str:
@@ -56,32 +50,28 @@ class RelayReason(Reason):
 
 
 class Meter:
-    """What one member sends through the relay: two limits without a queue, and counters."""
+    """What one member sends through the relay: a limit without a queue, and counters."""
 
-    __slots__ = (
-        *("_burst_s", "_byte_s", "_bytes_until", "_count_until", "_datagram_s"),
-        *("bytes", "datagrams", "over_limit"),
-    )
+    __slots__ = ("_burst_s", "_byte_s", "_until", "bytes", "datagrams", "name", "over_limit")
 
-    def __init__(self, limits: RelayLimits) -> None:
-        self._bytes_until = self._count_until = 0.0
+    def __init__(self, bits_s: int, name: str = "") -> None:
+        self.name = name
+        self._until = 0.0
         self.datagrams = self.bytes = 0  # forwarded
         self.over_limit = 0  # datagrams that were dropped
-        self.set_limits(limits)
+        self.set_limit(bits_s)
 
-    def set_limits(self, limits: RelayLimits) -> None:
-        self._datagram_s, self._byte_s = 1 / limits.datagrams_s, 8 / limits.bits_s
-        self._burst_s = max(BURST_S, self._datagram_s, BURST_BYTES * self._byte_s)
+    def set_limit(self, bits_s: int) -> None:
+        """``bits_s``: of UDP payload."""
+        self._byte_s = 8 / bits_s
+        self._burst_s = max(BURST_S, BURST_BYTES * self._byte_s)
 
     def take(self, size: int, now: float) -> bool:
-        """Use up what a datagram of so many bytes takes. Returns whether it is within the limits."""
-        count_until, bytes_until = self._count_until, self._bytes_until
-        count_until = (count_until if count_until > now else now) + self._datagram_s
-        bytes_until = (bytes_until if bytes_until > now else now) + size * self._byte_s
-        latest = now + self._burst_s
-        if count_until > latest or bytes_until > latest:
+        """Use up what a datagram of so many bytes takes. Returns whether it is within the limit."""
+        until = (self._until if self._until > now else now) + max(size, LEAST_BYTES) * self._byte_s
+        if until > now + self._burst_s:
             return False
-        self._count_until, self._bytes_until = count_until, bytes_until
+        self._until = until
         return True
 
 
@@ -97,12 +87,13 @@ class _Route(NamedTuple):
 class Forwarding:
     """The routes of all connections. ``send`` passes a datagram to the kernel; ``clock`` is monotonic."""
 
-    def __init__(self, send: Callable[[bytes, Path], None], clock: Callable[[], float], limits: RelayLimits) -> None:
+    def __init__(self, send: Callable[[bytes, Path], None], clock: Callable[[], float], bits_s: int) -> None:
         self._send = send
         self._clock = clock
         self._routes: dict[_Key, _Route] = {}
-        self.total = Meter(limits)  # the limits of all members together
+        self.total = Meter(bits_s)  # the limit of all members together
         self.dropped = Counter[Reason]()
+        self.unreported = Counter[tuple[Reason, str]]()  # with the member's name
 
     def __len__(self) -> int:
         return len(self._routes)
@@ -125,18 +116,22 @@ class Forwarding:
         size = len(data)
         route = self._routes.get((socket, source, data[1:RELAYED_HEADER_BYTES]))
         if size <= RELAYED_HEADER_BYTES or data[RELAYED_HEADER_BYTES] not in INNER_STARTS:
-            self.dropped[DropReason.RELAY_MALFORMED] += 1
+            self._drop(DropReason.RELAY_MALFORMED)
         elif route is None:
-            self.dropped[DropReason.RELAY_UNKNOWN_HANDLE] += 1
+            self._drop(DropReason.RELAY_UNKNOWN_HANDLE)
         elif not (meter := route.meter).take(size, now := self._clock()):  # this costs the others nothing
             meter.over_limit += 1
-            self.dropped[DropReason.RELAY_OVER_LIMIT] += 1
+            self._drop(DropReason.RELAY_OVER_LIMIT, meter.name)
         elif not self.total.take(size, now):
-            self.dropped[RelayReason.OVER_TOTAL] += 1
+            self._drop(RelayReason.OVER_TOTAL)
         else:
             meter.datagrams += 1
             meter.bytes += size
             self._send(route.header + data[RELAYED_HEADER_BYTES:], route.path)
+
+    def _drop(self, reason: Reason, name: str = "") -> None:
+        self.dropped[reason] += 1
+        self.unreported[reason, name] += 1
 
 
 def _key(end: ConnectionEnd) -> _Key:

@@ -22,7 +22,7 @@ from uavlinkd.protocol.path import Path
 from uavlinkd.protocol.peer import Peer
 from uavlinkd.protocol.relay_records import Bind, Who, bounds_of
 from uavlinkd.relay.bindings import Bindings, Changes
-from uavlinkd.relay.forwarding import Forwarding, MemberSettings, Meter, RelayLimits, RelayReason
+from uavlinkd.relay.forwarding import Forwarding, MemberSettings, Meter
 from uavlinkd.relay.introductions import Introductions
 from uavlinkd.system.guard import run
 
@@ -41,11 +41,10 @@ class RelayMember:
         self.peer = peer
         """Its object in the core."""
         self.is_own = is_own  # whether the relay added its peer to the core: it does not carry frames
-        self.meter = Meter(settings.limits)
+        self.meter = Meter(settings.bits_s, settings.name)
         self.binds = TokenBucket(BINDS_PER_S, BINDS_BURST, now)
         self.binds_ignored = 0  # binds above `BINDS_PER_S`
         self.since = now  # when it was up or not for the first time, as it is now
-        self.reported_over_limit = 0  # of the meter's count
 
     @property
     def key(self) -> bytes:
@@ -78,21 +77,19 @@ class RelayService(Feature):
 
     records = (Bind,)
 
-    def __init__(self, node: Node, limits: RelayLimits, shell: RelayShell) -> None:
+    def __init__(self, node: Node, bits_s: int, shell: RelayShell) -> None:
         self._node = node
         self._shell = shell
         self.members: dict[bytes, RelayMember] = {}  # by public key
         self._member_of: dict[LinkedPeer, RelayMember] = {}
         self.bindings = Bindings(shell.entropy)
-        self.forwarding = Forwarding(shell.send, shell.clock, limits)
+        self.forwarding = Forwarding(shell.send, shell.clock, bits_s)
         self.introductions = Introductions(self.bindings.wished_at)
         self._due: dict[tuple[bytes, Path], dict[bytes, None]] = {}  # reports to members
         self._asked: dict[bytes, dict[Path, _Asked]] = {}
         self._look_at = 0.0
         self._unchecked: list[bytes] = []  # keys of members whose paths are to be looked at
         self._questions: list[tuple[RelayMember, Path, Who]] = []
-        self._reported = Counter[Reason]()
-        self._unreported: list[tuple[Reason, str, int]] = []  # drops of removed members, and of binds that waited
 
     # Members.
 
@@ -150,14 +147,13 @@ class RelayService(Feature):
 
     def _set(self, member: RelayMember, settings: MemberSettings) -> None:
         member.settings = settings
-        member.meter.set_limits(settings.limits)
+        member.meter.set_limit(settings.bits_s)
         self.bindings.set_member(member.key, settings.most_peers)
 
     def _remove(self, member: RelayMember, now: float) -> None:
         self._apply(self.bindings.remove_member(member.key, now))
         del self.members[member.key]
         self._asked.pop(member.key, None)
-        self._unreported += _over_limit(member)
         self._member_of.pop(member.peer, None)
         is_certified = member.key in self.introductions
         if is_certified:
@@ -299,7 +295,7 @@ class RelayService(Feature):
     def _count_late(self, reason: DropReason, member: RelayMember) -> None:
         """A bind that waited for its path has no effect."""
         self._node.drops[reason] += 1
-        self._unreported.append((reason, member.settings.name, 1))
+        self.forwarding.unreported[reason, member.settings.name] += 1
 
     def do_housekeeping(self, now: float) -> None:
         """End the wishes that were not renewed, and those along paths that the core has given up."""
@@ -315,16 +311,9 @@ class RelayService(Feature):
         self.settle(now)
 
     def count_drops(self) -> Iterator[tuple[Reason, str, int]]:
-        """How many datagrams were dropped since the last call: reason, member or an empty name, count."""
-        for reason in (DropReason.RELAY_MALFORMED, DropReason.RELAY_UNKNOWN_HANDLE, RelayReason.OVER_TOTAL):
-            if count := self.forwarding.dropped[reason] - self._reported[reason]:
-                yield reason, "", count
-        self._reported = self.forwarding.dropped.copy()
-        unreported, self._unreported = self._unreported, []
-        yield from unreported
-        for member in self.members.values():
-            if member.meter.over_limit > member.reported_over_limit:
-                yield from _over_limit(member)
+        """The datagrams that were dropped since the last call: reason, name of the member or nothing, count."""
+        unreported, self.forwarding.unreported = self.forwarding.unreported, Counter()
+        return ((reason, name, count) for (reason, name), count in unreported.items())
 
     def _apply(self, changes: Changes) -> None:
         for connection in changes.closed:
@@ -340,10 +329,3 @@ def _is_same(member: RelayMember, members: Mapping[bytes, MemberSettings]) -> bo
     """Whether it is one of these members, with the same name and PSK."""
     settings = members.get(member.key)
     return settings is not None and settings.peer == member.settings.peer
-
-
-def _over_limit(member: RelayMember) -> Iterator[tuple[Reason, str, int]]:
-    """What the member sent above its limits since the last call."""
-    if count := member.meter.over_limit - member.reported_over_limit:
-        member.reported_over_limit = member.meter.over_limit
-        yield DropReason.RELAY_OVER_LIMIT, member.settings.name, count

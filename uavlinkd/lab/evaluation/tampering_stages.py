@@ -23,14 +23,14 @@ from uavlinkd.protocol import constants as c
 from uavlinkd.protocol.crypto import KeyPair, Secret
 from uavlinkd.protocol.settings import Link, PeerSettings
 from uavlinkd.protocol.suites import SUITES_BY_NAME
-from uavlinkd.relay.forwarding import MemberSettings, RelayLimits
+from uavlinkd.relay.forwarding import MemberSettings
 from uavlinkd.system.addresses import Address
 
 SLOWER: Final = ("both/2", RadioSettings(delay_s=0.02))
 """The second path: the election prefers the first one."""
 SIK: Final = ModemSettings()
 _ENDS: Final = dict(zip(ModemEnd, ("drone0", "drone1"), strict=True))
-AMPLE: Final = RelayLimits(1_000_000, 10**10)
+AMPLE: Final = 10**10
 RELAY_LINK: Final = Link((SUITES_BY_NAME["x25519"],), features=c.FEATURE_REFUSALS | c.FEATURE_RECORDS)
 RELAY_PEERS: Final = 16
 

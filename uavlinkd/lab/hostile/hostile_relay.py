@@ -157,8 +157,8 @@ class HostileRelay(ChannelService):
             send=self._forward,
             on_event=lambda event, at: None,
         )
-        self._service = RelayService(self._node, self.settings.server.limits, shell)
-        forwarding = _NotedForwarding(self._forward, monotonic, self.settings.server.limits)
+        self._service = RelayService(self._node, self.settings.server.bits_s, shell)
+        forwarding = _NotedForwarding(self._forward, monotonic, self.settings.server.bits_s)
         forwarding.relay = self
         self._service.forwarding = forwarding
         self._service.set_members(self.settings.server.by_key, {}, now)
