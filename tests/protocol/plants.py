@@ -93,7 +93,7 @@ def _answers_along_the_best(peer: Peer, session: Session, request: Any, _: Any, 
 
 def _judges_paths_of_peers_that_are_up(peer: Peer) -> None:
     is_probed = peer.is_up and peer.sending_session() is not None
-    peer.timers.set(Timer.PATHS, peer.paths.next_at if is_probed else c.NEVER)
+    peer.timers.set(Timer.PATHS, peer.paths.due_at if is_probed else c.NEVER)
 
 
 FAULTS: dict[str, Fault] = {

@@ -200,7 +200,7 @@ class Narrow:
     def run(self, until: float) -> tuple[int, int]:
         """Send what is due. Returns the limit and the length that the path drops."""
         limit = self.limit
-        while (now := limit.next_at) <= until:
+        while (now := limit.due_at) <= until:
             if size := limit.next_size(LONGEST, now - 0.01 if self.answers else -1.0, 0.02, now):
                 self.sizes.append(size)
                 if size <= self.carries:

@@ -235,7 +235,7 @@ def test_better_path_is_elected_after_two_seconds() -> None:
     for srtt_s, now in ((0.4, 2.0), (0.1, 3.0), (0.4, 3.5), (0.4, 3.5 + c.BETTER_FOR_S - 0.001)):
         of(paths, LTE).srtt_s = srtt_s
         assert paths.update(PEER, now) == []
-    assert paths.next_at <= 3.5 + c.BETTER_FOR_S
+    assert paths.due_at <= 3.5 + c.BETTER_FOR_S
     assert paths.update(PEER, 3.5 + c.BETTER_FOR_S) == [PathChanged(PEER, MESH, LTE, "faster")]
     paths = linked(LTE, MESH)
     of(paths, LTE).srtt_s = 2.0

@@ -125,10 +125,10 @@ def test_late_answer_makes_a_path_suspect() -> None:
     """At SRTT + 4 RTTVAR and not before. The answer makes it usable again; silence without a question does not."""
     state = usable(0.1)
     state.check(1000.0)
-    assert (state.condition, state.next_check()) == (USABLE, NEVER)
+    assert (state.condition, state.due_at) == (USABLE, NEVER)
     question, late_at = ask(state, 1.0), 1.0 + state.wait_s
     state.check(late_at - 0.001)
-    assert (state.condition, state.next_check()) == (USABLE, late_at)
+    assert (state.condition, state.due_at) == (USABLE, late_at)
     state.check(late_at)
     assert (state.condition, state.reason, state.works) == (SUSPECT, "unanswered", True)
     answer(state, question, 1.5)
@@ -154,9 +154,9 @@ def test_two_unanswered_questions_bring_a_path_down(round_trip_s: float, down_af
     assert state.condition is SUSPECT
     ask(state, 1.25)
     state.check(1.0 + down_after_s - 0.001)
-    assert (state.condition, state.next_check()) == (SUSPECT, 1.0 + down_after_s)
+    assert (state.condition, state.due_at) == (SUSPECT, 1.0 + down_after_s)
     state.check(1.0 + down_after_s)
-    assert (state.condition, state.reason, state.works, state.next_check()) == (DOWN, "unanswered", False, NEVER)
+    assert (state.condition, state.reason, state.works, state.due_at) == (DOWN, "unanswered", False, NEVER)
 
 
 @pytest.mark.parametrize(
@@ -176,7 +176,7 @@ def test_path_that_was_down_recovers_after_three_answers_and_two_seconds(
     for at in answers_at:
         if unanswered_at is not None and at > unanswered_at:
             ask(state, unanswered_at)
-            assert state.next_check() < NEVER
+            assert state.due_at < NEVER
             state.check(unanswered_at + state.wait_s)
             assert not state.is_recovering
         answer(state, ask(state, at - 0.1), at, is_only=is_only)
@@ -265,6 +265,6 @@ def test_path_is_down_while_its_network_is_gone() -> None:
     state.set_off(is_off=False, now=5.0)
     assert (state.condition, state.question_at) == (DOWN, 5.0)
     assert state.questioned_at < 0.0
-    assert state.envelope_limit.next_at == 5.0
+    assert state.envelope_limit.due_at == 5.0
     answer(state, ask(state, 5.0), 5.1)
     assert state.condition is USABLE

@@ -49,7 +49,8 @@ Timers
 ------
 Time acts through one table for each peer, ``TimerTable``: seven timers, each with one deadline and one handler in
 :mod:`.timeouts`. A handler does what is due *now* and sets the next deadline. It may find nothing due: traffic moves
-deadlines later without touching the table. The node's ``Schedule`` orders the peers by their earliest deadline.
+deadlines later without touching the table. Each part that waits says when by ``due_at``; the ``set_…`` methods of a
+peer put the earliest of a group into the table. The node's ``Schedule`` orders the peers by their earliest deadline.
 
 =========  ============================================  ==========================================================
 timer      expires when                                  then
@@ -71,7 +72,8 @@ What happens to a frame
 -----------------------
 Out: ``send_frames`` takes the current session and the route of the class, puts frames that are here together into
 envelopes, and seals each once. The same bytes go along each path of the route. A frame without a session is dropped
-and counted: it is never kept for later.
+and counted: it is never kept for later. Along an only path, all this is decided once: the ``outlet`` stands until a
+path or the session changes.
 
 In: ``DatagramReceiver.receive`` finds the session by its index, verifies the tag, and only then changes anything.
 Whatever it refuses is a ``Drop`` with a reason, caught and counted in one place.

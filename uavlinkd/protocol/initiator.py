@@ -208,7 +208,8 @@ class Initiator:
         for index in [index for index, pending in self.pending.items() if now >= pending.expires_at]:
             self._forget(index)
 
-    def next_expiry(self) -> float:
+    @property
+    def due_at(self) -> float:
         """When :meth:`expire` has something to do."""
         return min((pending.expires_at for pending in self.pending.values()), default=c.NEVER)
 

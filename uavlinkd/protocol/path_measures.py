@@ -115,14 +115,14 @@ class EnvelopeLimit:
     A path may drop long datagrams and report nothing. The answer to a padded probe acknowledges its length.
     """
 
-    __slots__ = ("_aim", "_asked_at", "_doubted_at", "_tries", "dropped", "limit", "next_at")
+    __slots__ = ("_aim", "_asked_at", "_doubted_at", "_tries", "dropped", "due_at", "limit")
 
     def __init__(self) -> None:
         self.limit = c.MIN_ENVELOPE_LIMIT
         """Bytes. Every path carries the longest frame, whose envelope is not longer."""
         self.dropped = 0
         """The length that the path drops, as far as is known; 0 for none."""
-        self.next_at = c.NEVER
+        self.due_at = c.NEVER
         """When to look for a test; infinity before the path is proved."""
         self._aim = c.MAX_ENVELOPE_LIMIT  # the length to be tested
         self._asked_at = c.NEVER  # when the test was sent; infinity without one
@@ -132,7 +132,7 @@ class EnvelopeLimit:
     def begin(self, now: float, aim: int = c.MAX_ENVELOPE_LIMIT) -> None:
         """The path was proved, or may have changed: test this length, and then shorter ones."""
         self.limit, self._aim, self._asked_at, self._tries = c.MIN_ENVELOPE_LIMIT, aim, c.NEVER, 0
-        self.next_at = now
+        self.due_at = now
 
     def note_lost(self, lost: int, now: float) -> None:
         """The path lost so many envelopes recently: perhaps all long ones."""
@@ -142,7 +142,7 @@ class EnvelopeLimit:
             self.begin(now, self.limit)
 
     def next_size(self, longest: int, answered_at: float, wait_s: float, now: float) -> int:
-        """The length of the test to be sent at :attr:`next_at`; 0 for none.
+        """The length of the test to be sent at :attr:`due_at`; 0 for none.
 
         ``longest``: of the session, or of the network if that is less. ``answered_at``: when a question was answered
         last. ``wait_s``: how long an answer may take.
@@ -154,16 +154,16 @@ class EnvelopeLimit:
                 self.dropped, self._tries = size, 0
                 self._aim = size = next((less for less in c.SMALLER_LIMITS if less < size), 0)
         if size > self.limit:
-            self._asked_at, self.next_at = now, now + max(c.LIMIT_TEST_S, 2 * wait_s)
+            self._asked_at, self.due_at = now, now + max(c.LIMIT_TEST_S, 2 * wait_s)
             return size
         # Later, a single test shows whether the path carries more.
         self._aim, self._asked_at, self._tries = c.MAX_ENVELOPE_LIMIT, c.NEVER, c.LIMIT_TESTS - 1
-        self.next_at = now + c.LIMIT_RAISE_S
+        self.due_at = now + c.LIMIT_RAISE_S
         return 0
 
     def acknowledge(self, size: int, now: float) -> None:
         """A test of this length was answered."""
-        self.limit, self._asked_at, self.next_at = max(size, self.limit), c.NEVER, now
+        self.limit, self._asked_at, self.due_at = max(size, self.limit), c.NEVER, now
         if size >= self.dropped:
             self.dropped = 0
 

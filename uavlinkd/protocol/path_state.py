@@ -352,7 +352,8 @@ class PathState:
         elif is_late and self.condition is PathCondition.USABLE:
             self._set(PathCondition.SUSPECT, "unanswered", now)
 
-    def next_check(self) -> float:
+    @property
+    def due_at(self) -> float:
         """When :meth:`check` has something to do."""
         if self.condition is PathCondition.USABLE or self.is_recovering:
             return self._unanswered_since + self.wait_s

@@ -127,7 +127,7 @@ class PathSet(PathSlots):
         """The longest envelope that frames of each class share, in bytes. A longer one holds a single frame."""
         self.echo_route: Route = ()
         """Of echo requests that are repeated if they are lost, and of their replies."""
-        self.next_at = c.NEVER
+        self.due_at = c.NEVER
         """When :meth:`update` has something to do, or a question is due."""
         self.active_at = -c.NEVER
         """When frames were sent last."""
@@ -330,7 +330,7 @@ class PathSet(PathSlots):
     def test_at(self, state: PathState) -> float:
         """When to test how long the envelopes of a path may be."""
         is_due = self.shares_envelopes and state.condition is PathCondition.USABLE
-        return state.envelope_limit.next_at if is_due else c.NEVER
+        return state.envelope_limit.due_at if is_due else c.NEVER
 
     def carries(self, state: PathState, size: int) -> bool:
         """Whether a copy of so many bytes may go along a path. Each path carries the longest frame."""
@@ -345,7 +345,7 @@ class PathSet(PathSlots):
 
     def revise(self, now: float) -> None:
         """Slots or networks have changed: :meth:`update` is due, also if frames are sent before it."""
-        self.revised_at = self.next_at = now
+        self.revised_at = self.due_at = now
 
     def is_idle(self, now: float) -> bool:
         """Whether no frames were sent recently."""
@@ -401,5 +401,5 @@ class PathSet(PathSlots):
         for state in self.by_path.values():
             interval_s = c.NEVER if state.is_off else self.interval_s(state, now)
             state.question_at = c.NEVER if interval_s == c.NEVER else max(now, state.questioned_at + interval_s)
-            moments += [state.question_at, state.next_check(), self.test_at(state)]
-        self.next_at = min(moments)
+            moments += [state.question_at, state.due_at, self.test_at(state)]
+        self.due_at = min(moments)

@@ -278,7 +278,7 @@ class Peer:
 
     def set_expiry(self) -> None:
         """Set when a session, an initiation or a provisional peer expires."""
-        expiries = self.sessions.next_expiry(), self.initiator.next_expiry(), self.provisional_until
+        expiries = self.sessions.due_at, self.initiator.due_at, self.provisional_until
         self.timers.set(Timer.EXPIRY, min(expiries))
 
     def set_initiate(self) -> None:
@@ -289,7 +289,7 @@ class Peer:
         """Set when paths are judged or questioned. A peer that is not up is looked for by handshakes instead."""
         is_probed = self.is_up and self.sending_session() is not None
         self.timers.set(
-            Timer.PATHS, self.paths.next_at if is_probed else min(self.paths.revised_at, self.paths.slots_at)
+            Timer.PATHS, self.paths.due_at if is_probed else min(self.paths.revised_at, self.paths.slots_at)
         )
 
     def new_question(self) -> int:

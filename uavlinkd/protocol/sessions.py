@@ -217,7 +217,8 @@ class Sessions:
                 return higher is session
         return False
 
-    def next_expiry(self) -> float:
+    @property
+    def due_at(self) -> float:
         """When :meth:`expire` has something to do."""
         moments = [session.reject_at for session in self.confirmed]
         moments += [waiting.expires_at for waiting in self.unconfirmed.values()]

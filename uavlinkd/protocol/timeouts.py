@@ -16,7 +16,7 @@ from uavlinkd.protocol.timers import Timer
 def _expire(peer: Peer, now: float) -> list[Output]:
     out: list[Output] = []
     peer.initiator.expire(now)
-    if now >= peer.sessions.next_expiry():
+    if now >= peer.sessions.due_at:
         out += freshness.end(peer, peer.sessions.expire(now))
         if peer.is_up and peer.sessions.current is None:
             out += peer.note_lost(now)
