@@ -32,7 +32,7 @@ def _keeps_a_removed_peer(node: Node, peer: Peer, now: float) -> list[Output]:
     return []
 
 
-def _initiates_once(initiator: Initiator, now: float, *, is_metered: bool = False, slow_at: float = 0.0) -> None:
+def _initiates_once(initiator: Initiator, now: float, due_at: float = 0.0) -> None:
     initiator.retry_at = now + 100.0
 
 
@@ -57,8 +57,8 @@ def _copies_nothing(paths: PathSet, now: float) -> None:
     paths.routes = dict.fromkeys(Class, paths.routes[Class.BULK])
 
 
-def _tries_one_path(paths: PathSet, *, is_answering: bool = True) -> tuple[list[Path], list[Path]]:
-    return [state.path for state in paths.states[:1]], []
+def _tries_one_path(paths: PathSet, *, is_answering: bool = True) -> list[Path]:
+    return [state.path for state in paths.states[:1]]
 
 
 def _counts_arrivals(session: Session, counter: int) -> int:

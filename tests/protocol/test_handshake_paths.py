@@ -206,8 +206,8 @@ def test_peer_that_is_off_costs_little_on_a_metered_path() -> None:
     radios = dead(1).run(1200.0)
     tries = initiations(radios)
     assert sum(at < 60.0 for at in tries) > 30
-    assert 36 <= sum(60.0 <= at < 600.0 for at in tries) <= 37
-    assert 10 <= sum(at >= 600.0 for at in tries) <= 11
+    assert 29 <= sum(60.0 <= at < 600.0 for at in tries) <= 36
+    assert 8 <= sum(at >= 600.0 for at in tries) <= 10
     radios.a.node.set_socket_state(0, radios.now, is_up=True)
     radios.run(5.0)
     assert len(initiations(radios)) >= len(tries) + 4
@@ -221,7 +221,7 @@ def test_metered_path_is_tried_rarely_beside_another_of_a_peer_that_is_off(flaps
         radios.run(1.0)
         if flaps:
             radios.a.node.set_socket_state(1, radios.now, is_up=True)
-    assert 7 <= len(initiations(radios, 0, since=60.1)) <= 9
+    assert 5 <= len(initiations(radios, 0, since=60.1)) <= 8
     assert len(initiations(radios, 1, since=60.1)) > others
 
 

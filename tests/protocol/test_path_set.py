@@ -313,13 +313,13 @@ def test_initiations_avoid_metered_paths_while_another_works() -> None:
     paths = linked(MESH, LTE, SIK, metered={LTE.socket})
     paths.learn(PLACES[0], 1.0)
     paths.prefer(SIK, 1.0)
-    assert paths.handshake_paths() == ([MESH, SIK], [])
-    assert paths.handshake_paths(is_answering=False) == ([MESH, SIK], [LTE])
+    assert paths.handshake_paths() == [MESH, SIK]
+    assert paths.handshake_paths(is_answering=False) == [MESH, SIK, LTE]
     for path in (MESH, SIK):
         fail(paths, path, 5.0)
-    assert paths.handshake_paths() == ([MESH, SIK], [LTE])
+    assert paths.handshake_paths() == [LTE, MESH, SIK]
     paths.set_socket_state(MESH.socket, 6.0, is_up=False)
-    assert paths.handshake_paths() == ([SIK], [LTE])
+    assert paths.handshake_paths() == [LTE, SIK]
 
 
 # Routes.
@@ -427,7 +427,7 @@ def test_path_of_an_absent_network_is_not_used_until_it_is_back() -> None:
     paths.set_socket_state(LTE.socket, 2.0, is_up=False)
     assert paths.update(PEER, 2.0)[0] == PathChanged(PEER, MESH, LTE, "network")
     assert of(paths, LTE).question_at == NEVER
-    assert paths.handshake_paths() == ([MESH], [])
+    assert paths.handshake_paths() == [MESH]
     assert route(paths, Class.CRITICAL) == [MESH]
     paths.set_socket_state(LTE.socket, 9.0, is_up=True)
     paths.update(PEER, 9.0)

@@ -25,19 +25,18 @@ def initiate(peer: Peer, now: float) -> list[Output]:
     initiator = peer.initiator
     is_silent = peer.unanswered_since is not None and now >= peer.unanswered_since + peer.handshake_after_s
     is_answering = peer.is_up and not is_silent
-    unmetered, metered = peer.paths.handshake_paths(is_answering=is_answering)
-    if not unmetered and not metered:
+    paths = peer.paths.handshake_paths(is_answering=is_answering)
+    if not paths:
         return []
     if peer.keys_wanted_at() > initiator.initiated_at:  # none was wanted between the last initiation and this one
         initiator.attempts = 0
     if initiator.attempts and peer.is_up:
         peer.traffic.handshakes_unanswered += 1
-    paths = unmetered + initiator.take_metered(metered, now)
     if initiator.attempts < c.REKEYS_ALONG_BEST and is_answering and peer.paths.works:
         paths = paths[:1]
     shown = initiator.shown(is_answering=is_answering)
-    paths, slow_at = initiator.take_slow(paths, shown, now)
-    initiator.begin_try(now, is_metered=not unmetered, slow_at=slow_at)
+    paths, due_at = initiator.take(paths, shown, now)
+    initiator.begin_try(now, due_at)
     peer.set_initiate()
     if not paths:
         return []

@@ -66,49 +66,42 @@ class Initiator:
         self.initiated_at = -c.NEVER
         """When the last initiation was sent."""
         self._began_at = now  # the first of the tries since new keys were wanted
-        self._metered_at = -c.NEVER  # the next initiation along a metered path, of a peer that does not answer
-        self._metered_turn = -1
-        self._slow_at: dict[int, float] = {}  # by socket of a network with a budget: the next initiation there
+        self._due_at: dict[int, float] = {}  # by socket of a network with a budget, or metered: the next try there
         self._received_cookies: dict[Path, tuple[bytes, float]] = {}  # the peer's, and until when; the oldest first
 
-    def take_metered(self, paths: list[Path], now: float) -> list[Path]:
-        """Of metered paths those along which to initiate now: fewer the longer the peer does not answer."""
-        wait_s = self._metered_wait_s(now)
-        if not wait_s or not paths:
-            return paths
-        if now < self._metered_at:
-            return []
-        self._metered_at = now + wait_s
-        self._metered_turn += 1
-        return [paths[self._metered_turn % len(paths)]]
+    def take(self, paths: Sequence[Path], shown: bytes, now: float) -> tuple[list[Path], float]:
+        """Of these paths those along which to initiate now, and when the next try is due if none of them is free.
 
-    def take_slow(self, paths: list[Path], shown: bytes, now: float) -> tuple[list[Path], float]:
-        """Of these paths those along which to initiate now, and when the next try is due if all of them are slow.
-
-        ``shown``: the certificate in this initiation.
-
-        On a network with a budget the tries are :data:`c.TRY_AIRTIMES` airtimes apart, whatever other networks do.
+        Tries along a network with a budget are :data:`c.TRY_AIRTIMES` airtimes apart, those along a metered one are
+        the rarer the longer the peer does not answer, whatever other networks do. ``shown``: the certificate in this
+        initiation.
         """
         taken: list[Path] = []
-        slow_at, is_free = c.NEVER, False
-        sockets: set[int] = set()
+        due_at, sockets = c.NEVER, set[int]()
         for path in paths:
-            interval_s = self._try_interval_s(path, shown)
+            interval_s = max(self._slow_interval_s(path, shown), self._metered_interval_s(path, now))
             if not interval_s:
-                is_free = True
-                taken.append(path)
-                continue
-            if path.socket in sockets or now >= self._slow_at.get(path.socket, now):
+                due_at = now
+            elif path.socket in sockets or now >= self._due_at.get(path.socket, now):
                 sockets.add(path.socket)
-                self._slow_at[path.socket] = now + interval_s * self._jitter()
-                taken.append(path)
-            slow_at = min(slow_at, self._slow_at[path.socket])
-        return taken, now if is_free else slow_at
+                self._due_at[path.socket] = now + interval_s * self._jitter()
+            else:
+                due_at = min(due_at, self._due_at[path.socket])
+                continue
+            taken.append(path)
+        return taken, min([due_at, *(self._due_at[socket] for socket in sockets)])
 
-    def _try_interval_s(self, path: Path, shown: bytes) -> float:
-        """Between tries along a path; 0 if it carries the usual ones."""
+    def _slow_interval_s(self, path: Path, shown: bytes) -> float:
+        """Between tries along a path of a network with a budget; 0 if it carries the usual ones."""
         interval_s = self._facts.try_interval_s(path, self.settings.link.suites[0], len(shown))
         return interval_s if interval_s > self.settings.link.timers.retry_min_s else 0.0
+
+    def _metered_interval_s(self, path: Path, now: float) -> float:
+        """Between tries along a path of a metered network; 0 while the peer has not been silent for long."""
+        if path.socket not in self._facts.metered or not self.attempts:
+            return 0.0
+        silent_s = now - self._began_at
+        return max((wait_s for after_s, wait_s in c.METERED_RETRIES if silent_s >= after_s), default=0.0)
 
     def shown(self, *, is_answering: bool) -> bytes:
         """The certificate, if the next attempt shows it. A peer that does not answer may have restarted."""
@@ -117,15 +110,8 @@ class Initiator:
     def _jitter(self) -> float:
         return 1.0 + c.RETRY_JITTER * int.from_bytes(self._entropy(2), "big") / 2**16
 
-    def _metered_wait_s(self, now: float) -> float:
-        silent_s = now - self._began_at if self.attempts else 0.0
-        return max((wait_s for after_s, wait_s in c.METERED_RETRIES if silent_s >= after_s), default=0.0)
-
-    def begin_try(self, now: float, *, is_metered: bool = False, slow_at: float = 0.0) -> None:
-        """An initiation is to be sent now. Schedules the one after it. ``is_metered``: every path is metered.
-
-        ``slow_at``: see :meth:`take_slow`.
-        """
+    def begin_try(self, now: float, due_at: float = 0.0) -> None:
+        """An initiation is to be sent now. Schedules the one after it, not before ``due_at``: see :meth:`take`."""
         if not self.attempts:
             self._began_at = now
         timers = self.settings.link.timers
@@ -134,9 +120,7 @@ class Initiator:
         wait = min(timers.retry_min_s * 2.0**doublings, timers.retry_max_s)
         self.attempts += 1
         self.initiated_at = now
-        self.retry_at = max(now + wait * self._jitter(), slow_at)
-        if is_metered and self._metered_wait_s(now):
-            self.retry_at = max(self.retry_at, self._metered_at)
+        self.retry_at = max(now + wait * self._jitter(), due_at)
 
     def initiate(
         self, index: int, paths: Sequence[Path], generation: int, shown: bytes, now: float
@@ -145,7 +129,7 @@ class Initiator:
         initiated = handshake.initiate(self._identity, self.settings, index, generation, self._entropy, shown)
         datagrams = [(self.add_macs(initiated.message, path, now), path) for path in paths]
         mac1 = mac1_of(datagrams[0][0])
-        slowest_s = max(self._try_interval_s(path, shown) for path in paths)
+        slowest_s = max(self._slow_interval_s(path, shown) for path in paths)
         expires_at = now + max(c.PENDING_LIFETIME_S, slowest_s)
         while len(self.pending) >= c.PENDING_PER_PEER:
             # Fast tries along one network must not push out the one that a slow network still carries.
@@ -188,9 +172,9 @@ class Initiator:
 
         Slow and metered networks behind other sockets keep their pace: this one may appear every second.
         """
-        self._slow_at.pop(socket, None)
+        self._due_at.pop(socket, None)
         if socket in self._facts.metered:
-            self._began_at, self._metered_at = now, -c.NEVER
+            self._began_at = now
         self.attempts = min(self.attempts, 1)  # not 0: then the time of silence would restart for all of them
         self.retry_at = min(self.retry_at, now)
 

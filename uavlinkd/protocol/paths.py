@@ -162,9 +162,8 @@ class PathSet(PathSlots):
         """What the path is used for: ``best``, ``metered`` (or by TCP), or ``standby``."""
         return "best" if state is self.best else "metered" if state.is_metered else "standby"
 
-    def handshake_paths(self, *, is_answering: bool = True) -> tuple[list[Path], list[Path]]:
-        """Where to initiate: every path that may lead to the peer, the best first; those that are not metered, and
-        those that are.
+    def handshake_paths(self, *, is_answering: bool = True) -> list[Path]:
+        """Where to initiate: every path that may lead to the peer, the best first, and metered ones last.
 
         While another path works, a metered one is only probed. ``is_answering``: the peer is not silent. Of a silent
         one it is unknown which paths work.
@@ -177,10 +176,7 @@ class PathSet(PathSlots):
             and not state.is_off
             and not (works and state.is_metered)
         ]
-        states.sort(key=lambda state: state is not self.best)
-        return [state.path for state in states if not state.is_metered], [
-            state.path for state in states if state.is_metered
-        ]
+        return [state.path for state in sorted(states, key=lambda state: (state is not self.best, state.is_metered))]
 
     # Answers.
 
