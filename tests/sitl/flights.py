@@ -1,4 +1,4 @@
-"""Scenarios in the air: a flight, outages with the autopilot's failsafe, restarts, two vehicles, follow-me."""
+"""Scenarios in the air: a flight, outages with the autopilot's failsafe, restarts, two vehicles."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from tests.sitl.world import Vehicle, World
 
 OUTAGES_S = (2.0, 2.5, 3.0, 6.0, 20.0)
 LEG_M = 30.0
-LEAD_M = 60.0
-FOLLOW_OFFSET_M = 10.0
+APART_M = 10.0
+"""The distance between two vehicles on the ground."""
 RADIO_LOSS = 0.3
 RETURN_S = 5.0
 """A radio that is back is used again within this time."""
@@ -190,30 +190,29 @@ async def restarts(world: World, pilot: Pilot) -> Figures:
     vehicle = world.vehicles[0]
     await pilot.request_streams()
     results: list[Figures] = []
-    if world.daemons:
-        await pilot.set_parameters(pilot.kind.failsafe)
-        await pilot.take_off()
-        start = pilot.place
-        await pilot.set_mode(Mode.GUIDED)
-        assert world.ground is not None
-        assert vehicle.daemon is not None
-        cases: list[tuple[str, DaemonProcess, signal.Signals]] = [
-            ("drone's daemon restarted", vehicle.daemon, signal.SIGTERM),
-            ("drone's daemon killed", vehicle.daemon, signal.SIGKILL),
-            ("ground's daemon restarted", world.ground, signal.SIGTERM),
-            ("ground's daemon killed", world.ground, signal.SIGKILL),
-        ]
-        for number, (what, daemon, how) in enumerate(cases):
-            began = monotonic()
-            await daemon.stop(how)
-            await daemon.start()
-            down_s, up_s = await frames_pass_again(world, vehicle, monotonic())
-            absent_s = round(monotonic() - began, 2)
-            await pilot.go_to(start.moved(LEG_M / 2 if number % 2 == 0 else 0.0, 0.0))
-            tripped = any(mode != pilot.kind.modes[Mode.GUIDED] for at, mode in modes(vehicle) if at > began)
-            assert not tripped, f"the failsafe tripped: {what}"
-            results.append({"what": what, "absent_s": absent_s, "down_back_s": down_s, "up_back_s": up_s})
-        await pilot.return_and_land()
+    await pilot.set_parameters(pilot.kind.failsafe)
+    await pilot.take_off()
+    start = pilot.place
+    await pilot.set_mode(Mode.GUIDED)
+    assert world.ground is not None
+    assert vehicle.daemon is not None
+    cases: list[tuple[str, DaemonProcess, signal.Signals]] = [
+        ("drone's daemon restarted", vehicle.daemon, signal.SIGTERM),
+        ("drone's daemon killed", vehicle.daemon, signal.SIGKILL),
+        ("ground's daemon restarted", world.ground, signal.SIGTERM),
+        ("ground's daemon killed", world.ground, signal.SIGKILL),
+    ]
+    for number, (what, daemon, how) in enumerate(cases):
+        began = monotonic()
+        await daemon.stop(how)
+        await daemon.start()
+        down_s, up_s = await frames_pass_again(world, vehicle, monotonic())
+        absent_s = round(monotonic() - began, 2)
+        await pilot.go_to(start.moved(LEG_M / 2 if number % 2 == 0 else 0.0, 0.0))
+        tripped = any(mode != pilot.kind.modes[Mode.GUIDED] for at, mode in modes(vehicle) if at > began)
+        assert not tripped, f"the failsafe tripped: {what}"
+        results.append({"what": what, "absent_s": absent_s, "down_back_s": down_s, "up_back_s": up_s})
+    await pilot.return_and_land()
     results.append(await _restart_simulator(world, pilot, vehicle))
     return {"restarts": results}
 
@@ -257,58 +256,14 @@ async def two_vehicles(world: World, pilots: list[Pilot]) -> Figures:
         starts = [pilot.place for pilot in pilots]
         await pilots[0].go_to(starts[0].moved(LEG_M, 0.0))
         stayed_m = pilots[1].place.distance_m(starts[1])
-        assert stayed_m < FOLLOW_OFFSET_M / 2, "the other vehicle moved too"
+        assert stayed_m < APART_M / 2, "the other vehicle moved too"
         await pilots[1].go_to(starts[1].moved(-LEG_M, 0.0))
         await asyncio.gather(*(pilot.return_and_land() for pilot in pilots))
         return {"parameters": [len(table) for _, table in tables], "parameters_s": [seconds for seconds, _ in tables]}
 
     figures = await counted(world, act)
-    if world.daemons:
-        for vehicle in world.vehicles:
-            foreign = [p for p in world.station.sent if p.target not in (0, vehicle.system)]
-            arrived = {p.frame for p in vehicle.tap.to_autopilot}
-            assert not any(p.frame in arrived for p in foreign), "a command reached the other vehicle"
-    return figures
-
-
-async def follow_me(world: World, leader: Pilot, follower: Pilot) -> Figures:
-    """The follower keeps its distance by the positions that it receives from the leader's daemon."""
-    for pilot in (leader, follower):
-        await pilot.request_streams()
-    await asyncio.gather(leader.take_off(), follower.take_off())
-    start = leader.place
-    await follower.set_mode(Mode.FOLLOW)
-    distances: list[float] = []
-
-    async def watch() -> None:
-        while True:
-            await asyncio.sleep(0.5)
-            distances.append(follower.place.distance_m(leader.place))
-
-    watching = asyncio.create_task(watch())
-    goal = start.moved(LEAD_M, 0.0)
-    began = monotonic()
-    await leader.go_to(goal)
-    behind = goal.moved(-FOLLOW_OFFSET_M, 0.0)
-    await follower.until_at(behind)
-    seconds = monotonic() - began
-    watching.cancel()
-    between = [
-        passing
-        for passing in world.vehicles[1].tap.to_autopilot
-        if sender_of(passing.frame) == leader.system and passing.at > began
-    ]
-    names = sorted({name_of(passing.frame) for passing in between})
-    await asyncio.gather(*(pilot.return_and_land() for pilot in (leader, follower)))
-    figures: Figures = {
-        "lead_m": LEAD_M,
-        "seconds": round(seconds, 1),
-        "distance_m": [round(min(distances), 1), round(max(distances), 1)],
-        "final_distance_m": round(distances[-1], 1),
-        "frames_from_leader": len(between),
-        "messages_from_leader": names,
-    }
-    assert between, "the follower received nothing from the leader"
-    if world.daemons:
-        assert not any("COMMAND" in name or "PARAM" in name or "MISSION" in name for name in names), names
+    for vehicle in world.vehicles:
+        foreign = [p for p in world.station.sent if p.target not in (0, vehicle.system)]
+        arrived = {p.frame for p in vehicle.tap.to_autopilot}
+        assert not any(p.frame in arrived for p in foreign), "a command reached the other vehicle"
     return figures

@@ -34,7 +34,6 @@ class Mode(StrEnum):
     GUIDED = "guided"
     MISSION = "mission"
     RETURN = "return"
-    FOLLOW = "follow"
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,8 +44,6 @@ class Kind:
     modes: Mapping[Mode, int]
     """The custom mode in HEARTBEAT."""
     is_px4: bool = False
-    flies: bool = True
-    """Whether it takes off and lands. Flown on the clean link only if not: the link is the same."""
     has_home_item: bool = True
     """Item 0 of a mission is the home position."""
     parameters: Mapping[str, float] = field(default_factory=dict)
@@ -55,29 +52,19 @@ class Kind:
     """Parameters that make the vehicle return without its ground station."""
     failsafe_s: float = 5.0
     """The time from the last heartbeat until it returns."""
-    follows: Mapping[str, float] = field(default_factory=dict)
-    """Parameters that make it follow vehicle 1, 10 m south of it."""
 
 
 def _px4(sub_mode: int) -> int:
     return PX4_AUTO << 16 | sub_mode << 24
 
 
-_COPTER_MODES = {Mode.GUIDED: 4, Mode.MISSION: 3, Mode.RETURN: 6, Mode.FOLLOW: 23}
+_COPTER_MODES = {Mode.GUIDED: 4, Mode.MISSION: 3, Mode.RETURN: 6}
 COPTER = Kind(
     "ArduCopter",
     _COPTER_MODES,
     # SITL ends itself where a number that is not finite becomes an integer. A flight controller goes on.
     parameters={"SIM_FLOAT_EXCEPT": 0},
     failsafe={"FS_GCS_ENABLE": 1, "FS_GCS_TIMEOUT": 5},
-    follows={
-        "FOLL_ENABLE": 1,
-        "FOLL_SYSID": 1,
-        "FOLL_OFS_TYPE": 0,
-        "FOLL_OFS_X": -10,
-        "FOLL_OFS_Y": 0,
-        "FOLL_OFS_Z": 0,
-    },
 )
 PX4 = Kind(
     "PX4",
@@ -89,7 +76,6 @@ PX4 = Kind(
     failsafe_s=7.5,  # it notices a lost heartbeat after 2.5 s, then waits 5 s
 )
 OWN = Kind("uavlinkd sim", _COPTER_MODES)
-ROVER = Kind("ArduRover", {Mode.GUIDED: 15, Mode.MISSION: 10, Mode.RETURN: 11}, flies=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +112,6 @@ class Pilot:
         self.station = station
         self.system = system
         self.kind = kind
-        self._home: Place | None = None
 
     @property
     def place(self) -> Place:
@@ -169,7 +154,7 @@ class Pilot:
         raise RequestError(f"mode {mode}: not within {timeout_s:.0f} s; texts: {self.station.texts[-5:]}")
 
     async def take_off(self, height_m: float = HEIGHT_M) -> None:
-        """Arm as soon as the vehicle is ready, take off if it flies, and wait until it is there."""
+        """Arm as soon as the vehicle is ready, take off, and wait until it is there."""
         station, system = self.station, self.system
         await self.until_ready()
         if not self.kind.is_px4:  # not before: it reads the switch of the radio control after its start
@@ -181,13 +166,11 @@ class Pilot:
         arm = (mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0)
         climb = (mavlink.MAV_CMD_NAV_TAKEOFF, 0.0, 0.0, 0.0, anywhere, anywhere, anywhere, altitude_m)
         # PX4 arms in the mode of a take-off, ArduPilot takes off only once it is armed.
-        commands = (climb, arm) if self.kind.is_px4 else (arm, climb) if self.kind.flies else (arm,)
+        commands = (climb, arm) if self.kind.is_px4 else (arm, climb)
         for command in commands:
             await station.must(system, *command, timeout_s=READY_S)
         await station.until(lambda: station.is_armed(system), LEG_S, "armed")
-        self._home = self.place
-        if self.kind.flies:
-            await station.until(lambda: self.place.z > 0.9 * height_m, LEG_S, f"{height_m} m above home")
+        await station.until(lambda: self.place.z > 0.9 * height_m, LEG_S, f"{height_m} m above home")
 
     async def until_ready(self) -> None:
         """Wait until the vehicle may be armed."""
@@ -240,10 +223,6 @@ class Pilot:
             await self.until_at(place)
 
     async def return_and_land(self) -> None:
-        """Return home, land if it flies, and wait until the motors stop. A rover is disarmed there."""
+        """Return home, land, and wait until the motors stop."""
         await self.set_mode(Mode.RETURN)
-        if not self.kind.flies:
-            assert self._home is not None, "it did not start"
-            await self.until_at(self._home)
-            await self.station.must(self.system, mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0.0, timeout_s=READY_S)
         await self.station.until(lambda: not self.station.is_armed(self.system), LAND_S, "landed and disarmed")

@@ -12,19 +12,18 @@ from typing import Any
 from pymavlink.dialects.v20 import all as mavlink
 
 from tests.sitl.downloads import downloads
-from tests.sitl.flights import flight, follow_me, outages, restarts, two_radios, two_vehicles
-from tests.sitl.pilots import COPTER, OWN, PX4, ROVER, Kind, Pilot
+from tests.sitl.flights import flight, outages, restarts, two_radios, two_vehicles
+from tests.sitl.pilots import COPTER, OWN, PX4, Kind, Pilot
 from tests.sitl.radio import BY_NAME, CLEAN
-from tests.sitl.real_autopilot import Firmware
 from tests.sitl.relayed import relayed
 from tests.sitl.roles import roles
-from tests.sitl.simulators import OwnSimulator, RealSimulator, Simulator
+from tests.sitl.simulators import Firmware, OwnSimulator, RealSimulator, Simulator
 from tests.sitl.station import Station
-from tests.sitl.transfers import Figures, FlightError, log_and_file, parameters_and_mission, signing
+from tests.sitl.transfers import Figures, FlightError, parameters_and_mission, signing, whole_log
 from tests.sitl.world import Layout, World, flying
 from uavlinkd.lab.sim.loopback_ports import free_port
 
-KINDS: Mapping[str, Kind] = {"ardupilot": COPTER, "px4": PX4, "rover": ROVER, "own": OWN}
+KINDS: Mapping[str, Kind] = {"ardupilot": COPTER, "px4": PX4, "own": OWN}
 ALL_KINDS = tuple(KINDS)
 ALL_CONDITIONS = tuple(BY_NAME)
 
@@ -44,8 +43,6 @@ class Scenario(Layout):
     conditions: tuple[str, ...] = (CLEAN.name,)
     vehicles: int = 1
     has_maintenance_port: bool = False
-    is_direct: bool = False
-    """Whether it is flown without daemons only."""
 
 
 def _alone(scene: Callable[[World, Pilot], Awaitable[Figures]]) -> Scene:
@@ -54,13 +51,10 @@ def _alone(scene: Callable[[World, Pilot], Awaitable[Figures]]) -> Scene:
 
 SCENARIOS = (
     Scenario("parameters-mission", _alone(parameters_and_mission), ALL_KINDS, ALL_CONDITIONS),
-    Scenario("flight", _alone(flight), ("ardupilot", "px4", "rover"), ("clean", "loss10", "loss30", "slow", "delay")),
-    Scenario("log-file", _alone(log_and_file)),
+    Scenario("flight", _alone(flight), ("ardupilot", "px4"), ALL_CONDITIONS),
+    Scenario("log", _alone(whole_log)),
     Scenario("signing", _alone(signing), ("ardupilot",), has_maintenance_port=True),
-    Scenario("two-vehicles", two_vehicles, ("ardupilot", "px4", "own"), vehicles=2),
-    Scenario(
-        "follow-me", lambda world, pilots: follow_me(world, *pilots), kinds=("ardupilot",), vehicles=2, swarm=True
-    ),
+    Scenario("two-vehicles", two_vehicles, vehicles=2),
     Scenario("outages", _alone(outages), radios=({},)),
     Scenario("restarts", _alone(restarts)),
     Scenario("two-radios", _alone(two_radios), radios=({}, {})),
@@ -84,48 +78,35 @@ class Run:
     scenario: str
     kind: str
     condition: str = CLEAN.name
-    with_daemons: bool = True
 
     def __str__(self) -> str:
-        daemons = "daemons" if self.with_daemons else "direct"
-        return f"{self.scenario}-{self.kind}-{self.condition}-{daemons}"
+        return f"{self.scenario}-{self.kind}-{self.condition}"
 
 
 @dataclass(slots=True)
 class Record:
     """The result of a run. ``error`` is None if all assertions held."""
 
-    scenario: str
-    kind: str
-    condition: str
-    with_daemons: bool
+    run: Run
     version: str = ""
     seconds: float = 0.0
     error: str | None = None
     figures: dict[str, Any] = field(default_factory=dict)
 
-    @property
-    def run(self) -> Run:
-        """What was flown."""
-        return Run(self.scenario, self.kind, self.condition, self.with_daemons)
 
-
-def runs(kinds: tuple[str, ...]) -> list[Run]:
-    """Every scenario under each of its conditions, with and without daemons; a rover on the clean link only."""
+def runs(kind: str) -> list[Run]:
+    """Every scenario of an autopilot under each of its conditions."""
     return [
-        Run(scenario.name, kind, condition, with_daemons)
-        for kind in kinds
+        Run(scenario.name, kind, condition)
         for scenario in SCENARIOS
         if kind in scenario.kinds
-        for condition in (scenario.conditions if KINDS[kind].flies else (CLEAN.name,))
-        for with_daemons in ((False,) if scenario.is_direct else (True, False))
-        if with_daemons or not (BY_NAME[condition].needs_daemons or scenario.needs_daemons)
+        for condition in scenario.conditions
     ]
 
 
 async def fly(run: Run) -> Record:
     """Fly a scenario; a failure is in the record."""
-    record = Record(run.scenario, run.kind, run.condition, run.with_daemons)
+    record = Record(run)
     began = monotonic()
     try:
         with tempfile.TemporaryDirectory(prefix="sitl-") as folder:
@@ -142,24 +123,20 @@ async def _fly(run: Run, record: Record, folder: Path) -> None:
     scenario, kind = SCENARIO_BY_NAME[run.scenario], KINDS[run.kind]
     maintenance_port = free_port() if scenario.has_maintenance_port else None
     systems = range(1, scenario.vehicles + 1)
-    simulators = [
-        _simulator(run.kind, kind, system, folder / str(system), swarm=scenario.swarm, port=maintenance_port)
-        for system in systems
-    ]
-    async with flying(
-        simulators, scenario, BY_NAME[run.condition], with_daemons=run.with_daemons, maintenance_port=maintenance_port
-    ) as world:
+    simulators = [_simulator(run.kind, system, folder / str(system), maintenance_port) for system in systems]
+    condition = BY_NAME[run.condition]
+    async with flying(simulators, scenario, condition, maintenance_port=maintenance_port) as world:
         pilots = [Pilot(world.station, system, kind) for system in systems]
         record.version = await version(world.station, 1)
         record.figures = await scenario.scene(world, pilots)
 
 
-def _simulator(name: str, kind: Kind, system: int, folder: Path, *, swarm: bool, port: int | None) -> Simulator:
-    if kind is OWN:
+def _simulator(name: str, system: int, folder: Path, maintenance_port: int | None) -> Simulator:
+    if KINDS[name] is OWN:
         folder.mkdir()
         return OwnSimulator(system, folder)
-    parameters = {**kind.parameters, **(kind.follows if swarm and system > 1 else {})}
-    return RealSimulator(Firmware(name), system, folder, parameters=parameters, maintenance_port=port)
+    parameters = KINDS[name].parameters
+    return RealSimulator(Firmware(name), system, folder, parameters=parameters, maintenance_port=maintenance_port)
 
 
 async def version(station: Station, system: int) -> str:

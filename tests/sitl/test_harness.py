@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from tests.processes.frames import frame, heartbeat
 from tests.sitl.downloads import judged
-from tests.sitl.ledger import Passing, compare, compare_by, number_of, source_of, split
+from tests.sitl.ledger import Passing, compare, compare_by, number_of, source_of
 from tests.sitl.pilots import Place
 from tests.sitl.relayed import problem_of
 from tests.sitl.roles import LIMITS_M, Snapshot, differences
@@ -118,11 +118,6 @@ def test_dead_relay_is_judged(change: dict[str, Any], problem: str) -> None:
     assert problem_of(CALM | change) == problem
 
 
-def test_datagram_is_split_into_frames() -> None:
-    """Bytes outside frames are counted."""
-    assert split(b"boot" + frame(1) + frame(2)) == ([frame(1), frame(2)], 4)
-
-
 CALM_STATE = Snapshot(
     {"armed": False, "mode": 4, "plan 0": "[]", "FENCE_ENABLE": b"\0\0\0\0"},
     dict.fromkeys(LIMITS_M, Place(469_480_000, 74_474_000, 540.0)),
@@ -157,16 +152,15 @@ def test_change_by_a_role_is_reported(change: dict[str, Any]) -> None:
 @pytest.mark.long
 async def test_roles_change_nothing_in_own_simulator() -> None:
     """On the ground and in the air."""
-    record = await fly(Run("roles", "own", with_daemons=False))
+    record = await fly(Run("roles", "own"))
     assert record.error is None, record
     assert len(record.figures["attacks"]) == 4
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("with_daemons", [True, False], ids=["daemons", "direct"])
-async def test_own_simulator_flies(with_daemons: bool) -> None:
+async def test_own_simulator_flies() -> None:
     """Parameters and a mission of 100 items, every frame counted: the same code as with a real autopilot."""
-    record = await fly(Run("parameters-mission", "own", with_daemons=with_daemons))
+    record = await fly(Run("parameters-mission", "own"))
     assert record.error is None, record
     assert record.figures["frames"]["exact"]
 
@@ -207,9 +201,3 @@ def test_every_message_and_command_is_drawn(role: str) -> None:
             assert only is None or commands == only
         else:
             assert not commands
-
-
-def test_seed_repeats_the_frames() -> None:
-    """So a run can be repeated."""
-    first, second = (RoleFrames("swarm-member", seed=9) for _ in range(2))
-    assert [first.draw() for _ in range(500)] == [second.draw() for _ in range(500)]

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from tests.sitl.real_autopilot import Firmware, RealAutopilotError, binary_of
 from tests.sitl.scenarios import Run, fly, runs
+from tests.sitl.simulators import Firmware, RealAutopilotError, binary_of
 
 
 def flights() -> Iterator[Any]:
@@ -23,7 +23,7 @@ def flights() -> Iterator[Any]:
             yield pytest.param(error, id=firmware.value)
             continue
         if binary is not None:
-            yield from (pytest.param(run, id=str(run)) for run in runs((firmware.value,)))
+            yield from (pytest.param(run, id=str(run)) for run in runs(firmware.value))
         else:
             reason = f"no autopilot simulator: set UAVLINKD_{firmware.name} to its binary"
             yield pytest.param(None, id=firmware.value, marks=pytest.mark.skip(reason=reason))
@@ -36,4 +36,5 @@ async def test_scenario(run: Run | RealAutopilotError) -> None:
     if isinstance(run, RealAutopilotError):
         raise run
     record = await fly(run)
+    print(record)
     assert record.error is None, record

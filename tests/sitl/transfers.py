@@ -1,13 +1,9 @@
-"""Scenarios on the ground: parameters, a mission of 100 items, a log, a file by MAVFTP, signing.
-
-A log is read by LOG_REQUEST_DATA, any file by MAVFTP; what was lost is requested again.
-"""
+"""Scenarios on the ground: parameters, a mission of 100 items, a log, signing. What was lost is requested again."""
 
 from __future__ import annotations
 
 import asyncio
 import os
-import struct
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,25 +13,13 @@ from typing import Any
 from pymavlink.dialects.v20 import all as mavlink
 
 from tests.sitl.pilots import Pilot
-from tests.sitl.station import AUTOPILOT, Inbox, RequestError, Station
+from tests.sitl.station import AUTOPILOT, RequestError, Station
 from tests.sitl.tables import download_mission, download_parameters, upload_mission
 from tests.sitl.world import World
 
 LOG_BYTES = 90
 """In one LOG_DATA message."""
 SILENCE_S = 1.0
-FTP_BYTES = 239
-_HEADER = struct.Struct("<HBBBBBBI")
-_TERMINATE, _RESET, _OPEN_RO, _CREATE, _WRITE, _BURST = 1, 2, 4, 6, 7, 15
-_NAK = 129
-
-
-class FtpError(RequestError):
-    """The vehicle answered with an error; ``code`` as in the MAVFTP specification."""
-
-    def __init__(self, opcode: int, code: int) -> None:
-        super().__init__(f"MAVFTP operation {opcode} was refused with error {code}")
-        self.code = code
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,104 +78,9 @@ async def download_log(station: Station, system: int, log: Log, timeout_s: float
     return b"".join(part for part in parts if part is not None)
 
 
-class Ftp:
-    """MAVFTP with one vehicle."""
-
-    def __init__(self, station: Station, system: int) -> None:
-        self._station = station
-        self._system = system
-        self._sequence = 0
-
-    async def read(self, path: str, timeout_s: float = 600.0) -> bytes:
-        """Read a file in bursts; each gap is read again.
-
-        Raises:
-            RequestError: the vehicle refused it, or the file was incomplete after ``timeout_s``.
-        """
-        deadline = monotonic() + timeout_s
-        await self._request(_RESET)
-        session, opened = await self._request(_OPEN_RO, data=path.encode())
-        size = struct.unpack("<I", opened[:4])[0]
-        parts: dict[int, bytes] = {}
-        with self._station.inbox(self._system, "FILE_TRANSFER_PROTOCOL") as inbox:
-            while (offset := self._first_gap(parts, size)) < size:
-                if monotonic() > deadline:
-                    raise RequestError(f"byte {offset} of {size} of {path} is missing after {timeout_s:.0f} s")
-                self._send(_BURST, session, offset, FTP_BYTES, b"")
-                await self._receive_burst(inbox, parts, offset, size)
-        await self._request(_TERMINATE, session=session)
-        return b"".join(parts[offset] for offset in sorted(parts))
-
-    async def write(self, path: str, content: bytes, timeout_s: float = 600.0) -> None:
-        """Create a file and write it, part by part.
-
-        Raises:
-            RequestError: the vehicle refused it, or did not answer.
-        """
-        deadline = monotonic() + timeout_s
-        await self._request(_RESET)
-        session, _ = await self._request(_CREATE, data=path.encode())
-        for offset in range(0, len(content), FTP_BYTES):
-            if monotonic() > deadline:
-                raise RequestError(f"{offset} of {len(content)} bytes were written within {timeout_s:.0f} s")
-            await self._request(_WRITE, session=session, offset=offset, data=content[offset : offset + FTP_BYTES])
-        await self._request(_TERMINATE, session=session)
-
-    async def _receive_burst(self, inbox: Inbox, parts: dict[int, bytes], offset: int, size: int) -> None:
-        """Store what arrives until the burst is complete, the vehicle is silent, or the end was reached."""
-        while (message := await inbox.next(SILENCE_S)) is not None:
-            _, _, opcode, length, of, is_complete, _, at = _HEADER.unpack(bytes(message.payload[:12]))
-            if of != _BURST:
-                continue
-            if opcode == _NAK:
-                return
-            parts[at] = bytes(message.payload[12 : 12 + length])
-            if is_complete or at + length >= size:
-                return
-        self._station.retries["MAVFTP burst"] += 1
-
-    @staticmethod
-    def _first_gap(parts: dict[int, bytes], size: int) -> int:
-        offset = 0
-        while offset < size and offset in parts:
-            offset += len(parts[offset])
-        return offset
-
-    def _send(self, opcode: int, session: int, offset: int, size: int, data: bytes) -> int:
-        self._sequence = (self._sequence + 1) % 65536
-        header = _HEADER.pack(self._sequence, session, opcode, size, 0, 0, 0, offset)
-        payload = (header + data).ljust(251, b"\0")
-        self._station.send(mavlink.MAVLink_file_transfer_protocol_message(0, self._system, AUTOPILOT, payload))
-        return self._sequence
-
-    async def _request(
-        self, opcode: int, *, session: int = 0, offset: int = 0, data: bytes = b"", tries: int = 40
-    ) -> tuple[int, bytes]:
-        """Send a request until it is answered; session and data of the answer.
-
-        A vehicle answers a repeated request as the first one if the sequence number is the same.
-        """
-        with self._station.inbox(self._system, "FILE_TRANSFER_PROTOCOL") as inbox:
-            for attempt in range(tries):
-                self._sequence -= attempt > 0
-                sequence = self._send(opcode, session, offset, len(data), data)
-                self._station.retries["MAVFTP"] += attempt > 0
-                ends_at = monotonic() + SILENCE_S
-                while (left_s := ends_at - monotonic()) > 0 and (message := await inbox.next(left_s)) is not None:
-                    number, of_session, answer, length, of, *_ = _HEADER.unpack(bytes(message.payload[:12]))
-                    content = bytes(message.payload[12 : 12 + length])
-                    if of != opcode or number != (sequence + 1) % 65536:
-                        continue
-                    if answer == _NAK:
-                        raise FtpError(opcode, content[0])
-                    return of_session, content
-        raise RequestError(f"MAVFTP operation {opcode}: no answer")
-
-
 Figures = dict[str, Any]
 
 ITEMS = 100
-FILE_BYTES = 1_000_000
 FLIGHT_LOG_BYTES = 100_000
 """The log of a flight is longer."""
 SIGNING_SINCE_S = 1_420_070_400
@@ -264,11 +153,9 @@ async def parameters_and_mission(world: World, pilot: Pilot) -> Figures:
     return await counted(world, act)
 
 
-async def log_and_file(world: World, pilot: Pilot) -> Figures:
-    """Download a log, and a file of 1 MB by MAVFTP: equal byte for byte to the simulator's files."""
+async def whole_log(world: World, pilot: Pilot) -> Figures:
+    """Download a log: equal byte for byte to the simulator's file."""
     station, system, folder = world.station, pilot.system, world.vehicles[0].simulator.folder
-    content = os.urandom(FILE_BYTES)
-    await asyncio.to_thread((folder / "uavlinkd.bin").write_bytes, content)
     await pilot.request_streams()
     await pilot.take_off()  # the log begins when the motors start
     await pilot.return_and_land()
@@ -277,21 +164,7 @@ async def log_and_file(world: World, pilot: Pilot) -> Figures:
         log = largest(await list_logs(station, system))
         log_s, data = await timed(download_log(station, system, log))
         await asyncio.to_thread(check_log, folder, data)
-        ftp = Ftp(station, system)
-        read_s, back = await timed(ftp.read("uavlinkd.bin"))
-        assert back == content, "the file differs"
-        write_s, _ = await timed(ftp.write("uavlinkd.up", content))
-        assert await asyncio.to_thread((folder / "uavlinkd.up").read_bytes) == content, "the written file differs"
-        return {
-            "log_bytes": len(data),
-            "log_s": log_s,
-            "log_kb_s": round(len(data) / log_s / 1000, 1),
-            "file_bytes": len(back),
-            "ftp_read_s": read_s,
-            "ftp_read_kb_s": round(len(back) / read_s / 1000, 1),
-            "ftp_write_s": write_s,
-            "ftp_write_kb_s": round(len(back) / write_s / 1000, 1),
-        }
+        return {"log_bytes": len(data), "log_s": log_s, "log_kb_s": round(len(data) / log_s / 1000, 1)}
 
     return await counted(world, act)
 

@@ -2,9 +2,9 @@
 
 ::
 
-    with daemons:     autopilot ─ tap ─ uavlinkd ─ radio ─ uavlinkd ─ station
+    with radios:      autopilot ─ tap ─ uavlinkd ─ radio ─ uavlinkd ─ station
     with relays:      autopilot ─ tap ─ uavlinkd ─ relay ─ uavlinkd ─ station
-    without daemons:  autopilot ─ tap ─ radio ─ station
+    without daemons:  autopilot ─ tap ─ station
 
 The taps, the station and our own simulator are in this process, all others are processes of their own. The radio is
 left out where nothing has to be impaired. A tap records each frame and changes nothing. It opens a new socket for
@@ -23,7 +23,7 @@ from typing import Any
 
 from tests.kernel_queues import cpu_s
 from tests.namespaces import Namespace
-from tests.processes.fleet import AN_OPERATOR, a_member, a_vehicle, make_relay
+from tests.processes.fleet import AN_OPERATOR, a_vehicle, make_relay
 from tests.processes.frames import sender_of
 from tests.processes.harness import Stage
 from tests.processes.process import DaemonProcess, Status
@@ -47,8 +47,6 @@ class Tap(asyncio.DatagramProtocol):
         self.sources = 0
         """The number of source ports that the autopilot has used."""
         self.onward: Sockaddr | None = None
-        self.listeners: list[Tap] = []
-        """Taps whose autopilots receive what this one sends, without daemons."""
         self._sock = open_socket("127.0.0.1")
         self._autopilot: Sockaddr | None = None
         self._faces: dict[Sockaddr, _Face] = {}
@@ -95,9 +93,6 @@ class Tap(asyncio.DatagramProtocol):
             face.opening = asyncio.ensure_future(face.open())
         if self.onward is not None:
             face.sock.sendto(data, self.onward)
-        for listener in self.listeners:
-            if listener._autopilot is not None:
-                listener.deliver(data, listener._autopilot)
 
     def deliver(self, data: bytes, autopilot: Sockaddr) -> None:
         """Send a datagram to the autopilot."""
@@ -155,19 +150,14 @@ class Vehicle:
 class Layout:
     """How vehicles and station are connected."""
 
-    swarm: bool = False
-    """Whether the vehicles are peers of each other, as swarm members."""
+    is_direct: bool = False
+    """Whether there are no daemons."""
     radios: Sequence[Mapping[str, object]] = ()
-    """The impairments of each radio that is there under every condition. Several need daemons."""
+    """The impairments of each radio that is there under every condition."""
     relays: int = 0
-    """How many relays are between the vehicles and the station, in place of radios. They need daemons."""
+    """How many relays are between the vehicles and the station, in place of radios."""
     by_tls: bool = False
     """Whether the relays are reached by TLS alone. The flight has a network namespace of its own, to be cut."""
-
-    @property
-    def needs_daemons(self) -> bool:
-        """Whether it cannot be flown without daemons."""
-        return len(self.radios) > 1 or self.relays > 0
 
 
 @dataclass(slots=True)
@@ -301,7 +291,6 @@ async def flying(
     layout: Layout,
     condition: Condition,
     *,
-    with_daemons: bool,
     maintenance_port: int | None,
 ) -> AsyncIterator[World]:
     """Start everything, and wait until the station receives each vehicle.
@@ -309,7 +298,6 @@ async def flying(
     ``simulators``: one for each vehicle, not yet started. ``maintenance_port``: where a simulator sends MAVLink on a
     second port.
     """
-    assert with_daemons or not (condition.needs_daemons or layout.needs_daemons)
     async with AsyncExitStack() as stack:
         network = stack.enter_context(Namespace()) if layout.by_tls else None
         if network is not None:
@@ -329,10 +317,11 @@ async def flying(
             await tap.open()
             stack.callback(tap.close)
             world.vehicles.append(Vehicle(simulator.system, tap, simulator))
-        if with_daemons:
-            await _start_daemons(world, layout)
+        if layout.is_direct:
+            (vehicle,) = world.vehicles
+            vehicle.tap.onward = world.station.address
         else:
-            await _connect_directly(world, swarm=layout.swarm)
+            await _start_daemons(world, layout)
         for vehicle in world.vehicles:
             stack.push_async_callback(vehicle.simulator.stop)
             await vehicle.simulator.start(vehicle.tap.address)
@@ -352,12 +341,6 @@ async def _start_daemons(world: World, layout: Layout) -> None:
         psk = stage.psk()
         drone.add_peer(ground, [] if layout.relays else list(map(shown, to_ground)), psk, **AN_OPERATOR)
         ground.add_peer(drone, [] if layout.relays else list(map(shown, to_drone)), psk, **a_vehicle(vehicle.system))
-    for one, other in _pairs(world.vehicles) if layout.swarm else ():
-        assert one.daemon is not None
-        assert other.daemon is not None
-        psk = stage.psk()
-        one.daemon.add_peer(other.daemon, [other.daemon.address], psk, **a_member(other.system))
-        other.daemon.add_peer(one.daemon, [one.daemon.address], psk, **a_member(one.system))
     for number in range(1, layout.relays + 1):
         relay = stage.daemon(f"relay{number}")
         make_relay(relay, *world.daemons)
@@ -372,19 +355,3 @@ async def _start_daemons(world: World, layout: Layout) -> None:
         await radio.start()
     await stage.start(*world.relays, linked=False)
     await stage.start(*world.daemons)
-
-
-async def _connect_directly(world: World, *, swarm: bool) -> None:
-    for vehicle in world.vehicles:
-        vehicle.tap.onward = world.station.address
-        for radio in world.radios:
-            vehicle.tap.onward, _ = radio.connect(f"drone{vehicle.system}", None, world.station.address)
-    for radio in world.radios:
-        await radio.start()
-    for one, other in _pairs(world.vehicles) if swarm else ():
-        one.tap.listeners.append(other.tap)
-        other.tap.listeners.append(one.tap)
-
-
-def _pairs(vehicles: Sequence[Vehicle]) -> list[tuple[Vehicle, Vehicle]]:
-    return [(one, other) for number, one in enumerate(vehicles) for other in vehicles[number + 1 :]]
