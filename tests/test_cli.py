@@ -107,7 +107,6 @@ def test_keys_are_those_of_wireguard(capsys: pytest.CaptureFixture[str], monkeyp
         ["sim", "--system-id", "x"],
         *(["demo", f"--seconds={seconds}"] for seconds in ("0", "-1", "nan", "inf")),
         *(["demo", "--attack", attack] for attack in ("nonsense", "bit-flip,size=3", "misroute")),
-        ["demo", "--web", "--attack", "drop"],
         ["sim", "--seconds", "nan"],
     ],
 )

@@ -112,16 +112,12 @@ def _flush() -> None:
 
 
 def mitm(arguments: Sequence[str] | None = None) -> int:
-    """Run ``uavlink-mitm``: a man in the middle, an emulated radio, or a hostile relay. Return the exit status."""
+    """Run ``uavlink-mitm``: a man in the middle, or an emulated radio. Return the exit status."""
     return _to_the_end(lambda: _mitm(sys.argv[1:] if arguments is None else arguments))
 
 
 def _mitm(words: Sequence[str]) -> int:
     _need_lab("uavlink-mitm")
-    if words[:1] == ["relay"]:
-        from uavlinkd.lab.hostile.relay_cli import relay_main  # the man in the middle itself cannot import a key
-
-        return relay_main(words[1:])
     from uavlinkd.lab.mitm.cli import main as mitm_main
 
     return mitm_main(words)

@@ -51,15 +51,9 @@ def parsers() -> Iterator[argparse.ArgumentParser]:
     yield uavlinkd
     if not has_laboratory:
         return
-    from uavlinkd.lab.hostile import relay_cli  # noqa: PLC0415  the Debian package has no laboratory
-    from uavlinkd.lab.mitm import cli as mitm_cli  # noqa: PLC0415
+    from uavlinkd.lab.mitm import cli as mitm_cli  # noqa: PLC0415  the Debian package has no laboratory
 
-    mitm = mitm_cli.make_parser()
-    added = mitm.add_subparsers(title="commands", metavar="COMMAND")
-    for name, parser in ("modem", mitm_cli.make_modem_parser()), ("relay", relay_cli.make_parser()):
-        text = str(parser.description)
-        added.add_parser(name, parents=[parser], add_help=False, help=text, description=text)
-    yield mitm
+    yield mitm_cli.make_parser()
 
 
 def subparsers(parser: argparse.ArgumentParser) -> Iterator[argparse._SubParsersAction[argparse.ArgumentParser]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +18,7 @@ from tests.bench.run import QUICK, Plan, Run, laboratory
 from tests.bench.traffic import TrafficError
 from tests.namespaces import NamespaceError, why_not
 from uavlinkd.lab.child_processes import interrupted_by_signals
-from uavlinkd.lab.evaluation.frame import ReportSection, Table, percentile, to_markdown
+from uavlinkd.lab.evaluation.frame import ReportSection, Table, to_markdown
 from uavlinkd.lab.evaluation.records import EvaluationError, Record, RecordWriter, Value, machine_facts, read_records
 
 PAGE: Final = "RESULTS.md"
@@ -50,7 +50,7 @@ def write_report(folder: Path, name: str) -> str:
         ReportSection("Not measured", text=["\n".join(missing)]),
         ReportSection("The run", [Table(("", ""), [(fact, str(facts[fact])) for fact in facts])], text=[disturbed]),
     ]
-    text = to_markdown("What a frame costs: medians over the rounds", (), sections, ())
+    text = to_markdown("What a frame costs: medians over the rounds", (), sections)
     (folder / PAGE).write_text(text, encoding="utf-8")
     return text
 
@@ -68,7 +68,13 @@ def _median(records: Sequence[Record], name: str) -> str:
     if name != "latencies_s":
         return f"{median(record.number(name) for record in records):.5g}"
     rounds = [latencies for record in records if (latencies := record.values[name])]
-    return ", ".join(f"{median(percentile(one, part) for one in rounds):.3g}" for part in LATENCIES if rounds)
+    return ", ".join(f"{median(_percentile(one, part) for one in rounds):.3g}" for part in LATENCIES if rounds)
+
+
+def _percentile(values: Iterable[float], share: float) -> float:
+    """The smallest value that at least ``share`` (0 to 1) of the values do not exceed."""
+    ordered = sorted(values)
+    return ordered[min(len(ordered) - 1, max(0, -int(-share * len(ordered) // 1) - 1))]
 
 
 def _point(record: Record) -> str:

@@ -148,7 +148,7 @@ class Air:
             return math.inf
         if sender in self.absent or receiver in self.absent:
             return math.inf
-        if settings.loss or settings.bursts or settings.outages or settings.bits_per_s is not None:
+        if settings.loss or settings.bursts or settings.bits_per_s is not None:
             return math.inf
         pair = frozenset((sender.drone, receiver.drone))
         scopes: tuple[Scope, ...] = (hop, sender, receiver, sender.drone, receiver.drone, pair, None)

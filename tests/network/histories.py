@@ -33,7 +33,7 @@ from tests.network.path_misfortunes import random_modems, random_radio
 from tests.network.plans import PLANS, WEIGHTS, Plan
 from tests.network.relay_fleet import RelayFleet
 from tests.protocol.bounds import Sizes
-from uavlinkd.lab.mitm.radio import RadioSettings
+from uavlinkd.lab.mitm.radio import HELD_BACK_S, RadioSettings
 from uavlinkd.protocol import constants as c
 from uavlinkd.protocol.outputs import SessionEstablished
 from uavlinkd.protocol.settings import Class
@@ -111,7 +111,7 @@ class CriticalWatch:
             settled_s = METERED_SETTLED_S if any(map(self._was_metered, hop)) else SETTLED_S
             for direction, one in enumerate((hop, hop.back)):
                 radio = self._network.air.settings_of(one)
-                held_back_s = radio.held_back_s if radio.reordering else 0.0
+                held_back_s = HELD_BACK_S if radio.reordering else 0.0
                 delays_s[direction] += radio.delay_s + radio.jitter_s + held_back_s
                 if self._network.air.undisturbed_since(one) > sent_at - settled_s:
                     return False

@@ -148,7 +148,7 @@ def test_package_holds_what_a_vehicle_needs(package: Package) -> None:
 
     assert depends == f"python3 (>= {lowest}), python3 (<< {beyond})"
     assert {"uavlinkd", "uvloop", "cryptography", "rich"} <= packages
-    assert not {"pip", "setuptools", "pymavlink", "matplotlib"} & packages
+    assert not {"pip", "setuptools", "pymavlink"} & packages
     assert not [name for name in names if "/uavlinkd/lab" in name]
     assert {fields[1] for fields in listing} == {"root/root"}
     assert {fields[0] for fields in listing} <= {"drwxr-xr-x", "drwx------", "-rw-r--r--", "-rwxr-xr-x", "lrwxrwxrwx"}

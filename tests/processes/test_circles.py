@@ -81,21 +81,5 @@ async def test_bridge_between_two_endpoints_makes_no_copies(stage: Stage) -> Non
     assert sorted(vehicle.frames) == sorted([heartbeat(2), heartbeat(3)])
 
 
-async def test_autopilot_joined_by_companion_and_radio(stage: Stage) -> None:
-    """It forwards what it gets from one to the other, also its own frames: the pilot gets each once."""
-    drone, ground = drone_and_ground(stage)
-    companion, radio, pilot = drone.add_endpoint("autopilot"), ground.add_endpoint("radio"), await stage.client()
-    ground.add_endpoint("pilot", f"udpout:{pilot}")
-    await stage.start(drone, ground)
-    with bridge(companion, radio) as (at_companion, at_radio):
-        at_radio.sendto(heartbeat(1), radio)
-        await pilot.until_received(heartbeat(1))
-        for number in range(1, 4):
-            at_companion.sendto(heartbeat(1, seq=number), companion)
-            await pilot.until_received(heartbeat(1, seq=number))
-            await ground.until(lambda status, n=number: status["unrouted"].get("duplicate", 0) >= n)  # type: ignore[misc]
-    assert pilot.frames == [heartbeat(1, seq=number) for number in range(4)]
-
-
 def causes(status: dict[str, list[dict[str, str]]]) -> list[str]:
     return [finding["cause"] for finding in status["findings"]]

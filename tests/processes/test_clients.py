@@ -15,6 +15,7 @@ from tests.processes.fleet import drone_and_ground, held_back
 from tests.processes.frames import heartbeat
 from tests.processes.harness import Stage
 from tests.processes.process import DaemonProcess, Status
+from uavlinkd.io.url import NetworkUrl, parse_url
 from uavlinkd.lab.mitm.modem import ModemSettings
 from uavlinkd.lab.mitm.modem_ports import ModemPorts, PortSettings
 from uavlinkd.lab.sim.autopilot import AutopilotSettings
@@ -35,7 +36,9 @@ async def flying(
     drone.add_endpoint("autopilot", drone_url)
     ground.add_endpoint("station", ground_url)
     await stage.start(drone, ground)
-    async with Flight(flight_url, AutopilotSettings(system_id=SYSTEM)) as flight:
+    url = parse_url(flight_url)
+    assert isinstance(url, NetworkUrl)
+    async with Flight(url, AutopilotSettings(system_id=SYSTEM)) as flight:
         await drone.until(lambda status: bool(status["endpoints"]["autopilot"]["clients"]))
         yield flight, drone, ground
 

@@ -83,37 +83,6 @@ async def test_captured_peer_says_what_its_policy_allows(stage: Stage) -> None:
             before = tally
 
 
-async def test_rates_bind_it(stage: Stage) -> None:
-    """Of a burst of a message with a rate limit two pass, and the rest are counted; other messages go on."""
-    victim, client, attacker = await besieged(stage, {**a_member(CAPTURED), "rate_in": {"ATTITUDE": 2}})
-    burst = [pack(mavlink.MAVLink_attitude_message(n, 0, 0, 0, 0, 0, 0), CAPTURED, seq=n) for n in range(20)]
-    async with attacker as rogue:
-        rogue.say(b"".join(burst) + heartbeat(CAPTURED))
-        await client.until_received(heartbeat(CAPTURED))
-        assert client.frames == [*burst[:2], heartbeat(CAPTURED)]
-        assert held_back(await victim.status(), "peers", "captured") == {("ATTITUDE", "rate_limited"): 18}
-
-
-async def test_it_receives_only_what_its_role_allows(stage: Stage) -> None:
-    """An observer gets telemetry; orders, keys and parameters set are never sent to it, and are counted."""
-    victim, client, attacker = await besieged(stage, {"role": "observer", "system_ids": [TABLET]})
-    setting = pack(mavlink.MAVLink_param_set_message(0, 1, b"FS_GCS_ENABLE", 0, 9), GROUND_SYSTEM)
-    key = pack(mavlink.MAVLink_setup_signing_message(0, 1, bytes(32), 1), GROUND_SYSTEM)
-    async with attacker as rogue:
-        rogue.say(pack(mavlink.MAVLink_ping_message(1, 2, 0, 0), TABLET))
-        await client.until(lambda: bool(client.received))
-        into = client.sources[-1]
-        for frame in (heartbeat(1), setting, command_long(ARM, GROUND_SYSTEM, (0, 1)), key, heartbeat(1, seq=1)):
-            client.send(frame, into)
-        await rogue.until(lambda: heartbeat(1, seq=1) in rogue.received)
-        status = await victim.status()
-    assert bytes(rogue.received) == heartbeat(1) + heartbeat(1, seq=1)
-    assert held_back(status, "endpoints", "client") == {("SETUP_SIGNING", "setup_signing"): 1}
-    assert held_back(status, "peers", "captured", "out") == {
-        (name, "message_not_allowed"): 1 for name in ("COMMAND_LONG", "PARAM_SET")
-    }
-
-
 # A client.
 
 CAMERA_POLICY: dict[str, Any] = {

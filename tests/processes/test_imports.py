@@ -7,12 +7,9 @@ import os
 import sys
 from pathlib import Path
 
-import pytest
-
 from tests.processes import frames
 from tests.processes.fleet import make_relay
 from tests.processes.harness import Stage
-from tests.processes.test_reload import reload
 from tests.processes.tls import listen_for_tls
 from tests.waiting import PATIENCE_S
 
@@ -69,7 +66,6 @@ NOT_CONFIGURED = (
     *(
         "argcomplete",
         "cobs",
-        "matplotlib",
         "prometheus_client",
         "pydantic",
         "pymavlink",
@@ -97,36 +93,18 @@ async def test_a_daemon_imports_what_its_file_needs(stage: Stage) -> None:
     assert await imported(hook, *NOT_CONFIGURED) == []
 
 
-async def test_a_daemon_imports_no_laboratory(stage: Stage) -> None:
-    """Nor what the page speaks HTTP with, nor pymavlink, with every part in use: endpoints, a reload."""
-    a, b = stage.pair()
-    a.add_endpoint("client")
-    a.add_endpoint("server", "tcp:127.0.0.1:9")
-    a.add_endpoint("autopilot", "serial:/dev/absent.test:57600")
-    hook, environ = hooked(stage, HOOK)
-    await a.start(environ)
-    await b.start()
-    await a.until_linked()
-    assert await reload(a) == []
-    assert await a.stop() == 0
-    of_page = "starlette", "uvicorn", "prometheus_client"
-    assert await imported(hook, "uavlinkd.lab", "matplotlib", "pymavlink", *of_page, *OF_TLS) == []
-
-
-@pytest.mark.parametrize("has_tls", [False, True])
-async def test_tls_is_imported_where_it_is_used(stage: Stage, *, has_tls: bool) -> None:
+async def test_tls_is_imported_where_it_is_used(stage: Stage) -> None:
     """By a relay that listens for it and by a member with a URL. Others start faster and stay smaller."""
     relay, member = stage.daemon("relay"), stage.daemon("member")
     make_relay(relay, member)
-    if has_tls:
-        member.config["relay"][0]["addresses"] = [listen_for_tls(relay)]
+    member.config["relay"][0]["addresses"] = [listen_for_tls(relay)]
     hooks = [hooked(stage, HOOK, daemon.name) for daemon in (relay, member)]
     for daemon, (_, environ) in zip((relay, member), hooks, strict=True):
         await daemon.start(environ)
     await member.until(lambda status: status["relays"]["relay"]["state"] == "up")
     assert [await member.stop(), await relay.stop()] == [0, 0]
     names = {name for hook, _ in hooks for name in await imported(hook, *OF_TLS)}
-    assert names >= set(OF_TLS) if has_tls else not names
+    assert names >= set(OF_TLS)
 
 
 async def test_daemon_links_and_delivers_without_unix(stage: Stage) -> None:

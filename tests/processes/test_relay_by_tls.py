@@ -59,16 +59,6 @@ async def carrying(member: DaemonProcess) -> str:
     return str(status["relays"]["vps"]["paths"][0]["address"])
 
 
-async def test_one_member_by_tls_and_another_by_udp(stage: Stage) -> None:
-    """They reach each other."""
-    scene = Scene(stage)
-    await scene.start([scene.url], [scene.relay.address])
-    await scene.talk()
-    assert await carrying(scene.drone) == scene.url
-    assert await carrying(scene.ground) == scene.relay.address
-    assert await scene.connections() == 1
-
-
 async def test_signed_frames_arrive_in_the_order_of_their_sender(stage: Stage) -> None:
     """Through the relay, with bursts of frames of all classes: no gap in their numbers, no signature is rejected."""
     scene = Scene(stage)
@@ -79,17 +69,6 @@ async def test_signed_frames_arrive_in_the_order_of_their_sender(stage: Stage) -
         await scene.pilot.until(lambda: len(scene.pilot.received) >= sum(len(frame.raw) for frame in autopilot.sent))
     station = Station([bytes(scene.pilot.received)])
     assert (station.packet_loss(), station.rejected) == (0, 0)
-
-
-async def test_relay_that_restarts(stage: Stage) -> None:
-    """Its members connect again, and the link is back."""
-    scene = Scene(stage)
-    await scene.start([scene.url], [scene.url])
-    await scene.relay.kill()
-    await scene.drone.until(lambda status: status["peers"]["ground"]["state"] != "up")
-    await scene.relay.start()
-    await scene.drone.until_linked()
-    await scene.talk()
 
 
 async def test_members_of_a_fleet(stage: Stage) -> None:

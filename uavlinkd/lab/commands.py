@@ -7,6 +7,7 @@ import asyncio
 import math
 from contextlib import suppress
 
+from uavlinkd.io.url import EndpointKind, NetworkUrl, UrlError, parse_url
 from uavlinkd.system.terminal import FAILED, OK, CommandError, UsageError, printable
 from uavlinkd.web.commands import of_the_extra
 
@@ -36,13 +37,8 @@ def _add_sim(sim: argparse.ArgumentParser) -> None:
 def _add_demo(demo: argparse.ArgumentParser) -> None:
     demo.set_defaults(command=_demo)
     demo.add_argument("--seconds", type=float, metavar="N", help="of traffic (default: 15, or 3 for each attack)")
-    attacked = demo.add_mutually_exclusive_group()
-    attacked.add_argument(
-        "--web",
-        action="store_true",
-        help="until q or Ctrl-C, show a daemon's page in a browser, with buttons that attack",
-    )
-    attacked.add_argument(
+    demo.add_argument("--web", action="store_true", help="until q or Ctrl-C, serve a daemon's page for a browser")
+    demo.add_argument(
         "--attack",
         metavar="NAME[,key=value]",
         help="attack between the drones: a name of `uavlink-mitm --list`, or all; exit status 0 if no forged, altered"
@@ -53,13 +49,16 @@ def _add_demo(demo: argparse.ArgumentParser) -> None:
 
 def _sim(options: argparse.Namespace) -> int:
     from uavlinkd.lab.sim.flight import SimOptions, run_sim  # noqa: PLC0415
-    from uavlinkd.lab.sim.links import LinkError, parse_url  # noqa: PLC0415
+    from uavlinkd.lab.sim.links import LinkError  # noqa: PLC0415
 
     _check_seconds(options)
     try:
         url = parse_url(options.url)
-    except LinkError as error:
-        raise UsageError(error) from None
+    except UrlError as error:
+        raise UsageError(f"--url {error}") from None
+    if url.kind not in (EndpointKind.UDPIN, EndpointKind.UDPOUT):
+        raise UsageError("--url must begin with udpin: or udpout:")
+    assert isinstance(url, NetworkUrl)
 
     def write(line: str) -> None:
         print(printable(line), flush=True)
@@ -84,7 +83,7 @@ def _demo(options: argparse.Namespace) -> int:
     if options.web:
         with of_the_extra("uavlinkd demo --web"):
             from uavlinkd.lab.demo import web  # noqa: PLC0415
-    serve = web.serve if options.web else None
+    serve = web.serving if options.web else None
     try:
         with interrupted_by_signals():
             summary = asyncio.run(

@@ -51,7 +51,7 @@ def make_app(watch: Watcher, more: Sequence[BaseRoute]) -> Starlette:
 
 
 class Page:
-    """Listens from the start on. ``more``: resources of others. Raises BindError if the address cannot be used."""
+    """Listens from the start on. Raises BindError if the address cannot be used."""
 
     def __init__(
         self,
@@ -60,8 +60,6 @@ class Page:
         names: frozenset[str] = frozenset(),
         password_hash: bytes | None = None,
         tls: ssl.SSLContext | None = None,
-        *,
-        more: Sequence[BaseRoute] = (),
     ) -> None:
         async def ask_daemon(request: str) -> dict[str, Any]:
             return await asyncio.to_thread(ask, control_socket, request, PATIENCE_S, for_terminal=False)
@@ -70,7 +68,7 @@ class Page:
         self._listener = tcp_listener(address)
         self._scheme = "http" if tls is None else "https"
         metrics = Route("/metrics", Scrapes(ask_daemon).answer)
-        app = Guard(make_app(self._watch, [*more, metrics]), names, password_hash, monotonic)
+        app = Guard(make_app(self._watch, [metrics]), names, password_hash, monotonic)
         self._server = WebServer(app, self._listener, tls)
 
     def __enter__(self) -> Page:

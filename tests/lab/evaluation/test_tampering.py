@@ -108,10 +108,9 @@ async def test_quick_run(tmp_path: Path) -> None:
         assert not trial.faults
         assert not trial.unseen, trial
         assert set(trial.successes) <= {NOT_IN_TIME}, trial
-        # On a busy machine the quiet time shows some of these counts too, and five attempts do not stand out.
         # A false address that no member asks leaves no trace.
         is_lie = trial.attack == "relay lies about addresses"
-        assert is_lie or trial.is_noticed or set(trial.noticed) & set(trial.control), trial
+        assert is_lie or trial.is_noticed, trial
         assert trial.recovery_s is not None
     # A busy machine may exceed the limit now and then, wherever it lets a process wait. A daemon that does so exceeds
     # it after each attack of a kind; tests/network has the limits in virtual time.

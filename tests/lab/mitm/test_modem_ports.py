@@ -1,23 +1,18 @@
-"""The emulated modems on pseudo-terminals: the plug, requests, the command line."""
+"""The emulated modems on pseudo-terminals: the plug, and devices of the user."""
 
 from __future__ import annotations
 
-import asyncio
 import errno
-import json
 import os
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from tests.waiting import until
-from uavlinkd.lab.mitm.cli import main
 from uavlinkd.lab.mitm.modem import Fate, ModemEnd, ModemSettings
 from uavlinkd.lab.mitm.modem_ports import ModemPorts, PortSettings
-from uavlinkd.ops.control import ask
 
 pytestmark = pytest.mark.usefixtures("undone_settings")
 
@@ -25,9 +20,9 @@ LEFT, RIGHT = ModemEnd.LEFT, ModemEnd.RIGHT
 FAST = ModemSettings(air_bits_s=1e6, line_baud=1e6, turn_around_s=0.001, queue_bytes=1 << 16)
 
 
-def settings_in(folder: Path, modem: ModemSettings = FAST, **others: Any) -> PortSettings:
+def settings_in(folder: Path) -> PortSettings:
     """Devices and files in a folder."""
-    return PortSettings(folder / "left", folder / "right", modem, **others)
+    return PortSettings(folder / "left", folder / "right", FAST)
 
 
 @asynccontextmanager
@@ -86,50 +81,14 @@ async def test_pulled_modem_fails_and_comes_back(tmp_path: Path) -> None:
         right.close()
 
 
-async def test_requests(tmp_path: Path) -> None:
-    """Each request of the control socket, and refusals that name what is wrong."""
-    path = tmp_path / "control"
-
-    async def asked(request: str) -> dict[str, Any]:
-        return await asyncio.to_thread(ask, path, request)
-
-    async with running(settings_in(tmp_path, control_socket=path)) as ports:
-        await asked("set packet_loss=0.5 byte_error_rate=0.25")
-        assert (ports.link.settings.packet_loss, ports.link.settings.byte_error_rate) == (0.5, 0.25)
-        await asked("attack line-noise,end=left,interval_s=0.01 line-forge,interval_s=0.01")
-        await until(lambda: ports.journal.counts.total() > 5)
-        assert (await asked("statistics"))["attacks"] == ["line-noise", "line-forge"]
-        await asked("attack none")
-        assert ports.attacker.names == []
-        await asked("pull left")
-        assert not ports.link.is_plugged(LEFT)
-        statistics = await asked("statistics")
-        assert statistics["modems"]["left"]["is_plugged"] is False
-        await asked("plug left")
-        assert ports.link.is_plugged(LEFT)
-        for wrong, message in (
-            ("pull middle", "left or right"),
-            ("set loss=1", "packet_loss"),
-            ("set packet_loss=2", "share"),
-            ("set packet_loss=much", "float"),
-            ("attack line", "line-noise"),
-            ("jump", "no request"),
-        ):
-            assert message in (await asked(wrong))["refused"], wrong
-        await asked("stop")
-        assert ports.stopping.is_set()
-
-
-def test_stale_link_is_replaced_but_no_other_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+async def test_stale_link_is_replaced_but_no_other_file(tmp_path: Path) -> None:
     """A killed emulator leaves a link to a pseudo-terminal. A file of the user stays."""
     (tmp_path / "left").symlink_to("/dev/pts/1234567")
     (tmp_path / "right").write_text("mine")
-    arguments = ["modem", f"--left={tmp_path}/left", f"--right={tmp_path}/right", "--seconds=0.05"]
-    assert main(arguments) == 1
-    assert str(tmp_path / "right") in capsys.readouterr().err
+    with pytest.raises(FileExistsError):
+        await ModemPorts(settings_in(tmp_path)).start()
     assert (tmp_path / "right").read_text() == "mine"
     assert not (tmp_path / "left").is_symlink()
     (tmp_path / "right").unlink()
-    assert main(arguments) == 0
-    printed = capsys.readouterr().out
-    assert json.loads(printed[printed.index("{\n") :])["modems"]["left"]["is_plugged"] is True
+    async with running(settings_in(tmp_path)) as ports:
+        assert ports.link.is_plugged(LEFT)

@@ -9,7 +9,9 @@ from typing import Self
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from tests import waiting
-from uavlinkd.lab.sim.links import MavlinkConnection, open_connection
+from uavlinkd.io.url import EndpointKind, NetworkUrl
+from uavlinkd.lab.sim.links import MavlinkConnection
+from uavlinkd.system.addresses import Address
 
 
 def frames(count: int, system_id: int = 1) -> list[bytes]:
@@ -28,14 +30,9 @@ def frames(count: int, system_id: int = 1) -> list[bytes]:
 class Collector:
     """A connection that stores each received frame, as on the wire."""
 
-    def __init__(self, url: str) -> None:
-        self._url = url
-        self.link: MavlinkConnection
+    def __init__(self, kind: EndpointKind, port: int) -> None:
         self.frames: list[bytes] = []
-
-    @property
-    def address(self) -> tuple[str, int]:
-        return self.link.url.host, self.link.url.port
+        self.link = MavlinkConnection(NetworkUrl(kind, Address("127.0.0.1", port)), self.frames.append)
 
     async def until(self, condition: Callable[[], bool]) -> None:
         await waiting.until(condition)
@@ -45,7 +42,7 @@ class Collector:
         return self.link.send(frame)
 
     async def __aenter__(self) -> Self:
-        self.link = await open_connection(self._url, self.frames.append)
+        await self.link.open()
         return self
 
     async def __aexit__(

@@ -9,8 +9,11 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from tests import waiting
 from tests.lab.sim.recorded import Collector, frames
 from tests.lab.sim.station import decode, of_type
+from uavlinkd.io.url import EndpointKind, NetworkUrl
 from uavlinkd.lab.sim.autopilot import AutopilotSettings
 from uavlinkd.lab.sim.flight import Flight
+from uavlinkd.lab.sim.loopback_ports import free_port
+from uavlinkd.system.addresses import Address
 
 
 def encode(message: Any) -> bytes:
@@ -23,8 +26,8 @@ ARM = encode(mavlink.MAVLink_command_long_message(1, 1, 400, 0, 1, 0, 0, 0, 0, 0
 
 
 async def test_the_report_has_the_frames_of_both_directions() -> None:
-    async with Collector("udpin:127.0.0.1:0") as station:
-        url = f"udpout:127.0.0.1:{station.address[1]}"
+    async with Collector(EndpointKind.UDPIN, port := free_port()) as station:
+        url = NetworkUrl(EndpointKind.UDPOUT, Address("127.0.0.1", port))
         async with Flight(url, AutopilotSettings(attitude_rate_hz=200)) as flight:
             await station.until(lambda: len(station.frames) >= 20)
             station.send(HEARTBEAT)
@@ -38,9 +41,9 @@ async def test_the_report_has_the_frames_of_both_directions() -> None:
 async def test_frames_pass_unchanged_in_both_directions() -> None:
     """What one end sends, the other collects byte for byte; a listener answers who called."""
     sent, answers = frames(20), frames(20, system_id=255)
-    async with Collector("udpin:127.0.0.1:0") as ground:
+    async with Collector(EndpointKind.UDPIN, port := free_port()) as ground:
         assert not ground.send(answers[0])
-        async with Collector(f"udpout:127.0.0.1:{ground.address[1]}") as air:
+        async with Collector(EndpointKind.UDPOUT, port) as air:
             for frame in sent:
                 assert air.send(frame)
             await ground.until(lambda: len(ground.frames) == len(sent))

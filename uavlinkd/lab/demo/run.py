@@ -1,7 +1,7 @@
 """``uavlinkd demo``: two real daemons on loopback, each with a client; every frame is checked.
 
-With ``--attack``, the man in the middle between the two runs one attack after the other; with ``--web`` those that a
-person starts.
+With ``--attack``, the man in the middle between the two runs one attack after the other. With ``--web`` a browser
+shows the page of one daemon.
 """
 
 from __future__ import annotations
@@ -13,8 +13,9 @@ import sys
 import termios
 import tty
 from collections import Counter
-from collections.abc import Awaitable, Callable, Iterator
-from contextlib import ExitStack, contextmanager, nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import AbstractAsyncContextManager, ExitStack, contextmanager, nullcontext
+from pathlib import Path
 from time import monotonic
 
 from rich.console import Console
@@ -70,9 +71,6 @@ _OPTIONS = {
     "blackout": ",seconds=60",
 }
 
-Serve = Callable[["Demo", float], Awaitable[None]]
-"""Shows a demo until this time of the monotonic clock."""
-
 
 def attacks_of(text: str) -> list[AttackSpec]:
     """The attacks that ``--attack`` names: one as for ``uavlink-mitm``, or ``all``.
@@ -93,14 +91,14 @@ async def run_demo(
     show: bool,
     attack: str | None = None,
     console: Console | None = None,
-    serve: Serve | None = None,
+    serve: Callable[[Path], AbstractAsyncContextManager[None]] | None = None,
 ) -> Summary:
     """Run the demo, on a live screen if ``show``.
 
     Args:
         seconds: of traffic; by default :data:`SECONDS`, or with attacks :data:`ATTACK_SECONDS` for each.
         attack: an attack between the drones, as for ``uavlink-mitm``, or ``all``.
-        serve: shows the demo in a browser, instead of the live screen.
+        serve: serves the page of the daemon with this control socket, until a person ends it.
 
     Raises:
         DroneError, EvaluationError: the daemons do not start or do not link.
@@ -109,7 +107,7 @@ async def run_demo(
     console = console or Console()
     specs = None if attack is None else attacks_of(attack)
     if seconds is None:
-        seconds = math.inf if serve else SECONDS if specs is None else ATTACK_SECONDS * len(specs)
+        seconds = ATTACK_SECONDS * len(specs) if specs else math.inf if serve else SECONDS
     link = LINK if specs is None else {**LINK, **ATTACKED_LINK}
     with private_folder("uavlinkd-demo-") as folder, ExitStack() as stack:
         # The summary replaces the live screen; after Ctrl-C it remains.
@@ -118,7 +116,8 @@ async def run_demo(
             async with DaemonStage(NAMES, folder, MiddleHere(NAMES, 0), link, rate_hz=RATE_HZ) as stage:
                 demo = Demo(stage, live)
                 with _ended_by_q(demo) if show else nullcontext():
-                    summary = await demo.run(seconds, specs, serve)
+                    async with serve(stage.drones[NAMES[0]].socket) if serve else nullcontext():
+                        summary = await demo.run(seconds, specs, lingers=serve is not None)
         except asyncio.CancelledError:
             if show:
                 console.print("Interrupted. The daemons have stopped, and their keys are deleted.")
@@ -173,19 +172,20 @@ class Demo:
         self._noticed_before = Counter[str]()
         self._attempts_before = 0
 
-    async def run(self, seconds: float, specs: list[AttackSpec] | None, serve: Serve | None) -> Summary:
+    async def run(self, seconds: float, specs: list[AttackSpec] | None, *, lingers: bool) -> Summary:
+        """Run; ``lingers``: after the attacks, until a person ends it."""
         stage, ledger, began_at = self.stage, self.stage.ledger, monotonic()
         await self._look(began_at + seconds)
         self._drops_before, self._began = self.drops(), ledger.mark()  # before, there was no session
         is_recovered = True
-        if serve is not None:
-            await serve(self, began_at + seconds)
-        elif specs is None:
+        if specs is None:
             await self.until(began_at + seconds)
         for spec in specs or ():
             if not self.is_ended:
                 await self.attack(spec, seconds / len(specs or ()))
-        is_attacked = specs is not None or bool(self.results)
+        is_attacked = specs is not None
+        if is_attacked and lingers:
+            await self.until(math.inf)
         self.is_ended = False  # the last frames may still arrive
         end, elapsed_s = ledger.mark(), monotonic() - began_at
         if not is_attacked:

@@ -12,7 +12,6 @@ import importlib
 import json
 import sys
 from dataclasses import fields
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -20,7 +19,6 @@ if TYPE_CHECKING:
     from uavlinkd.lab.evaluation.frame import Evaluation
 
 OK, FAILED = 0, 1
-NEEDS_EXTRA = "the figures need matplotlib: pip install '.[lab]'"
 EVALUATIONS = {
     "timing": "time the paper's method and uavlinkd's",
     "tampering": "attack the paper's protocol and real daemons",
@@ -69,8 +67,6 @@ def settings_of(evaluation: Evaluation[Any, Any], options: argparse.Namespace) -
 
 
 def _evaluate(options: argparse.Namespace) -> int:
-    if find_spec("matplotlib") is None:
-        return _fail(NEEDS_EXTRA)  # before minutes of measurements
     from uavlinkd.lab.child_processes import interrupted_by_signals  # noqa: PLC0415
 
     evaluation = evaluation_of(options.evaluation)

@@ -1,9 +1,8 @@
-"""What all evaluations share: a run writes records, and a report of tables and figures is made from them alone."""
+"""What all evaluations share: a run writes records, and a report of tables is made from them alone."""
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from datetime import UTC, datetime
 from pathlib import Path
@@ -55,11 +54,10 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class ReportSection:
-    """A heading, tables, the name of a figure, and paragraphs."""
+    """A heading, tables, and paragraphs."""
 
     title: str
     tables: Sequence[Table] = ()
-    figure: str = ""
     text: Sequence[str] = ()
 
 
@@ -76,8 +74,6 @@ class Evaluation(Generic[F, S]):
     sections: Callable[[F], list[ReportSection]]
     problems: Callable[[F], list[str]]
     summary: Callable[[F], dict[str, Value]]
-    draw: str = ""
-    """The function in :mod:`.figures` that draws its figures."""
 
     async def measure(self, out: Path, settings: S, show: Show) -> None:
         """Run, and write the records to ``out``."""
@@ -99,22 +95,12 @@ class Evaluation(Generic[F, S]):
         return [*self.problems(findings), *interrupted]
 
     def write(self, folder: Path) -> Path:
-        """Write the report and the figures from the records in ``folder``. Return the path of the report."""
+        """Write the report from the records in ``folder``. Return its path."""
         findings, page = self.read(folder), folder / f"{self.name}.md"
-        drawn = self._write_figures(findings, folder)
         sections = [*self.sections(findings), _run_section(findings)]
         problems = [f"Not as expected: {problem}." for problem in self.deviations(findings)]
-        page.write_text(to_markdown(self.title, problems, sections, drawn), encoding="utf-8")
+        page.write_text(to_markdown(self.title, problems, sections), encoding="utf-8")
         return page
-
-    def _write_figures(self, findings: F, folder: Path) -> list[str]:
-        if not self.draw:
-            return []
-        drawing = importlib.import_module("uavlinkd.lab.evaluation.figures")  # late: it imports matplotlib
-        figures: dict[str, bytes] = drawing.to_svg(getattr(drawing, self.draw), findings)
-        for name, svg in figures.items():
-            (folder / f"{name}.svg").write_bytes(svg)
-        return list(figures)
 
 
 def command(name: str, settings: EvaluationSettings) -> str:
@@ -146,15 +132,11 @@ def _run_section(findings: RunRecords) -> ReportSection:
     return ReportSection("Run", [Table(["fact", "value"], rows)], text=[text])
 
 
-def to_markdown(
-    title: str, problems: Sequence[str], sections: Sequence[ReportSection], figures: Sequence[str]
-) -> str:
+def to_markdown(title: str, problems: Sequence[str], sections: Sequence[ReportSection]) -> str:
     """The report as Markdown."""
     parts = [f"# {title}", *problems]
     for section in sections:
         parts.append(f"## {section.title}")
-        if section.figure in figures:
-            parts.append(f"![{section.title}]({section.figure}.svg)")
         parts += section.text
         for table in section.tables:
             head, *rows = ("| " + " | ".join(map(_safe, line)) + " |" for line in (table.head, *table.rows))
@@ -181,9 +163,3 @@ def duration(seconds: float) -> str:
         if abs(seconds) >= factor:
             return f"{seconds / factor:.3g} {unit}" if seconds / factor < 999.5 else f"{seconds / factor:.0f} {unit}"
     return f"{seconds * 1e9:.3g} ns"
-
-
-def percentile(values: Iterable[float], share: float) -> float:
-    """The smallest value that at least ``share`` (0 to 1) of the values do not exceed."""
-    ordered = sorted(values)
-    return ordered[min(len(ordered) - 1, max(0, -int(-share * len(ordered) // 1) - 1))]

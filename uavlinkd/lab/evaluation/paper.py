@@ -29,7 +29,6 @@ from cryptography.hazmat.backends.openssl import backend
 from cryptography.hazmat.primitives.asymmetric import dh
 
 from uavlinkd.protocol.crypto import hkdf_expand, hmac_sha256, sha256
-from uavlinkd.protocol.kem import ffdhe_prime
 
 GENERATOR = 2
 TAG_BYTES = 32
@@ -54,11 +53,6 @@ class GroupKey:
     def secret(self, other: int) -> bytes:
         """The secret shared with the owner of the public key ``other``."""
         return self._private.exchange(dh.DHPublicNumbers(other, self._parameters).public_key())
-
-
-def make_parameters(bits: int, *, standard: bool) -> Parameters:
-    """The group of RFC 7919 if ``standard``, otherwise a new safe prime."""
-    return load_parameters(ffdhe_prime(bits)) if standard else dh.generate_parameters(GENERATOR, bits)
 
 
 def load_parameters(prime: int) -> Parameters:
@@ -87,15 +81,13 @@ def _unpack(data: bytes) -> list[int]:
     return numbers
 
 
-def exchange(
-    initiator: socket.socket, responder: socket.socket, bits: int, data: bytes, *, standard: bool
-) -> dict[str, float | bool]:
+def exchange(initiator: socket.socket, responder: socket.socket, bits: int, data: bytes) -> dict[str, float | bool]:
     """One exchange between two connected sockets. Return whether the tag is valid, and the seconds that it took.
 
     Each end computes while the other one waits, so one process takes as long as two.
     """
     started_at = time.monotonic()
-    parameters = make_parameters(bits, standard=standard)
+    parameters = dh.generate_parameters(GENERATOR, bits)
     parameters_s = time.monotonic() - started_at
     ours = GroupKey(parameters)
     initiator.send(_pack(parameters.parameter_numbers().p, ours.public))

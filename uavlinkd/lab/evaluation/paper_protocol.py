@@ -28,10 +28,11 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache, partial
 
-from uavlinkd.lab.evaluation.paper import GroupKey, Parameters, mac_key, make_parameters
+from uavlinkd.lab.evaluation.paper import GroupKey, Parameters, load_parameters, mac_key
 from uavlinkd.lab.mitm.proxy import received
 from uavlinkd.protocol import wire
 from uavlinkd.protocol.crypto import hmac_sha256
+from uavlinkd.protocol.kem import ffdhe_prime
 
 HELLO, ANSWER = 1, 2
 GROUP_BITS = 2048
@@ -67,7 +68,7 @@ def _ffdh() -> Iterator[None]:
 
 @cache
 def parameters() -> Parameters:
-    return make_parameters(GROUP_BITS, standard=True)
+    return load_parameters(ffdhe_prime(GROUP_BITS))
 
 
 def seal(key: bytes, number: int, frame: bytes) -> bytes:

@@ -20,8 +20,6 @@ GIVE_UP_S, QUICK_GIVE_UP_S = 5.0, 120.0
 """How long to wait for frames after an attack. A quick run may share its machine with much else."""
 QUICK_AFTER_S = 1.2
 """How long a quick run continues at most after the last attempt."""
-CONTROL_S, QUICK_CONTROL_S = 10.0, 1.0
-"""The duration of the control without an attack, before the first attack."""
 _UNTIL_FIRST = 20
 """An attack that has not reached the network may take so many times as long: on a busy machine, a flood is weaker."""
 _LOOK_S = 0.02
@@ -50,8 +48,6 @@ class Bench:
 
     def __init__(self, stage: Stage, settings: TamperingSettings, add: Callable[[Trial], None]) -> None:
         self.stage = stage
-        self.control: dict[str, float] = {}
-        """The drones' counters per second without an attack, from :meth:`run_control`."""
         self._add = add
         self._settings = settings
 
@@ -66,7 +62,7 @@ class Bench:
         made = list(attacker.objects) if attacker is not None else []
         names = [one.name for one in made] or [line.split()[0].split(",")[0] for line in lines]
         await stage.settle()
-        before, observed_at = await self._counters(), monotonic()
+        before = await self._counters()
         logged = {name: len(log) for name, log in stage.logs().items()}
         stats, faults = await stage.middle.statistics(), Counter(ledger.faults)
         begin, begin_at = await self._attack(plan, lines, made, names, target)
@@ -112,8 +108,6 @@ class Bench:
             events=events,
             recovery_s=None if recovery_s is None else round(recovery_s, 4),
             notes=plan.notes,
-            observed_s=round(monotonic() - observed_at, 3),
-            control=self.control,
             critical_sent=critical_sent,
             critical_lost=critical_sent - critical_delivered,
             gap_s=round(gap_s, 4),
@@ -170,14 +164,6 @@ class Bench:
             if not unseen(needs, noticed, events) or monotonic() >= give_up_at:
                 return noticed, dict(events)
             await asyncio.sleep(_LOOK_S)
-
-    async def run_control(self) -> None:
-        """Measure the drones' counters while the man in the middle passes all datagrams."""
-        duration_s = QUICK_CONTROL_S if self._settings.quick else CONTROL_S
-        before = await self._counters()
-        await asyncio.sleep(duration_s)
-        counts = await self._counters() - before
-        self.control = {reason: round(count / duration_s, 3) for reason, count in counts.items()}
 
 
 def _attempts(interventions: Counts) -> int:

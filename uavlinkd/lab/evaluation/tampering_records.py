@@ -67,10 +67,6 @@ class Trial:
     recovery_s: float | None = None
     """From the attack's end until all receivers got frames sent after it; None: not within 5 s."""
     notes: str = ""
-    observed_s: float = 0.0
-    """How long the drones' counters were observed: longer than the attack."""
-    control: Mapping[str, float] = field(default_factory=dict)
-    """The counters of all drones of this stage per second without an attack."""
     critical_sent: int = 0
     critical_lost: int = 0
     """Heartbeats, of those sent during the attack."""
@@ -106,15 +102,9 @@ class Trial:
 
     @property
     def is_noticed(self) -> bool:
-        """Whether an operator can notice it: an event that attacks cause, or a counter beyond its usual rate."""
+        """Whether an operator can notice it: an event that attacks cause, or all counters that must show it."""
         logged = {name.partition(":")[0] for name in self.events}
-        is_logged = bool(logged & {"peer_lost", "path_changed"})
-        return is_logged or any(count > self._usual(reason) for reason, count in self.noticed.items())
-
-    def _usual(self, reason: str) -> float:
-        """The maximum count that is usual without an attack."""
-        rate = self.control.get(reason, 0.0)
-        return 2 + 2 * rate * self.observed_s if rate else 0.0
+        return bool(logged & {"peer_lost", "path_changed"} or (self.noticed and not self.unseen))
 
     @property
     def successes(self) -> list[str]:

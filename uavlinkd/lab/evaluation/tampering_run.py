@@ -158,7 +158,6 @@ class _Run:
     async def _try(self, label: str, stage: Stage, work: Callable[[Bench], Awaitable[None]]) -> None:
         bench = Bench(stage, self._settings, self._add)
         async with stage:
-            await bench.run_control()
             await work(bench)
         for name, lines in stage.logs().items():
             text = "".join(f"{line}\n" for line in lines)

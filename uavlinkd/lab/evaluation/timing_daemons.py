@@ -1,4 +1,4 @@
-"""Times the initiation in this process, and handshakes of two real daemons, each a process.
+"""Times handshakes of two real daemons, each a process.
 
 A proxy between the daemons sees each datagram. For a handshake it first drops all of them, until both processes are
 idle and the initiator waits for its retry. Then it passes them. The time starts when the next initiation reaches the
@@ -10,9 +10,7 @@ initiator's processor time. The proxy adds about 0.2 ms for each of the four dat
 from __future__ import annotations
 
 import asyncio
-import os
 import signal
-import time
 from collections import Counter
 from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack, suppress
@@ -29,25 +27,7 @@ from uavlinkd.lab.mitm.attack import Action, Direction, PassiveAttack, Send
 from uavlinkd.lab.sim.drone_process import DroneError
 from uavlinkd.mavlink.frames import SplitCounters, split_datagram
 from uavlinkd.protocol import wire
-from uavlinkd.protocol.crypto import KeyPair, Secret
-from uavlinkd.protocol.node import Node
-from uavlinkd.protocol.path import Path as PeerPath
-from uavlinkd.protocol.settings import Link, PeerSettings
 from uavlinkd.protocol.suites import Suite
-
-_THERE = PeerPath(0, ("127.0.0.1", 2))
-
-
-def measure_initiation(suite: Suite) -> Record:
-    """The computation of an initiation in a new node: cryptography and protocol, no sockets."""
-    link = Link(suites=(suite,))
-    node = Node(Secret(os.urandom(32)), os.urandom, 0.0)
-    settings = PeerSettings("peer", KeyPair(os.urandom(32)).public, Secret(os.urandom(32)), link)
-    node.set_paths(node.add_peer(settings, 0.0), [_THERE], 0.0)
-    before = time.perf_counter()
-    node.handle_timeout(0.0)
-    return Record("core", {"suite": suite.name}, {"initiate_s": time.perf_counter() - before})
-
 
 HANDSHAKE_LIMIT_S = 20.0
 """Enough for some retries: a handshake that takes longer has failed."""

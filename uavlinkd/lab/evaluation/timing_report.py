@@ -21,24 +21,18 @@ class TimingFindings(RunRecords):
         values = {record.point[name] for record in self.of(kind) if name in record.point}
         return sorted((v for v in values if not isinstance(v, list)), key=lambda v: (isinstance(v, str), v))
 
-    def paper_times(self, group: str, **point: Value) -> list[float]:
+    def paper_times(self, bits: Value) -> list[float]:
         """Seconds of each exchange of the paper's method, from the generation of parameters to the verified tag."""
-        return self.numbers("paper", "total_s", group=group, **point)
+        return self.numbers("paper", "total_s", dh_bits=bits)
 
-    def paper_late(self, group: str, **point: Value) -> list[float]:
+    def paper_late(self, bits: Value) -> list[float]:
         """The limit of each unfinished exchange: without them, the median would be too small."""
-        late = self.of("paper", group=group, **point)
+        late = self.of("paper", dh_bits=bits)
         return [record.number("limit_s") for record in late if record.status is Status.NOT_FINISHED]
 
-    def daemon_times(self, suite: str, **point: Value) -> list[float]:
-        """Seconds of each handshake, from before the initiation is computed to the first delivered frame.
-
-        The proxy sees the initiation after that computation, so its time, measured in the core, is added.
-        """
-        made = self.numbers("core", "initiate_s", suite=suite, **point)
-        return [
-            (median(made) if made else 0.0) + n for n in self.numbers("handshake", "total_s", suite=suite, **point)
-        ]
+    def daemon_times(self, suite: str) -> list[float]:
+        """Seconds of each handshake, from the initiation to the first delivered frame."""
+        return self.numbers("handshake", "total_s", suite=suite)
 
     def suites(self) -> list[str]:
         """The measured suites, in the order of their numbers in messages."""
@@ -56,7 +50,7 @@ def summary(findings: TimingFindings) -> dict[str, Value]:
     facts: dict[str, Value] = {"quick": findings.run.get("quick")}
     facts |= {f"{suite}_s": _median(findings.daemon_times(suite)) for suite in findings.suites()}
     for bits in findings.values("paper", "dh_bits"):
-        facts[f"paper_{bits}_s"] = _median(findings.paper_times("made", dh_bits=bits))
+        facts[f"paper_{bits}_s"] = _median(findings.paper_times(bits))
     return facts
 
 
@@ -67,7 +61,6 @@ def _median(times: Sequence[float]) -> float | None:
 def sections(findings: TimingFindings) -> list[ReportSection]:
     return [
         ReportSection("At equal size of the group", [comparison(findings)]),
-        ReportSection("Time over the size of the group (the paper's Fig. 6)", [], "scatter"),
         ReportSection("The suites", [suites(findings)]),
     ]
 
@@ -75,10 +68,10 @@ def sections(findings: TimingFindings) -> list[ReportSection]:
 def comparison(findings: TimingFindings) -> Table:
     rows = []
     for bits in sorted({*(int(str(bits)) for bits in findings.values("paper", "dh_bits")), *SUITE_OF_SIZE}):
-        finished, late = findings.paper_times("made", dh_bits=bits), findings.paper_late("made", dh_bits=bits)
+        finished, late = findings.paper_times(bits), findings.paper_late(bits)
         suite = SUITE_OF_SIZE.get(bits)
         ours = findings.daemon_times(suite) if suite else []
-        paper = spread([*finished, *late]) if finished else _missing(findings, group="made", dh_bits=bits)
+        paper = spread([*finished, *late]) if finished else _missing(findings, dh_bits=bits)
         factor = NOTHING
         if finished and ours:
             ratio = median([*finished, *late]) / median(ours)
@@ -88,17 +81,16 @@ def comparison(findings: TimingFindings) -> Table:
                 str(bits),
                 paper + (f", {len(late)} not finished" if finished and late else ""),
                 _search_share(findings, bits),
-                spread(findings.paper_times("standard", dh_bits=bits)),
                 spread(ours) if suite else "refused: too small",
                 factor,
             ]
         )
-    head = ["bits", "the paper's method", "search of the prime", "the same in RFC 7919's group"]
+    head = ["bits", "the paper's method", "search of the prime"]
     return Table([*head, "uavlinkd, ffdhe of that size", "factor"], rows)
 
 
 def _search_share(findings: TimingFindings, bits: int) -> str:
-    records = [record for record in findings.of("paper", group="made", dh_bits=bits) if record.is_ok]
+    records = [record for record in findings.of("paper", dh_bits=bits) if record.is_ok]
     shares = [record.number("parameters_s") / record.number("total_s") for record in records]
     return f"{100 * median(shares):.0f} %" if shares else NOTHING
 

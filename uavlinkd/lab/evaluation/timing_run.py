@@ -15,16 +15,14 @@ from typing import Any, TypeVar
 from uavlinkd.lab.child_processes import end_with_parent
 from uavlinkd.lab.evaluation.frame import Evaluation, EvaluationSettings, Work
 from uavlinkd.lab.evaluation.records import Record, Status, Value
-from uavlinkd.lab.evaluation.timing_daemons import measure_initiation, measured, time_handshake
+from uavlinkd.lab.evaluation.timing_daemons import measured, time_handshake
 from uavlinkd.lab.evaluation.timing_report import TimingFindings, sections, summary, timing_problems
-from uavlinkd.protocol.suites import SUITES, X25519, Suite
+from uavlinkd.protocol.suites import SUITES, Suite
 
 T = TypeVar("T")
 
 PAPER_DH_BITS = (512, 1024, 2048, 4096)
 """The paper's sizes, but for 256; its text has 2028 for 2048 in one place."""
-STANDARD_BITS = (2048, 4096)
-"""The sizes of the paper for which RFC 7919 has a group."""
 DATA_BYTES = 280
 """The largest MAVLink 2 frame."""
 _START_S = 0.5
@@ -35,19 +33,8 @@ _LIMIT_S, _QUICK_LIMIT_S = 600.0, 2.0
 """The time limit of one exchange of the paper's method: ten minutes, as in the paper."""
 
 
-def paper_points() -> list[dict[str, Value]]:
-    """The paper's grid, then the same method in standard groups, which need no generated parameters."""
-    groups = [("made", bits) for bits in PAPER_DH_BITS] + [("standard", bits) for bits in STANDARD_BITS]
-    return [{"dh_bits": bits, "group": group} for group, bits in groups]
-
-
 async def run_timing(work: Work[EvaluationSettings]) -> dict[str, Any]:
-    run = _Run(work)
-    work.show("initiations in the core")
-    measure_initiation(X25519)  # the first use is slow
-    for suite in run.shuffled(SUITES.values()):
-        work.add(measure_initiation(suite))
-    await run.exchanges()
+    await _Run(work).exchanges()
     return {}
 
 
@@ -68,29 +55,23 @@ class _Run:
         """Measure the daemons and the paper's method in random order, so that load affects both equally."""
         is_quick = self._settings.quick
         # Each exchange at the largest size takes up to the limit: these run last, and few times.
-        last = [point for point in paper_points() if (point["dh_bits"], point["group"]) == (4096, "made")]
-        work: list[Suite | dict[str, Value]] = [
-            *SUITES.values(),
-            *(point for point in paper_points() if point not in last),
-        ]
-        work = [*self.shuffled(work), *last * (1 if is_quick else _LARGEST_REPEATS)]
+        *sizes, largest = PAPER_DH_BITS
+        points: list[Suite | int] = [*SUITES.values(), *sizes]
+        work = [*self.shuffled(points), *[largest] * (1 if is_quick else _LARGEST_REPEATS)]
         limit_s = _QUICK_LIMIT_S if is_quick else _LIMIT_S
         for number, item in enumerate(work, 1):
             if isinstance(item, Suite):
                 self._work.show(f"{number} of {len(work)}: {item.name}")
                 self._work.add(await measured("handshake", {"suite": item.name}, time_handshake(item)))
             else:
-                self._work.show(f"{number} of {len(work)}: the paper's method, {item['dh_bits']} bits")
+                self._work.show(f"{number} of {len(work)}: the paper's method, {item} bits")
                 self._work.add(await measure_paper(item, limit_s, self._random.randbytes(DATA_BYTES)))
 
 
-async def measure_paper(point: dict[str, Value], limit_s: float, data: bytes) -> Record:
-    """One exchange of the paper's method in a new process, at a point of :func:`paper_points`."""
-    request = {
-        "bits": point["dh_bits"],
-        "standard": point["group"] == "standard",
-        "data": data.hex(),
-    }
+async def measure_paper(bits: int, limit_s: float, data: bytes) -> Record:
+    """One exchange of the paper's method in a new process, in a group of this size."""
+    point: dict[str, Value] = {"dh_bits": bits}
+    request = {"bits": bits, "data": data.hex()}
     process = await asyncio.create_subprocess_exec(
         *end_with_parent(sys.executable, "-m", "uavlinkd.lab.evaluation.paper", json.dumps(request)),
         stdin=asyncio.subprocess.DEVNULL,
@@ -123,5 +104,4 @@ TIMING = Evaluation(
     sections=sections,
     problems=timing_problems,
     summary=summary,
-    draw="draw_timing",
 )

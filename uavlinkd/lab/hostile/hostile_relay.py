@@ -21,8 +21,7 @@ from uavlinkd.io.reader import RECEIVE_BYTES
 from uavlinkd.io.sockets import udp_socket
 from uavlinkd.lab.hostile.relay_attacks import ALL_ATTACKS, Lie, RelayAttack, RelayContext
 from uavlinkd.lab.mitm.attack import Action, AttackContext, AttackObject, Direction, Intervention
-from uavlinkd.lab.mitm.attack_service import ChannelService, RunSettings
-from uavlinkd.lab.mitm.attacks import AttackSpec
+from uavlinkd.lab.mitm.attack_service import ChannelService, Journal
 from uavlinkd.lab.mitm.channel import AttackChannel
 from uavlinkd.lab.mitm.proxy import received
 from uavlinkd.protocol.crypto import Secret
@@ -49,14 +48,14 @@ _START: Final = bytes((RELAYED,))
 
 
 @dataclass(frozen=True, slots=True)
-class HostileRelaySettings(RunSettings):
+class HostileRelaySettings:
     """A relay as in its file, and the attacks."""
 
     name: str
     private_key: Secret
     listen: tuple[Address, ...]
     server: RelayServer
-    attacks: tuple[AttackSpec, ...] = ()
+    seed: int = 0
 
 
 class _LyingNode(Node):
@@ -97,7 +96,7 @@ class HostileRelay(ChannelService):
     known = ALL_ATTACKS
 
     def __init__(self, settings: HostileRelaySettings) -> None:
-        super().__init__(settings)
+        super().__init__(settings.seed)
         self.settings = settings
         self.name = settings.name
         self.keys = {member.name: member.peer.public_key for member in settings.server.members}
@@ -114,21 +113,20 @@ class HostileRelay(ChannelService):
     async def start(self) -> None:
         self._began_at = now = monotonic()
         self._victim = udp_socket(Address(VICTIM_HOST, 0))
+        self.channel = AttackChannel(self.context, (), None, self.seed, now)
         try:
-            attacks = self.make(self.settings.attacks)
-            self.channel = AttackChannel(self.context, attacks, None, self.settings.seed, now)
             for address in self.settings.listen:
                 self._sockets.append(udp_socket(address))
         except BaseException:
             await self._close()
             raise
-        await self._open()
+        self.journal = Journal(self.log)
         self._serve(now)
         for number, sock in enumerate(self._sockets):
             asyncio.get_running_loop().add_reader(sock, self._on_readable, number, sock)
         self._ticks = asyncio.create_task(self._tick())
         listen = list(map(str, self.addresses))
-        self.event("started", seed=self.settings.seed, listen=listen, attacks=self.names())
+        self.event("started", seed=self.seed, listen=listen)
 
     @property
     def addresses(self) -> list[Address]:
@@ -144,7 +142,6 @@ class HostileRelay(ChannelService):
         for sock in (*self._sockets, self._victim):
             asyncio.get_running_loop().remove_reader(sock)
             sock.close()
-        await super()._close()
 
     def _serve(self, now: float) -> None:
         """Make a relay without sessions, bindings and handles."""

@@ -1,4 +1,4 @@
-"""What a man in the middle, emulated modems and a hostile relay share while they run: totals, timer and requests."""
+"""What a man in the middle, emulated modems and a hostile relay share while they run: totals and a timer."""
 
 from __future__ import annotations
 
@@ -6,9 +6,6 @@ import asyncio
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
-from pathlib import Path
 from time import monotonic
 from types import MappingProxyType
 from typing import ClassVar
@@ -16,11 +13,9 @@ from typing import ClassVar
 import structlog
 from structlog.typing import FilteringBoundLogger
 
-from uavlinkd.lab.mitm.attack import NEVER, Attack, AttackContext, AttackError, AttackObject, Intervention
+from uavlinkd.lab.mitm.attack import NEVER, Attack, AttackContext, AttackObject, Intervention
 from uavlinkd.lab.mitm.attacks import ATTACKS, AttackSpec, parse_attack
 from uavlinkd.lab.mitm.channel import AttackChannel
-from uavlinkd.ops.control import ControlServer
-from uavlinkd.system.tasks import on_signal
 
 SUM_INTERVAL_S = 10.0
 """How often the totals of attacks that go on are logged."""
@@ -34,11 +29,6 @@ class Journal:
         self._log = log
         self._logged: Counter[tuple[str, str]] = Counter()
         self._sum_at = NEVER
-
-    def event(self, name: str, now: float, **facts: object) -> None:
-        """Log an event of the service."""
-        del now
-        self._log.info(name, **facts)
 
     def add(self, done: Intervention) -> None:
         key = (done.attack, done.operation.value)
@@ -72,32 +62,21 @@ class Journal:
         self.flush(NEVER)
 
 
-REQUESTS = '"statistics", "stop", "attack none" or "attack NAME,key=value ..."'
 LOOP_TICK_S = 0.001
 """An event loop may fire a timer up to one clock tick early."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RunSettings:
-    """The settings that all have."""
-
-    seed: int = 0
-    """Of all random choices."""
-    control_socket: Path | None = None
-
-
 class Service(ABC):
-    """Runs until it is stopped. Call :meth:`start` first and :meth:`stop` last."""
+    """Runs from :meth:`start` to :meth:`stop`. ``seed``: of all random choices."""
 
     kind: ClassVar[str]
     """The first word of its events."""
 
-    def __init__(self, run: RunSettings) -> None:
+    def __init__(self, seed: int) -> None:
         self.log = structlog.get_logger().bind(daemon=self.kind)
-        self.stopping = asyncio.Event()
-        self._run = run
+        self.seed = seed
+        self.journal: Journal
         self._began_at = monotonic()
-        self._control: ControlServer | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at = NEVER
 
@@ -120,60 +99,21 @@ class Service(ABC):
         self.event("stopped", **statistics)
         self.journal.close()
 
-    async def run(self, seconds: float | None) -> dict[str, object]:
-        """Start, run until SIGTERM, SIGINT, the request ``stop``, or for ``seconds``, and stop.
-
-        Returns the statistics. Raises what :meth:`start` raises.
-        """
-        for name in ("SIGTERM", "SIGINT"):
-            on_signal(name, self.stopping.set)
-        await self.start()
-        try:
-            with suppress(TimeoutError):
-                async with asyncio.timeout(seconds):
-                    await self.stopping.wait()
-            return self.statistics()
-        finally:
-            await self.stop()
-
-    async def _open(self) -> None:
-        """Open the control socket, or close everything."""
-        try:
-            if self._run.control_socket is not None:
-                self._control = ControlServer(self._run.control_socket, self.answer)
-                await self._control.start()
-            self.journal = Journal(self.log)
-        except BaseException:
-            await self._close()
-            raise
-
+    @abstractmethod
     async def _close(self) -> None:
-        """Close what is open. A subclass closes its sockets too."""
-        if self._control is not None:
-            await self._control.stop()
+        """Close what is open."""
 
     def event(self, name: str, **facts: object) -> None:
-        self.journal.event(f"{self.kind}_{name}", monotonic(), **facts)
+        self.log.info(f"{self.kind}_{name}", **facts)
 
     def statistics(self) -> dict[str, object]:
         """The counters of this run, as plain data."""
         counts = self.journal.counts.items()
         return {
             "seconds": round(monotonic() - self._began_at, 3),
-            "seed": self._run.seed,
+            "seed": self.seed,
             "interventions": {f"{attack}: {operation}": count for (attack, operation), count in counts},
         }
-
-    def answer(self, request: str) -> dict[str, object]:
-        """Do what a request asks, and return the answer."""
-        try:
-            return self.request(request.split()) or {"done": request}
-        except ValueError as error:
-            return {"refused": str(error)}
-
-    @abstractmethod
-    def request(self, words: list[str]) -> dict[str, object] | None:
-        """Do what a request asks. Raises ValueError if that is impossible; the message says what to write."""
 
     # One timer.
 
@@ -215,7 +155,7 @@ class ChannelService(Service):
 
     def make(self, specs: Sequence[AttackSpec]) -> list[AttackObject]:
         now = monotonic()
-        return [spec.make(self.context, f"{self._run.seed} {number}", now) for number, spec in enumerate(specs)]
+        return [spec.make(self.context, f"{self.seed} {number}", now) for number, spec in enumerate(specs)]
 
     def attack(self, texts: Sequence[str]) -> list[str]:
         """Replace the attacks by those that the texts select, and return their names.
@@ -229,20 +169,8 @@ class ChannelService(Service):
     def change_attacks(self, attacks: Sequence[AttackObject]) -> None:
         """Replace the attacks. Datagrams that the old ones hold are lost."""
         self.channel.attacks = tuple(attacks)
-        self.journal.event("attacks_changed", monotonic(), attacks=self.names())
+        self.log.info("attacks_changed", attacks=self.names())
         self.arm()
 
     def statistics(self) -> dict[str, object]:
         return {**super().statistics(), "attacks": self.names()}
-
-    def request(self, words: list[str]) -> dict[str, object] | None:
-        match words:
-            case ["statistics"]:
-                return self.statistics()
-            case ["stop"]:
-                self.stopping.set()
-            case ["attack", *texts] if texts:
-                return {"done": "attack", "attacks": self.attack([] if texts == ["none"] else texts)}
-            case _:
-                raise AttackError(f"there is no request {' '.join(words)!r}: write {REQUESTS}")
-        return None

@@ -193,17 +193,6 @@ LINE_ATTACKS: Final[Mapping[str, str]] = MappingProxyType({name: text for name, 
 """What each attack puts on the line."""
 
 
-def list_line_attacks() -> str:
-    """Every attack, and the parameters, for the command line."""
-    width = max(map(len, LINE_ATTACKS))
-    lines = [f"{name:<{width}}  {text}" for name, text in LINE_ATTACKS.items()]
-    lines += ["", "parameters of every attack:"]
-    for name, field in LineAttack.model_fields.items():
-        if name != "name":
-            lines.append(f"  {name}={'' if field.default is None else field.default}: {field.description}")
-    return "\n".join(lines)
-
-
 def parse_line_attack(text: str) -> LineAttack:
     """Parse ``NAME,key=value,key=value``. Raises AttackError if there is no such attack, or a parameter is wrong."""
     name, *pairs = (part.strip() for part in text.split(","))

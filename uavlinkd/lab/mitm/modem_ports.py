@@ -10,57 +10,32 @@ import asyncio
 import os
 import pty
 import tty
-from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from random import Random
 from time import monotonic
-from typing import Final
 
-from uavlinkd.lab.mitm.attack_service import RunSettings, Service
-from uavlinkd.lab.mitm.line_attacks import LineAttack, LineAttacker, parse_line_attack
+from uavlinkd.lab.mitm.attack_service import Journal, Service
+from uavlinkd.lab.mitm.line_attacks import LineAttack, LineAttacker
 from uavlinkd.lab.mitm.modem import ModemEnd, ModemLink, ModemSettings
 
-MODEM_REQUESTS: Final = (
-    '"statistics", "pull END", "plug END", "set key=value ...", "attack none", "attack NAME,key=value ..." or "stop",'
-    " where END is left or right"
-)
 _PSEUDO_TERMINALS = "/dev/pts/"
 
 
 @dataclass(frozen=True, slots=True)
-class PortSettings(RunSettings):
+class PortSettings:
     """The settings of emulated modems on pseudo-terminals."""
 
     left: Path
     """The symbolic link that is the left host's device. It exists while the modem is plugged in."""
     right: Path
     modem: ModemSettings = field(default_factory=ModemSettings)
-    attacks: tuple[LineAttack, ...] = ()
+    seed: int = 0
 
     def device(self, end: ModemEnd) -> Path:
         return self.left if end is ModemEnd.LEFT else self.right
-
-
-def parse_modem(text: str, settings: ModemSettings) -> ModemSettings:
-    """Parse ``key=value,key=value`` with the fields of :class:`.ModemSettings`, and change those.
-
-    Raises:
-        ValueError: the text is malformed, or a value is out of range.
-    """
-    types = {one.name: type(getattr(settings, one.name)) for one in fields(settings)}
-    values: dict[str, object] = {}
-    for pair in text.split(","):
-        key, _, value = (part.strip() for part in pair.partition("="))
-        if key not in types:
-            raise ValueError(f"there is no setting {key!r} of a modem: choose one of {', '.join(types)}")
-        try:
-            values[key] = types[key](value)
-        except ValueError:
-            raise ValueError(f"{key} must be {types[key].__name__}, not {value!r}") from None
-    return replace(settings, **values)  # type: ignore[arg-type]
 
 
 class ModemPorts(Service):
@@ -69,41 +44,37 @@ class ModemPorts(Service):
     kind = "modem"
 
     def __init__(self, settings: PortSettings) -> None:
-        super().__init__(settings)
+        super().__init__(settings.seed)
         self.settings = settings
         self.link = ModemLink(settings.modem, Random(f"modem {settings.seed}"))  # noqa: S311  not a secret
-        self.stalled: Counter[ModemEnd] = Counter()
-        """Bytes lost because the host of an end did not read."""
         self._masters: dict[ModemEnd, int] = {}
         self._slaves: dict[ModemEnd, int] = {}
         self._full: set[ModemEnd] = set()  # ends whose kernel accepts no more; not read until it does
 
     async def start(self) -> None:
         self._loop = asyncio.get_running_loop()
-        self._began_at = now = monotonic()
-        await self._open()
+        self._began_at = monotonic()
+        self.journal = Journal(self.log)
         try:
             for end in ModemEnd:
                 self._open_device(end)
         except BaseException:
             await self._close()
-            self.journal.close()
             raise
-        rng = Random(f"line {self.settings.seed}")  # noqa: S311  not a secret
+        rng = Random(f"line {self.seed}")  # noqa: S311  not a secret
         self.attacker = LineAttacker(self.link, rng, self.journal.add)
-        self.attacker.change(self.settings.attacks, now)
         devices = {str(end): str(self.settings.device(end)) for end in ModemEnd}
-        self.event("started", seed=self.settings.seed, devices=devices, attacks=self.attacker.names)
+        self.event("started", seed=self.seed, devices=devices)
         self.arm()
 
-    # What an operator or a test does.
+    # What a test does.
 
     def pull(self, end: ModemEnd) -> None:
         """Pull a modem out: its device vanishes, and a daemon that has it open gets an error."""
         if end in self._masters:
             self.link.pull(end, monotonic())
             self._close_device(end)
-            self._plugged("pulled", end)
+            self._arm_after("pulled", end)
 
     def plug(self, end: ModemEnd) -> None:
         """Put a modem back: there is a new device of the same name.
@@ -114,74 +85,15 @@ class ModemPorts(Service):
         if end not in self._masters:
             self._open_device(end)
             self.link.plug(end, monotonic())
-            self._plugged("plugged", end)
-
-    def inject(self, end: ModemEnd, data: bytes) -> None:
-        """Put bytes on the line to the host of an end, as a modem's own reports."""
-        self.link.inject(end, data, monotonic())
-        self.arm()
-
-    def change_modem(self, settings: ModemSettings) -> None:
-        """Change the modems and the air: rates, errors, losses."""
-        self._advance()
-        self.link.settings = settings
-        self.event("changed", settings=asdict(settings))
-        self.arm()
+            self._arm_after("plugged", end)
 
     def change_attacks(self, attacks: Sequence[LineAttack]) -> None:
         now = monotonic()
         self.attacker.change(attacks, now)
-        self.journal.event("attacks_changed", now, attacks=self.attacker.names)
+        self.log.info("attacks_changed", attacks=self.attacker.names)
         self.arm()
 
-    def statistics(self) -> dict[str, object]:
-        now = monotonic()
-        return {
-            **super().statistics(),
-            "attacks": self.attacker.names,
-            "modems": {
-                str(end): {
-                    "device": str(self.settings.device(end)),
-                    "is_plugged": self.link.is_plugged(end),
-                    "queued_bytes": self.link.queued(end, now),
-                    "packets": self.link.packets[end],
-                    "bytes": {str(fate): count for fate, count in self.link.bytes[end].items() if count},
-                    "not_read_bytes": self.stalled[end],
-                }
-                for end in ModemEnd
-            },
-            "settings": asdict(self.link.settings),
-        }
-
-    # Requests on the control socket.
-
-    def answer(self, request: str) -> dict[str, object]:
-        try:
-            return super().answer(request)
-        except OSError as error:
-            return {"refused": f"cannot make the device: {error.strerror or error}"}
-
-    def request(self, words: list[str]) -> dict[str, object] | None:
-        match words:
-            case ["statistics"]:
-                return self.statistics()
-            case ["stop"]:
-                self.stopping.set()
-            case ["pull", end]:
-                self.pull(_end(end))
-            case ["plug", end]:
-                self.plug(_end(end))
-            case ["set", *pairs] if pairs:
-                self.change_modem(parse_modem(",".join(pairs), self.link.settings))
-            case ["attack", "none"]:
-                self.change_attacks(())
-            case ["attack", *texts] if texts:
-                self.change_attacks([parse_line_attack(text) for text in texts])
-            case _:
-                raise ValueError(f"there is no request {' '.join(words)!r}: write {MODEM_REQUESTS}")
-        return None
-
-    def _plugged(self, name: str, end: ModemEnd) -> None:
+    def _arm_after(self, name: str, end: ModemEnd) -> None:
         self.event(name, end=str(end), device=str(self.settings.device(end)))
         self.arm()
 
@@ -215,7 +127,6 @@ class ModemPorts(Service):
     async def _close(self) -> None:
         for end in list(self._masters):
             self._close_device(end)
-        await super()._close()
 
     # Bytes.
 
@@ -240,11 +151,8 @@ class ModemPorts(Service):
                 self._hand_over(end, data)
 
     def _hand_over(self, end: ModemEnd, data: bytes) -> None:
-        try:
-            written = os.write(self._masters[end], data)
-        except OSError:  # the host does not read, and its kernel holds no more
-            written = 0
-        self.stalled[end] += len(data) - written
+        with suppress(OSError):  # the host does not read, and its kernel holds no more
+            os.write(self._masters[end], data)
 
     def next_deadline(self) -> float:
         deadline = min(self.link.next_deadline(), self.attacker.next_deadline())
@@ -259,10 +167,3 @@ class ModemPorts(Service):
             if self.link.unwritten(end, now) <= self.link.settings.host_bytes // 2:
                 self._full.discard(end)
                 self._loop.add_reader(self._masters[end], self._on_readable, end)
-
-
-def _end(text: str) -> ModemEnd:
-    try:
-        return ModemEnd(text)
-    except ValueError:
-        raise ValueError(f"{text!r} is not an end: write left or right") from None

@@ -18,13 +18,15 @@ from typing import Any
 
 from uavlinkd.io.reader import DATAGRAMS_PER_WAKE_UP, RECEIVE_BYTES
 from uavlinkd.io.sockets import BindError, udp_socket
-from uavlinkd.lab.mitm.attack import Action, AttackContext, Direction, Intervention
-from uavlinkd.lab.mitm.attack_service import ChannelService
+from uavlinkd.lab.mitm.attack import Action, AttackContext, AttackError, Direction, Intervention
+from uavlinkd.lab.mitm.attack_service import ChannelService, Journal
 from uavlinkd.lab.mitm.channel import AttackChannel
 from uavlinkd.lab.mitm.proxy_settings import ProxySettings
-from uavlinkd.lab.mitm.radio import RadioSettings
+from uavlinkd.ops.control import ControlServer
 from uavlinkd.system.addresses import Address
+from uavlinkd.system.tasks import on_signal
 
+REQUESTS = '"statistics", "stop", "attack none" or "attack NAME,key=value ..."'
 CREDIT_S = 10.0
 """How long a datagram counts as a request. Without a limit, a thousand unanswered datagrams would hide a thousand
 answers of twice the size. 10 s is enough for a busy machine."""
@@ -96,8 +98,10 @@ class Proxy(ChannelService):
     kind = "mitm"
 
     def __init__(self, settings: ProxySettings) -> None:
-        super().__init__(settings)
+        super().__init__(settings.seed)
         self.settings = settings
+        self.stopping = asyncio.Event()
+        self._control: ControlServer | None = None
         self.context: AttackContext = settings.context
         self.listeners: dict[Direction, Sockaddr] = {}
         """The address at which the sender reaches the receiver."""
@@ -119,15 +123,18 @@ class Proxy(ChannelService):
         try:
             await self._resolve()
             self._bind()
+            if self.settings.control_socket is not None:
+                self._control = ControlServer(self.settings.control_socket, self.answer)
+                await self._control.start()
         except BaseException:
             await self._close()
             raise
-        await self._open()
+        self.journal = Journal(self.log)
         loop = asyncio.get_running_loop()
         for direction, sock in self._sockets.items():
             loop.add_reader(sock, self._on_listener_readable, sock, direction)
         listeners = {str(direction): str(Address(*at)) for direction, at in self.listeners.items()}
-        self.event("started", seed=self.settings.seed, listeners=listeners, attacks=self.names())
+        self.event("started", seed=self.seed, listeners=listeners, attacks=self.names())
         self.arm()
 
     async def _resolve(self) -> None:
@@ -155,18 +162,40 @@ class Proxy(ChannelService):
             sock.close()
         self._sockets.clear()
         self._strangers.clear()
-        await super()._close()
+        if self._control is not None:
+            await self._control.stop()
 
-    def change_radio(self, directions: str, settings: RadioSettings) -> None:
-        """Replace the settings of radios. ``directions`` is ``both`` or ``A>B``. Datagrams in flight stay in flight.
+    async def run(self, seconds: float | None) -> None:
+        """Start, run until SIGTERM, SIGINT, the request ``stop``, or for ``seconds``, and stop.
 
-        Raises:
-            AttackError: there is no such direction.
-            KeyError: a direction has no radio.
+        Raises what :meth:`start` raises.
         """
-        for direction in self.context.select(directions):
-            self.channel.radios[direction].settings = settings
-        self.arm()
+        for name in ("SIGTERM", "SIGINT"):
+            on_signal(name, self.stopping.set)
+        await self.start()
+        try:
+            with suppress(TimeoutError):
+                async with asyncio.timeout(seconds):
+                    await self.stopping.wait()
+        finally:
+            await self.stop()
+
+    def answer(self, request: str) -> dict[str, object]:
+        """Do what a request on the control socket asks, and return the answer."""
+        words = request.split()
+        try:
+            match words:
+                case ["statistics"]:
+                    return self.statistics()
+                case ["stop"]:
+                    self.stopping.set()
+                case ["attack", *texts] if texts:
+                    return {"done": "attack", "attacks": self.attack([] if texts == ["none"] else texts)}
+                case _:
+                    raise AttackError(f"there is no request {' '.join(words)!r}: write {REQUESTS}")
+        except ValueError as error:
+            return {"refused": str(error)}
+        return {"done": request}
 
     def statistics(self) -> dict[str, object]:
         excess = self.amplification.excess.items()

@@ -17,7 +17,6 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, PlainValidator, ValidationError
 
 from uavlinkd.lab.mitm.attack import AttackContext, AttackError, Direction
-from uavlinkd.lab.mitm.attack_service import RunSettings
 from uavlinkd.lab.mitm.attacks import AttackSpec, attack_from_table
 from uavlinkd.lab.mitm.radio import RadioSettings
 from uavlinkd.protocol.constants import KEY_BYTES
@@ -105,7 +104,7 @@ class MitmRadio(RadioSettings):
 
 
 @dataclass(frozen=True, slots=True)
-class ProxySettings(RunSettings):
+class ProxySettings:
     """All settings of the man in the middle."""
 
     peers: tuple[MitmPeer, ...]
@@ -113,6 +112,9 @@ class ProxySettings(RunSettings):
     attacks: tuple[AttackSpec, ...] = ()
     radios: tuple[tuple[str, RadioSettings], ...] = ()
     """Direction (``both``, ``A>B``, or of one path ``both/2``) and settings. The last entry applies."""
+    seed: int = 0
+    """Of all random choices."""
+    control_socket: Path | None = None
 
     @property
     def listeners(self) -> dict[Direction, Address]:

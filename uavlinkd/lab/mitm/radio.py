@@ -3,7 +3,7 @@
 No I/O and no clock. The same code impairs the simulated network of the tests, the link of a man in the middle, and
 an emulated radio between two daemons. A two-way link has two of them.
 
-The stages of a datagram are: queue of the transmitter (bandwidth, tail drop), outage, loss, duplication, delay. Each
+The stages of a datagram are: queue of the transmitter (bandwidth, tail drop), loss, duplication, delay. Each
 datagram uses the same number of random draws with any settings. So an experiment can change one setting without
 changing the random results of the others.
 """
@@ -16,6 +16,11 @@ from collections import Counter
 from dataclasses import dataclass
 from enum import StrEnum
 from random import Random
+
+HELD_BACK_S = 0.05
+"""The delay of a datagram that others overtake."""
+IN_FLIGHT_LIMIT = 65536
+"""The maximum number of datagrams in flight; more are dropped. It bounds memory and does not model a radio."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,32 +41,6 @@ class Bursts:
 
 
 @dataclass(frozen=True, slots=True)
-class Outage:
-    """The link carries nothing from ``down_at_s`` until ``up_at_s``, seconds since the radio was made."""
-
-    down_at_s: float
-    up_at_s: float
-    every_s: float | None = None
-    """The interval at which the outage repeats; None for once."""
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.down_at_s < self.up_at_s:
-            raise ValueError(f"an outage must end after it begins: {self.down_at_s} s to {self.up_at_s} s")
-        if self.every_s is not None and self.every_s < self.up_at_s - self.down_at_s:
-            raise ValueError(f"an outage every {self.every_s} s must end before the next begins")
-
-    def overlaps(self, begin_s: float, end_s: float) -> bool:
-        """Whether the link is down at any moment from ``begin_s`` to ``end_s``, both included."""
-        if end_s < self.down_at_s:
-            return False
-        if self.every_s is None:
-            return begin_s < self.up_at_s
-        # The last time at or before the end that the link went down.
-        down_at_s = self.down_at_s + (end_s - self.down_at_s) // self.every_s * self.every_s
-        return begin_s < down_at_s + (self.up_at_s - self.down_at_s)
-
-
-@dataclass(frozen=True, slots=True)
 class RadioSettings:
     """The impairments of one direction. The defaults are a perfect link. Shares are 0 to 1, durations seconds.
 
@@ -78,33 +57,23 @@ class RadioSettings:
     delay_s: float = 0.0
     jitter_s: float = 0.0
     """The maximum additional delay, uniformly distributed."""
-    keeps_order: bool = False
-    """Jitter does not reorder datagrams, as in a queue."""
     reordering: float = 0.0
-    """Share of datagrams delayed by ``held_back_s`` so that later ones overtake them, also with ``keeps_order``."""
-    held_back_s: float = 0.05
+    """Share of datagrams delayed by :data:`HELD_BACK_S` so that later ones overtake them."""
     bits_per_s: float | None = None
     """The bandwidth of the transmitter; None for no limit."""
     queue_bytes: int = 16384
     """The queue of the transmitter: it drops datagrams that do not fit. Requires a bandwidth."""
     overhead_bytes: int = 28
     """Added to each datagram's length: the headers of IPv4 and UDP."""
-    outages: tuple[Outage, ...] = ()
-    is_stalled: bool = False
-    """Nothing arrives until other settings end the stall. Then everything arrives that was due meanwhile."""
-    in_flight_limit: int = 65536
-    """The maximum number of datagrams in flight; more are dropped. It bounds memory and does not model a radio."""
 
     def __post_init__(self) -> None:
         _check_shares(self, "loss", "duplication", "reordering")
-        for name in ("delay_s", "jitter_s", "held_back_s", "queue_bytes", "overhead_bytes"):
+        for name in ("delay_s", "jitter_s", "queue_bytes", "overhead_bytes"):
             value = getattr(self, name)
             if not 0 <= value < math.inf:
                 raise ValueError(f"{name} must be 0 or more, not {value}")
         if self.bits_per_s is not None and not 0 < self.bits_per_s < math.inf:
             raise ValueError(f"bits_per_s must be more than 0, not {self.bits_per_s}")
-        if self.in_flight_limit < 1:
-            raise ValueError(f"in_flight_limit must be at least 1, not {self.in_flight_limit}")
 
 
 class Outcome(StrEnum):
@@ -116,7 +85,6 @@ class Outcome(StrEnum):
     HELD_BACK = "held_back"
     LOST = "lost"
     LOST_IN_BURST = "lost_in_burst"
-    LOST_IN_OUTAGE = "lost_in_outage"
     QUEUE_FULL = "queue_full"
     TOO_MANY_IN_FLIGHT = "too_many_in_flight"
 
@@ -127,7 +95,7 @@ class Radio:
     Args:
         settings: the impairments.
         rng: the random source. An equal generator and equal calls return equal results.
-        now: monotonic seconds; outages are relative to this time.
+        now: monotonic seconds.
     """
 
     def __init__(self, settings: RadioSettings, rng: Random, now: float = 0.0) -> None:
@@ -135,9 +103,7 @@ class Radio:
         self.settings = settings
         """May be replaced at any time; datagrams in flight stay in flight."""
         self._rng = rng
-        self._began_at = now
         self._idle_at = now  # when the transmitter's queue is empty
-        self._last_arrival_at = now
         self._is_in_burst = False
         self._in_flight: list[tuple[float, int, bytes]] = []  # a heap; the number keeps the order of equal times
         self._number = 0
@@ -150,12 +116,9 @@ class Radio:
         if not self._has_room(len(datagram), now):
             outcomes[Outcome.QUEUE_FULL] += 1
             return
-        begun_at = max(now, self._idle_at)
-        sent_at = self._idle_at = begun_at + self._airtime_s(len(datagram))
+        sent_at = self._idle_at = max(now, self._idle_at) + self._airtime_s(len(datagram))
         is_lost_in_burst = self._is_lost_in_burst(turn)
-        if self._is_down(begun_at, sent_at):
-            outcomes[Outcome.LOST_IN_OUTAGE] += 1
-        elif is_lost_in_burst:
+        if is_lost_in_burst:
             outcomes[Outcome.LOST_IN_BURST] += 1
         elif loss_draw < settings.loss:
             outcomes[Outcome.LOST] += 1
@@ -171,14 +134,14 @@ class Radio:
     def due(self, now: float) -> list[bytes]:
         """Pop the datagrams that have arrived by ``now``, in the order of arrival."""
         arrived: list[bytes] = []
-        while not self.settings.is_stalled and self._in_flight and self._in_flight[0][0] <= now:
+        while self._in_flight and self._in_flight[0][0] <= now:
             arrived.append(heapq.heappop(self._in_flight)[2])
         self.outcomes[Outcome.DELIVERED] += len(arrived)
         return arrived
 
     def next_deadline(self) -> float:
-        """The time of the next arrival; infinity if nothing is in flight, or during a stall."""
-        return self._in_flight[0][0] if self._in_flight and not self.settings.is_stalled else math.inf
+        """The time of the next arrival; infinity if nothing is in flight."""
+        return self._in_flight[0][0] if self._in_flight else math.inf
 
     @property
     def in_flight(self) -> int:
@@ -195,10 +158,6 @@ class Radio:
         waiting_bytes = (self._idle_at - now) * rate / 8
         return waiting_bytes + size + self.settings.overhead_bytes <= self.settings.queue_bytes
 
-    def _is_down(self, begin_at: float, end_at: float) -> bool:
-        begin_s, end_s = begin_at - self._began_at, end_at - self._began_at
-        return any(outage.overlaps(begin_s, end_s) for outage in self.settings.outages)
-
     def _is_lost_in_burst(self, turn: float) -> bool:
         bursts = self.settings.bursts
         if bursts is None:
@@ -208,13 +167,11 @@ class Radio:
         return self._is_in_burst
 
     def _carry(self, datagram: bytes, arrival_at: float, *, is_held_back: bool) -> None:
-        if len(self._in_flight) >= self.settings.in_flight_limit:
+        if len(self._in_flight) >= IN_FLIGHT_LIMIT:
             self.outcomes[Outcome.TOO_MANY_IN_FLIGHT] += 1
             return
         if is_held_back:
-            arrival_at += self.settings.held_back_s
-        elif self.settings.keeps_order:
-            arrival_at = self._last_arrival_at = max(arrival_at, self._last_arrival_at)
+            arrival_at += HELD_BACK_S
         self._number += 1
         heapq.heappush(self._in_flight, (arrival_at, self._number, datagram))
 

@@ -9,8 +9,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Self
 
+from uavlinkd.io.url import NetworkUrl
 from uavlinkd.lab.sim.autopilot import Autopilot, AutopilotSettings, Event
-from uavlinkd.lab.sim.links import LinkURL, MavlinkConnection, open_connection
+from uavlinkd.lab.sim.links import MavlinkConnection
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +33,9 @@ class Flight:
     parameter_set, mission_received, gcs_connected.
     """
 
-    def __init__(self, url: str, settings: AutopilotSettings | None = None, *, on_event: Event | None = None) -> None:
+    def __init__(
+        self, url: NetworkUrl, settings: AutopilotSettings | None = None, *, on_event: Event | None = None
+    ) -> None:
         self._url = url
         self.link: MavlinkConnection
         self._loop = asyncio.get_running_loop()
@@ -58,7 +61,8 @@ class Flight:
             self._failure.result()
 
     async def __aenter__(self) -> Self:
-        self.link = await open_connection(self._url, self._receive)
+        self.link = MavlinkConnection(self._url, self._receive)
+        await self.link.open()
         self._on_timer()
         return self
 
@@ -106,7 +110,7 @@ Write = Callable[[str], None]
 class SimOptions:
     """The command line."""
 
-    url: LinkURL
+    url: NetworkUrl
     system_id: int = 1
     rate_hz: float = 10.0
     seconds: float | None = None
@@ -125,7 +129,7 @@ async def run_sim(options: SimOptions, write: Write) -> None:
     def on_event(name: str, fields: dict[str, object]) -> None:
         write(" ".join([name.replace("_", " ") + ":" * bool(fields), *(f"{k} {v}" for k, v in fields.items())]))
 
-    async with Flight(str(options.url), settings, on_event=on_event) as flight:
+    async with Flight(options.url, settings, on_event=on_event) as flight:
         write(f"copter with system ID {options.system_id}, {_where(flight.link.url)}; Ctrl-C ends it")
         watching = asyncio.create_task(_watch(flight.link, lambda: flight.report.frames_received > 0, write))
         try:
@@ -137,17 +141,17 @@ async def run_sim(options: SimOptions, write: Write) -> None:
                 write(f"{flight.frames_unsent:,} frames had no receiver")
 
 
-def _where(url: LinkURL) -> str:
-    return f"sends to {url}" if url.kind == "udpout" else f"waits for clients at {url}"
+def _where(url: NetworkUrl) -> str:
+    return f"waits for clients at {url}" if url.listens else f"sends to {url}"
 
 
 async def _watch(link: MavlinkConnection, is_answered: Callable[[], bool], write: Write) -> None:
     """Report the first client, or that nothing listens."""
-    if link.url.kind == "udpin":
+    if link.url.listens:
         await link.joined.wait()
         write("a client connected")
         return
     await link.refused.wait()
     if not is_answered():
-        place = str(link.url).partition(":")[2]
+        place = link.url.address
         write(f"nothing listens at {place}: start a client there, or uavlinkd with an endpoint udpin:{place}")

@@ -7,16 +7,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import re
 import socket
 from collections import OrderedDict
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Final
 
+from uavlinkd.io.url import NetworkUrl
 from uavlinkd.mavlink.frames import SplitCounters, split_datagram
 
-KINDS: Final = ("udpin", "udpout")
 # A UDP client silent for longer receives no more frames.
 FORGET_AFTER_S: Final = 60.0
 MAX_CLIENTS: Final = 16
@@ -25,48 +23,9 @@ RECEIVE_BUFFER_BYTES: Final = 1 << 21
 SocketAddress = tuple[str, int]
 OnFrame = Callable[[bytes], None]
 
-_URL = re.compile(r"(?P<kind>[a-z]+):(?://)?(?P<host>\[[^\]]*\]|[^:\[\]/]*):(?P<port>\d{1,5})/?")
-
 
 class LinkError(Exception):
     """The connection cannot be opened. The text is one line for the operator."""
-
-
-@dataclass(frozen=True, slots=True)
-class LinkURL:
-    """The address of a connection: ``udpin`` listens there, ``udpout`` sends there."""
-
-    kind: str
-    host: str
-    port: int
-
-    def __str__(self) -> str:
-        host = f"[{self.host}]" if ":" in self.host else self.host
-        return f"{self.kind}:{host}:{self.port}"
-
-
-def parse_url(text: str) -> LinkURL:
-    """Parse ``udpin:HOST:PORT`` or ``udpout:HOST:PORT``, with or without ``//`` before the host.
-
-    An empty host means all addresses of this machine. ``udp:`` is refused: some software listens there, and other
-    software sends there.
-
-    Raises:
-        LinkError: The URL is invalid.
-    """
-    match = _URL.fullmatch(text)
-    if match is None:
-        raise LinkError(f"{text!r} is not a MAVLink URL: write KIND:HOST:PORT, with KIND one of {', '.join(KINDS)}")
-    kind = match["kind"]
-    if kind not in KINDS:
-        place = text.partition(":")[2].removeprefix("//")
-        raise LinkError(f"{text!r}: write udpin:{place} to listen there, or udpout:{place} to send there")
-    host, port = match["host"].strip("[]"), int(match["port"])
-    if port > 65535 or (port == 0 and kind == "udpout"):
-        raise LinkError(f"{text!r}: the port must be {0 if kind == 'udpin' else 1} to 65535")
-    if not host and kind == "udpout":
-        raise LinkError(f"{text!r}: the host is missing")
-    return LinkURL(kind, host or "0.0.0.0", port)
 
 
 class MavlinkConnection:
@@ -76,7 +35,7 @@ class MavlinkConnection:
     frame within a minute.
     """
 
-    def __init__(self, url: LinkURL, on_frame: OnFrame) -> None:
+    def __init__(self, url: NetworkUrl, on_frame: OnFrame) -> None:
         self.url = url
         self.split = SplitCounters()
         self._on_frame = on_frame
@@ -89,7 +48,7 @@ class MavlinkConnection:
 
     @property
     def receivers(self) -> int:
-        return len(self._clients) if self.url.kind == "udpin" else 1
+        return len(self._clients) if self.url.listens else 1
 
     async def close(self) -> None:
         self._udp.close()
@@ -97,7 +56,7 @@ class MavlinkConnection:
 
     def send(self, frame: bytes) -> bool:
         """Send to all receivers; False if there is none."""
-        if self.url.kind == "udpout":
+        if not self.url.listens:
             self._udp.sendto(frame)
             return True
         now = self._loop.time()
@@ -107,23 +66,28 @@ class MavlinkConnection:
             self._udp.sendto(frame, address)
         return bool(self._clients)
 
+    async def open(self) -> None:
+        """Begin. Raises LinkError if the system refuses it: an address in use, an unknown host."""
+        try:
+            await self._open()
+        except OSError as error:
+            raise LinkError(f"{self.url}: {error.strerror or error}") from error
+
     async def _open(self) -> None:
-        url, place = self.url, (self.url.host, self.url.port)
-        here, there = (place, None) if url.kind == "udpin" else (None, place)
+        place = self.url.address.host, self.url.address.port
+        here, there = (place, None) if self.url.listens else (None, place)
         self._udp, _ = await self._loop.create_datagram_endpoint(lambda: _Datagrams(self), here, there)
         sock = self._udp.get_extra_info("socket")
         with contextlib.suppress(OSError):  # a larger buffer for bursts, as far as the system allows
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
-        if url.kind == "udpout":
+        if not self.url.listens:
             self.joined.set()
-        else:
-            self.url = LinkURL(url.kind, url.host, sock.getsockname()[1])
 
     def _datagram(self, data: bytes, address: SocketAddress) -> None:
         frames = split_datagram(data, self.split)
         if not frames:
             return  # a sender without MAVLink frames is not a client
-        if self.url.kind == "udpin":
+        if self.url.listens:
             self._clients[address] = self._loop.time()
             self._clients.move_to_end(address)
             self.joined.set()
@@ -142,17 +106,3 @@ class _Datagrams(asyncio.DatagramProtocol):
 
     def error_received(self, exc: Exception) -> None:
         self._link.refused.set()
-
-
-async def open_connection(url: str | LinkURL, on_frame: OnFrame) -> MavlinkConnection:
-    """Open a connection.
-
-    Raises:
-        LinkError: The URL is invalid, or the system refuses it (address in use, unknown host).
-    """
-    link = MavlinkConnection(parse_url(url) if isinstance(url, str) else url, on_frame)
-    try:
-        await link._open()
-    except OSError as error:
-        raise LinkError(f"{link.url}: {error.strerror or error}") from error
-    return link
