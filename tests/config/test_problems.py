@@ -167,7 +167,7 @@ _FILE_ROWS = [
     (relays(relay() + relay("b") + relay("c") + relay("d")), "relay", "at most 3"),
     (relays(relay() + relay("vps", key=KEY["b"], addresses='["b:1"]')), "relay[1].name (vps)", "of relay[0] (vps)"),
     (relays(relay() + relay("b", key=KEY["vps"])), "relay[1].public_key (b)", "is that of relay[0] (vps) too"),
-    (relays(_AS_PEER + _PSK + "\n"), "relay[0].psk_file (vps)", "because peer[0] (drone1) has the same"),
+    (relays(_AS_PEER + _PSK + "\n"), "relay[0].psk_file (vps)", "was removed: delete the line; against a later"),
     (relays(relay(key=KEY["drone1"], addresses="[]")), "relay[0].addresses (vps)", "a relay never initiates"),
     (relays(_AS_PEER, 'relays = ["vps"]'), "peer[0].relays (drone1)", "or this peer itself"),
     (relays(relay(key=KEY["b"], more=member()), head=HEAD), "relay[0].public_key (vps)", "member[0] (b) too"),
@@ -183,7 +183,6 @@ _FILE_ROWS = [
     (HEAD + _MEMBERS + "max_peers = 9\n", "member[1].max_peers (b)", "was removed: delete the line"),
     (HEAD + _MEMBERS + "bits_s = 9000\n", "member[1].bits_s (b)", "member_bits_s in [relay_server]"),
     (GOOD + OTHER_PEER + member("drone2", KEY["c"]), "member[0].name (drone2)", "is that of peer[1] (drone2) too"),
-    (GOOD + member("drone1", more=_PSK), "member[0].psk_file (drone1)", "write it there only"),
 ]
 _ROWS = [
     *((GOOD + lines + "\n", f"peer[0].{key} (drone1)", says) for lines, key, says in _PEER_ROWS),

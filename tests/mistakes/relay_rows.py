@@ -45,5 +45,4 @@ RELAY_ROWS = (
     ),
     Mistake("90", scenes.port_in_use, command=r"ss -lntup"),
     Mistake("91", scenes.file_of_a_member, command=r"is not the file of a relay.*\[\[member\]\].*`uavlinkd run`"),
-    Mistake("92", scenes.psk, signs=(Sign("here", "wrong_psk", r"same psk_file"),)),
 )

@@ -65,14 +65,6 @@ async def exchanged_keys(scene: Scene) -> None:
     await _checked_start(scene)
 
 
-async def psk(scene: Scene) -> None:
-    """Only `here` has a PSK for the relay."""
-    _member(scene.here, scene.there)
-    keys.write_secret_file(scene.here.folder / "relay.psk", scene.stage.psk())
-    _used(scene.here)["psk_file"] = "relay.psk"
-    await _checked_start(scene)
-
-
 async def firewall(scene: Scene) -> None:
     """Datagrams to the relay `here` are dropped when they arrive."""
     need(os.geteuid() == 0, "root, for network namespaces")

@@ -247,7 +247,6 @@ def _relay(file: File, section: Values, fleet: FleetConfig | None) -> RelayConfi
         settings=PeerSettings(
             name=RELAY_HOST + section.get("name"),
             public_key=section.get("public_key"),
-            psk=section.get("psk_file"),
             link=link if fleet is None else fleet_link(link),
             is_certified=is_contact,
         ),
@@ -262,8 +261,7 @@ def _relay_server(file: File) -> RelayServer:
     keys, link = file.one("relay_server"), replace(_link(file.one("link")), features=c.FEATURE_RECORDS)
     link = fleet_link(link) if file["fleet"] else link
     members = (
-        PeerSettings(one.get("name"), one.get("public_key"), one.get("psk_file"), link, initiates=False)
-        for one in file["member"]
+        PeerSettings(one.get("name"), one.get("public_key"), link=link, initiates=False) for one in file["member"]
     )
     return RelayServer(
         members=tuple(MemberSettings(peer, _PEERS_OF_MEMBER, keys.get("member_bits_s")) for peer in members),

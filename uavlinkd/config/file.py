@@ -170,9 +170,16 @@ _KNOWN: dict[str, str] = {
 """The remedies for keys and sections of earlier versions, and for keys of WireGuard."""
 
 
+_REMOVED_OF_RELAYS = {
+    "bits_s": "write member_bits_s in [relay_server], which is the limit of each member",
+    "psk_file": "delete the line; against a later quantum computer, write a suite with ML-KEM in [link]",
+}
+"""The remedies for keys that only ``[[relay]]`` and ``[[member]]`` had in earlier versions."""
+
+
 def unknown_key(key: str, keys: Keys) -> str:
-    if key == "bits_s" and keys is SECTIONS["member"]:
-        return "was removed: write member_bits_s in [relay_server], which is the limit of each member"
+    if keys in (SECTIONS["relay"], SECTIONS["member"]) and key in _REMOVED_OF_RELAYS:
+        return f"was removed: {_REMOVED_OF_RELAYS[key]}"
     plain = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|[ -]", "_", key).lower()
     if key in TITLES:
         return f"does not belong here: write {TITLES[key]}, a section of its own"

@@ -14,10 +14,6 @@ def check(file: File) -> Found:
     yield from _members(file)
     yield from _relays(file)
     yield from _uses(file)
-    for section in (*file["member"], *file["relay"]):
-        if (peer := with_same_key(section, file["peer"])) is not None and "psk_file" in section.valid:
-            text = f"has no effect, because {peer.at()} has the same public_key: write it there only"
-            yield section.at("psk_file"), text
 
 
 def _members(file: File) -> Found:

@@ -210,7 +210,6 @@ POLICY: Final[Keys] = dict.fromkeys(POLICY_KEYS, Key(anything, None))
 _WITH_KEY: Final[Keys] = {
     "name": Key(_name, written='"drone1"'),
     "public_key": Key(_public_key, written='"…", what `uavlinkd pubkey` prints there'),
-    "psk_file": Key(_file_name, None, '"drone0-drone1.psk"'),
 }
 """The keys that say who another daemon is."""
 
@@ -256,6 +255,7 @@ REPEATED: Final[dict[str, Keys]] = {
     },
     "peer": {
         **_WITH_KEY,
+        "psk_file": Key(_file_name, None, '"drone0-drone1.psk"'),
         "addresses": Key(_addresses, [], '["10.13.0.2:5790"]'),
         "relays": Key(each(_name), None, "[]"),
         **POLICY,

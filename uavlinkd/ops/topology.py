@@ -43,21 +43,17 @@ def _facts(config: Config) -> Iterator[str]:
         port = config.listen[0].port
         yield f"(it connects): the peer's file needs an address of this machine, with port {port}"
     relays = [
-        (one.name, _whole(one.settings.public_key), ", ".join(map(str, one.addresses)), _yes(one.settings.psk))
-        for one in config.relays
+        (one.name, _whole(one.settings.public_key), ", ".join(map(str, one.addresses))) for one in config.relays
     ]
-    yield from _table("Relays", ["name", "public key", "address", "PSK"], relays)
+    yield from _table("Relays", ["name", "public key", "address"], relays)
     titles = ["name", "URL", "RADIO_STATUS", "STATUSTEXT", "plain MAVLink is open to"]
     yield from _table("Local endpoints", titles, list(map(_endpoint, config.endpoints)))
     if config.relay_server is not None:
         members = [
-            (
-                *(one.name, _whole(one.peer.public_key), _yes(one.peer.psk)),
-                *(f"{one.most_peers:,}", f"{one.bits_s / 1000:,.0f}"),
-            )
+            (one.name, _whole(one.peer.public_key), f"{one.bits_s / 1000:,.0f}")
             for one in config.relay_server.members
         ]
-        titles = ["name", "public key", "PSK", "members", "kbit/s"]
+        titles = ["name", "public key", "kbit/s"]
         yield from _table("Members of this relay, and their limits", titles, members)
 
 
