@@ -49,12 +49,9 @@ LINK_ROWS = (
     ),
     Mistake("25", scenes.psk, signs=_both("wrong_psk", r"same psk_file")),
     Mistake("26", scenes.suites, signs=_both("no_common_suite", r"write this end's suites")),
-    Mistake("27", scenes.confidential),
-    Mistake("28", scenes.tags),
     Mistake(
         "30", scenes.copied_card, signs=_both("key_on_two_machines", r"uavlinkd pubkey.*only if a second machine")
     ),
-    Mistake("31", scenes.old_clock),
     Mistake(
         "32",
         scenes.input_dropped,
@@ -80,6 +77,7 @@ LINK_ROWS = (
         signs=_here("foreign_system", r"MAV_SYSID .*MAV_SYS_ID .* of its autopilot to 2"),
     ),
     Mistake("39", scenes.roles, signs=_here("roles_exchanged", r'write role = "operator"')),
+    Mistake("40", scenes.no_control_socket, command=r'add control_socket = "NAME\.sock"'),
     Mistake("46", scenes.bare_mavlink, signs=_here("raw_mavlink", r"port of an \[\[endpoint\]\]")),
     Mistake(
         "47", scenes.closed_client, signs=_here("client_unreachable", r"start the client there, or correct the port")
@@ -90,14 +88,12 @@ LINK_ROWS = (
         command=r"tag_bits: must be 64, 96 or 128",
         signs=_here("configuration_refused", r"`uavlinkd check --config .*` prints, and run `uavlinkd reload`"),
     ),
-    Mistake("51", scenes.reload_listen, command=r"routing: has changed, .*: restart the daemon"),
     Mistake(
         "52",
         scenes.without_restart,
         signs=_here("wrong_key_here", r"After a change of keys, restart it with its new files"),
     ),
     Mistake("53", scenes.other_user, command=r"use sudo"),
-    Mistake("53b", scenes.not_started, command=r"start it \(`uavlinkd run"),
     Mistake("54", scenes.killed, command=r"start it \(`uavlinkd run"),
     Mistake("74", scenes.withheld, signs=_here("commands_withheld", r"write another role, or allow the command")),
     Mistake("75", scenes.garbage, signs=_here("garbage", r"baud rate")),

@@ -6,7 +6,6 @@ import os
 import pty
 import signal
 import socket
-import time
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -141,18 +140,6 @@ async def suites(scene: Scene) -> None:
     await _checked_start(scene)
 
 
-async def confidential(scene: Scene) -> None:
-    """Only `here` asks for it."""
-    scene.introduce(here={"confidential": True})
-    await _linked(scene)
-
-
-async def tags(scene: Scene) -> None:
-    """`here` asks for shorter tags."""
-    scene.introduce(here={"tag_bits": 64})
-    await _linked(scene)
-
-
 async def copied_card(scene: Scene) -> None:
     """A third daemon has the key of `there`, and both call `here`."""
     scene.introduce()
@@ -246,14 +233,6 @@ async def reload(scene: Scene) -> None:
     scene.command = await said_by_process("reload", "--config", str(scene.here.write_config()))
 
 
-async def reload_listen(scene: Scene) -> None:
-    """It gets a file with a key that needs a restart."""
-    scene.introduce()
-    await scene.start(scene.here)
-    scene.here.config["routing"] = {"relay": True}
-    scene.command = await said_by_process("reload", "--config", str(scene.here.write_config()))
-
-
 async def without_restart(scene: Scene) -> None:
     """`here` has the new key of `there`, which still runs with its old one."""
     scene.introduce()
@@ -274,25 +253,12 @@ async def other_user(scene: Scene) -> None:
         scene.command = await said_by_process("status", "--socket", str(path), launcher=WITHOUT_RIGHTS)
 
 
-async def not_started(scene: Scene) -> None:
-    """It was never started."""
-    scene.command = await said_by_process("status", "--config", str(scene.here.write_config()))
-
-
 async def killed(scene: Scene) -> None:
     """It left its control socket."""
     scene.introduce()
     await scene.start(scene.here)
     await scene.here.stop(signal.SIGKILL)
     scene.command = await said_by_process("status", "--config", str(scene.here.write_config()))
-    await _linked(scene)
-
-
-async def old_clock(scene: Scene) -> None:
-    """Its files are from the future of a clock of 1970: the daemon reads the monotonic clock only."""
-    scene.introduce()
-    future = time.time() + 40 * 365 * 86400
-    os.utime(scene.here.folder / "daemon.key", (future, future))
     await _linked(scene)
 
 
@@ -337,3 +303,9 @@ async def revoked_card(scene: Scene) -> None:
     fleet.revoke(scene.there.name)
     scene.here.config["fleet"]["bulletin"] = to_base64(fleet.bulletin)
     await scene.start()
+
+
+async def no_control_socket(scene: Scene) -> None:
+    """`status` has nothing to ask."""
+    del scene.here.config["control_socket"]
+    scene.command = await said_by_process("status", "--config", str(scene.here.write_config()))

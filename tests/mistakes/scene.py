@@ -10,7 +10,6 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterable
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 from tests.processes.harness import Stage
@@ -132,8 +131,3 @@ async def said_by_process(*arguments: str, launcher: tuple[str, ...] = ()) -> st
 def checked(daemon: DaemonProcess) -> str:
     """What `check` prints about a daemon's file. The file is written as it will be at the start."""
     return said("check", "--config", str(daemon.write_config()))
-
-
-def checked_file(path: Path) -> str:
-    """What `check` prints about a file."""
-    return said("check", "--config", str(path))

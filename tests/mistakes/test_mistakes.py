@@ -7,7 +7,6 @@ from time import monotonic
 
 import pytest
 
-from tests.mistakes.file_rows import FILE_ROWS
 from tests.mistakes.link_rows import LINK_ROWS
 from tests.mistakes.relay_rows import RELAY_ROWS
 from tests.mistakes.row import Mistake, Result, Side, is_in
@@ -28,7 +27,7 @@ def _order(mistake: Mistake) -> tuple[int, str]:
     return int(number), mistake.row
 
 
-MISTAKES = tuple(sorted((*FILE_ROWS, *LINK_ROWS, *RELAY_ROWS), key=_order))
+MISTAKES = tuple(sorted((*LINK_ROWS, *RELAY_ROWS), key=_order))
 
 
 async def run_all(mistakes: tuple[Mistake, ...] = MISTAKES) -> dict[str, Result]:
