@@ -5,20 +5,17 @@ Pure: no I/O, no clock, no randomness. Only members by certificate take part. Th
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right, insort
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from operator import itemgetter
+from heapq import nsmallest
 
 from uavlinkd.authority import constants as a
-from uavlinkd.authority.certificates import MemberRole, roles_in
+from uavlinkd.authority.certificates import roles_in
 from uavlinkd.authority.trust import HeldCertificate
 from uavlinkd.protocol import constants as c
 from uavlinkd.protocol.drops import DropReason
 from uavlinkd.protocol.limits import TokenBucket
 from uavlinkd.protocol.relay_records import CertificateRecord, Who
-
-_serial = itemgetter(0)
 
 
 class _Certified:
@@ -42,8 +39,6 @@ class Introductions:
     def __init__(self, wished_at: Callable[[bytes, bytes], float]) -> None:
         self._wished_at = wished_at
         self._members: dict[bytes, _Certified] = {}
-        self._up: dict[MemberRole, list[tuple[int, bytes]]] = {role: [] for role in MemberRole}
-        """Serials and keys, ascending."""
         self._arrived: dict[bytes, float] = {}  # members with a new session, and when to introduce others, ascending
         self._due: dict[tuple[bytes, bytes], None] = {}  # who is to learn of whom
         self._again: deque[tuple[float, bytes, bytes, int]] = deque()
@@ -58,39 +53,22 @@ class Introductions:
         """A member has this certificate from now on."""
         if key not in self._members:
             self._members[key] = _Certified(held, now)
-        self._renew(key, held)
-        self.set_up(key, is_up=is_up)
+        self._members[key].held, self._members[key].is_up = held, is_up
 
     def renew(self, held: Mapping[bytes, HeldCertificate]) -> None:
         """These are held now: members may have newer ones than before."""
         for key in self._members.keys() & held.keys():
-            self._renew(key, held[key])
-
-    def _renew(self, key: bytes, held: HeldCertificate) -> None:
-        member = self._members[key]
-        if held is not member.held:
-            is_up = member.is_up
-            self.set_up(key, is_up=False)
-            member.held = held
-            self.set_up(key, is_up=is_up)
+            self._members[key].held = held[key]
 
     def remove(self, key: bytes) -> None:
         """Tell others nothing more about it."""
-        self.set_up(key, is_up=False)
         del self._members[key]
         self._arrived.pop(key, None)
 
     def set_up(self, key: bytes, *, is_up: bool) -> None:
         """A member came up or went down."""
-        if (member := self._members.get(key)) is None:
-            return
-        certificate = member.held.certificate
-        entries, entry = self._up[certificate.role], (certificate.serial, key)
-        if is_up and not member.is_up:
-            insort(entries, entry)
-        elif member.is_up and not is_up:
-            del entries[bisect_left(entries, entry)]
-        member.is_up = is_up
+        if (member := self._members.get(key)) is not None:
+            member.is_up = is_up
 
     def on_session(self, key: bytes, now: float) -> None:
         """A member has a new session, perhaps after a restart. Then it has forgotten the others."""
@@ -115,11 +93,14 @@ class Introductions:
 
     def answer(self, key: bytes, who: Who, now: float) -> list[CertificateRecord] | None:
         """The certificates that a member asks for; None if it got too many."""
-        found = list[tuple[int, bytes]]()
-        for entries in map(self._up.__getitem__, roles_in(who.roles)):
-            at = bisect_right(entries, who.after, key=_serial)
-            found += entries[at : at + a.CERTIFICATES_PER_ANSWER + 1]
-        keys = [other for _, other in sorted(found) if other != key][: a.CERTIFICATES_PER_ANSWER]
+        roles = set(roles_in(who.roles))
+        others = ((other, member.held.certificate) for other, member in self._members.items() if member.is_up)
+        known = (
+            (certificate.serial, other)
+            for other, certificate in others
+            if certificate.role in roles and certificate.serial > who.after and other != key
+        )
+        keys = [other for _, other in nsmallest(a.CERTIFICATES_PER_ANSWER, known)]
         return list(map(self._record, keys)) if self._members[key].certificates.take(now, len(keys)) else None
 
     # Introductions.
