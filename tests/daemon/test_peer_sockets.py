@@ -25,9 +25,8 @@ from uavlinkd.daemon import networks as module
 from uavlinkd.daemon.evidence import Evidence
 from uavlinkd.daemon.journal import DaemonJournal
 from uavlinkd.daemon.peer_names import REFRESH_S
-from uavlinkd.daemon.peer_sockets import RELAY_BUFFER_BYTES, PeerSockets
-from uavlinkd.io.reader import PAUSE_S
-from uavlinkd.io.sockets import BUFFER_BYTES, Presence
+from uavlinkd.daemon.peer_sockets import PeerSockets
+from uavlinkd.io.sockets import Presence
 from uavlinkd.protocol.path import Path, relayed
 from uavlinkd.protocol.relay_records import wrap
 from uavlinkd.relay.client_link import RelayHandles
@@ -95,22 +94,6 @@ def test_relayed_path_goes_to_the_relay_or_nowhere() -> None:
     sockets.send(b"inner", relayed(0, "vps", 8))
     assert sock.sent == [wrap(7, b"inner")]
     assert sockets.failures == {"relay_handle_gone": 1} == drops.totals
-
-
-@pytest.mark.parametrize("is_relay", [True, False])
-async def test_sockets_of_a_relay_have_room_for_longer_bursts(*, is_relay: bool) -> None:
-    """As far as the kernel grants it."""
-    log = structlog.get_logger()
-    stall = StallWatch(0.0, lambda _: None)
-    sockets = PeerSockets(stall, DaemonJournal(), Evidence({}, b""), log, SocketStateLog())
-    sockets.pause_s = 0.0 if is_relay else PAUSE_S
-    sockets.open([Address("127.0.0.1", 0)])
-    sockets.start(lambda *_: None)
-    option = socket.SOL_SOCKET, socket.SO_RCVBUF
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
-        other.setsockopt(*option, RELAY_BUFFER_BYTES if is_relay else BUFFER_BYTES)
-        assert sockets.open_sockets()[0].getsockopt(*option) == other.getsockopt(*option)
-    sockets.close()
 
 
 # The paths to a peer along networks, and what failed sends cause. The networks are made up, on loopback.

@@ -176,43 +176,6 @@ def test_answer_does_not_tell_who_exists(key: bytes) -> None:
     assert made.handles(A, path(A), key) == ()
 
 
-def test_connection_ends_with_the_wish_of_either() -> None:
-    """After the lifetime of a wish, and not before."""
-    made = bindings()
-    connection = connect(made)
-    made.bind(A, path(A), [B], 30.0)
-    assert made.expire(c.BIND_LIFETIME_S - 0.01) == Changes()
-    changes = made.expire(c.BIND_LIFETIME_S)
-    assert changes.closed == [connection]
-    assert changes.concerned == {(A, path(A)): {B: None}, (B, path(B)): {A: None}}
-    assert made.handles(A, path(A), B) == ()
-    made.expire(30.0 + c.BIND_LIFETIME_S)
-
-
-def test_new_path_takes_the_place_of_a_spare_connection() -> None:
-    """Every path has one; the others keep their handles."""
-    made = bindings()
-    for member, key in ((A, B), (B, A)):
-        for number in (0, 1):
-            made.bind(member, path(member, number), [key], 0.0)
-    changes = made.bind(A, path(A, 2), [B], 1.0)
-    assert (len(changes.opened), len(changes.closed)) == (1, 1)
-    assert all(made.handles(A, path(A, number), B) for number in (0, 1, 2))
-    assert all(made.handles(B, path(B, number), A) for number in (0, 1))
-
-
-def test_fifth_path_replaces_the_one_renewed_least_recently() -> None:
-    """A member whose NAT changes its address keeps the paths that it renews."""
-    made = bindings()
-    connect(made)
-    for number in (1, 2, 3):
-        made.bind(A, path(A, number), [B, C], float(number))
-    made.bind(A, path(A), [B], 4.0)
-    made.bind(A, path(A, 4), [B], 5.0)
-    assert [bool(made.handles(A, path(A, number), B)) for number in range(5)] == [True, False, True, True, True]
-    assert (made.connections, made.peers_of(A)) == (c.HANDLES_PER_PAIR, (1, 1))
-
-
 def test_handle_is_quarantined() -> None:
     """It is not given to its member again until then, although the random source returns it."""
     draws = [1, 2, 1, 2, 3, 2, 4]  # A's, B's; then both again
@@ -249,41 +212,6 @@ def test_member_that_changes_its_paths_fast_does_not_use_up_the_handles_of_anoth
     assert len(used) > 2 * QUARANTINED_PER_MEMBER
     assert made.handles(A, path(A), C)
     assert made.connections == 1
-
-
-@pytest.mark.parametrize(
-    "end",
-    [lambda made: made.remove_member(A, 1.0), lambda made: made.expire(c.BIND_LIFETIME_S)],
-    ids=["removed", "expired"],
-)
-def test_wishes_that_end_together_open_nothing(end: Callable[[Bindings], Changes]) -> None:
-    """Of two members with three paths each, which have connections to spare."""
-    made = bindings()
-    for number in range(3):
-        made.bind(A, path(A, number), [B], 0.0)
-        made.bind(B, path(B, number), [A], 0.0)
-    assert made.connections == c.HANDLES_PER_PAIR
-    changes = end(made)
-    assert changes.opened == []
-    assert len(changes.closed) == c.HANDLES_PER_PAIR
-    assert made.connections == 0
-
-
-def test_removed_member_leaves_nothing_behind_it() -> None:
-    """Its handles end for both. The others wait, as for any key without a member, and get it when it is back."""
-    made = bindings()
-    connection = connect(made)
-    made.bind(C, path(C), [A], 0.0)
-    changes = made.remove_member(A, 1.0)
-    assert changes.closed == [connection]
-    assert {member for member, _ in changes.concerned} >= {B}
-    assert made.peers_of(B) == made.peers_of(C) == (0, 1)
-    made.expire(c.BIND_LIFETIME_S - 0.1)
-    made.set_member(A, 10)
-    assert len(made.bind(A, path(A), [B, C], 2.0).opened) == 2
-    made.remove_member(A, 3.0)
-    made.expire(c.BIND_LIFETIME_S)
-    assert made.peers_of(B) == made.peers_of(C) == (0, 0)
 
 
 @pytest.mark.parametrize("key", [STRANGER, C], ids=["unknown", "absent"])

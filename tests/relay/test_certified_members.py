@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
-
 from tests.relay.certified import LINK, CertifiedRelay
 from uavlinkd.authority.certificates import MemberRole
 from uavlinkd.authority.constants import (
@@ -11,7 +9,6 @@ from uavlinkd.authority.constants import (
     CERTIFICATES_PER_ANSWER,
     INTRODUCED_AGAIN_S,
     INTRODUCED_TRIES,
-    INTRODUCTIONS,
     WHO,
 )
 from uavlinkd.protocol import constants as c
@@ -114,15 +111,6 @@ def test_flood_of_questions_costs_only_its_sender() -> None:
     assert len(one.learnt) == CERTIFICATES.burst + CERTIFICATES.per_s
 
 
-def test_certificates_to_one_member_have_a_limit() -> None:
-    """A question that the rest of the budget cannot answer is counted, and has no part of an answer."""
-    relay = CertifiedRelay()
-    one, _ = relay.join(1, 2)
-    relay.service.introductions._members[one.key].certificates.set_burst(0.5)
-    assert one.ask(VEHICLE) == []
-    assert list(relay.service.count_drops()) == [(DropReason.RECORD_OVER_LIMIT, "m1", 1)]
-
-
 # Introductions.
 
 
@@ -219,25 +207,6 @@ def test_seekers_that_share_a_victim_share_its_budget() -> None:
     assert operator.learnt == [vehicle.key, other.key]
 
 
-@pytest.mark.long
-def test_introductions_to_one_member_have_a_limit() -> None:
-    """Those above it follow with renewed binds. Introductions to others have budgets of their own."""
-    relay = CertifiedRelay()
-    seekers = relay.join(*range(1, INTRODUCTIONS.burst + 11))
-    one, other = relay.join(250, 251, role=OPERATOR)
-    for seeker in seekers:
-        seeker.bind(one)
-    assert one.learnt == [seeker.key for seeker in seekers[: INTRODUCTIONS.burst]]
-    seekers[0].bind(other)
-    assert other.learnt == [seekers[0].key]
-    for first in range(0, INTRODUCTIONS.burst, c.KEYS_PER_BIND):
-        one.bind(*seekers[: INTRODUCTIONS.burst][first : first + c.KEYS_PER_BIND])
-    relay.pass_time(c.BIND_WAITING_S)
-    for seeker in reversed(seekers):
-        seeker.bind(one)
-    assert {seeker.key for seeker in seekers} == set(one.learnt)
-
-
 def test_memory_of_introductions_is_that_of_the_wishes() -> None:
     """When a wish ends, or its member, nothing is left."""
     relay = CertifiedRelay()
@@ -296,34 +265,6 @@ def test_only_members_by_certificate_take_part() -> None:
     relay.service.end(key, relay.now)
     assert key not in relay.service.introductions
     assert key in relay.service.members
-
-
-def test_bind_does_not_tell_who_is_a_member() -> None:
-    """Of a member by certificate that does not bind back, of an absent one, and of a key without a member."""
-    relay = CertifiedRelay()
-    vehicle, silent, absent = relay.join(1, 2, 3)
-    absent.close()
-    unknown = bytes([7]) * c.KEY_BYTES
-    vehicle.send(Bind((silent.key, absent.key, unknown)))
-    assert vehicle.handles == {silent.key: [0], absent.key: [0], unknown: [0]}
-    assert vehicle.learnt == []
-
-
-def test_stranger_learns_nothing() -> None:
-    """An initiation with another member's certificate, and records without a session, get no answer."""
-    relay = CertifiedRelay()
-    (vehicle,) = relay.join(1)
-    relay.members.clear()
-    before = relay.node.drops[DropReason.BAD_CERTIFICATE]
-    private = vehicle.private
-    thief = type(vehicle)(relay, 5, VEHICLE)
-    thief.certificate = vehicle.certificate
-    thief.restart()
-    relay.transmit(thief, thief.node.handle_timeout(relay.now))
-    relay.settle()
-    assert relay.outside == []
-    assert relay.node.drops[DropReason.BAD_CERTIFICATE] == before + 1
-    assert private != thief.private
 
 
 # Ends.

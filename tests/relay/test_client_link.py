@@ -247,11 +247,3 @@ def test_path_to_a_relay_is_never_relayed() -> None:
     paths.assign("vps", LTE, [7])
     paths.assign("vps", relayed(0, "vps", 7), [8])
     assert paths.wrap(ENVELOPE, relayed(0, "vps", 8)) is None
-
-
-def test_malformed_data_is_dropped_before_its_handle_is_looked_up() -> None:
-    """Nothing inside, and a relay inside a relay."""
-    paths = RelayHandles()
-    paths.assign("vps", LTE, [7])
-    for data in (wrap(7, b""), wrap(7, wrap(7, ENVELOPE)), b"\x50"):
-        assert paths.unwrap(0, data, LTE.address) is DropReason.RELAY_MALFORMED

@@ -249,17 +249,3 @@ def test_relay_that_ends_handles_renews_no_limit() -> None:
     links.clear()
     relays.do_housekeeping(now)
     assert relays.on_record(older, now) is DropReason.UNEXPECTED_RECORD
-
-
-def test_captured_member_cannot_make_a_peer_ask_without_end() -> None:
-    """A list each tenth of a second, each with other victims: the bucket of the core holds."""
-    network = Network()
-    search, pair = network.search["a"], network.pair
-    network.set_own(0.1)
-    sent = 0
-    for round_ in range(200):
-        now = 0.1 + round_ / 10
-        victims = tuple((f"203.0.113.{(8 * round_ + number) % 250}", 4000) for number in range(8))
-        search.on_record(RecordReceived(pair.a.peer, pair.a.peer_at, Candidates(victims), round_), now)
-        sent += sum(not transmit.path.is_relayed for transmit in of(search.do_due(now), Transmit))
-    assert sent <= c.CANDIDATE_QUESTIONS + 20 * c.CANDIDATE_QUESTIONS_PER_S
