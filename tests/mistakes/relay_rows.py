@@ -28,7 +28,7 @@ RELAY_ROWS = (
     Mistake(
         "83",
         scenes.unknown_name,
-        signs=(Sign("here", "name_not_resolved", r"getent hosts"),),
+        signs=(Sign("here", "relay_not_answering", r"getent hosts"),),
     ),
     Mistake(
         "84",

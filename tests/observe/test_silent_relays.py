@@ -143,20 +143,24 @@ def test_a_peer_that_is_not_bound_may_not_reach_the_relay(member: Member, monkey
     """Nor may it be on."""
     relay = member.add_relay("one", FIRST)
     monkeypatch.setattr(relay, "state_for", lambda _: "waiting")
+    member.answers(relay, FIRST)
     assert member.only().text.startswith(
         "drone1 is not bound at the relay one: it is off, cannot reach the relay (UDP"
     )
 
 
 def test_known_reasons_do_not_look_like_a_firewall(member: Member) -> None:
-    """A refused handshake, and an error of this machine."""
+    """A refused handshake, an error of this machine, and a name without an address."""
     relay = member.add_relay("one", FIRST)
-    other = member.add_relay("two", SECOND)
+    member.add_relay("two", SECOND)
     refused = Dropped(DropReason.BAD_HANDSHAKE, relay.peer, Path(0, FIRST), 1, "")
     member.evidence.add_dropped(refused, 1.0)
     member.evidence.add_error("EPERM", SECOND, 1.0)
-    assert set(member.findings(LATER)) == {"wrong_psk", "firewall_here"}
-    assert other.peer.received_at is None
+    texts = [one.text for one in find(member.parts, member.history, LATER)]
+    assert "its response does not authenticate: the PSKs differ" in texts[0]
+    assert "firewall, or the service's unit, does not permit it (EPERM)" in texts[1]
+    member.sockets.unresolved = lambda name: {"b.test"}
+    assert "b.test has no address now" in find(member.parts, member.history, LATER)[0].text
 
 
 def test_a_peer_that_was_up_and_is_silent(member: Member, monkeypatch: pytest.MonkeyPatch) -> None:

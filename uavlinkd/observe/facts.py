@@ -88,14 +88,12 @@ class Moment:
 
     @cached_property
     def silent_relays(self) -> list[RelayLink]:
-        """The relays that do not answer, while no fact of this machine is known to be the reason."""
-        return [relay for relay in self.daemon.relay_links.values() if self._is_silent(relay)]
-
-    def _is_silent(self, relay: RelayLink) -> bool:
-        is_over = not relay.peer.is_up and self.now - relay.silent_since >= NOT_ANSWERING_S
-        certain = (self.seen_at(relay, error) for error in ("EPERM", *UNROUTED))
-        has_address = bool(relay.peer.paths.configured)  # by UDP or TLS
-        return is_over and has_address and self.refused_by(relay) is None and not any(certain)
+        """The relays that do not answer."""
+        return [
+            relay
+            for relay in self.daemon.relay_links.values()
+            if not relay.peer.is_up and self.now - relay.silent_since >= NOT_ANSWERING_S
+        ]
 
 
 class PartFacts:
@@ -145,33 +143,20 @@ class PeerFacts(PartFacts):
         return self.moment.current(self.daemon.evidence.seen_at(reason, ELSEWHERE, self.now), reason, self.link)
 
     @cached_property
-    def relay_problems(self) -> list[tuple[str, RelayLink]]:
-        """What is wrong with each relay of a peer that has no other path, while none of them is bound for it."""
+    def relays(self) -> list[RelayLink]:
+        """The relays of the peer."""
         by_name = self.daemon.relay_links
-        relays = [by_name[name] for name in self.link.config.relays if name in by_name]
-        if any(relay.peer.is_up and relay.state_for(self.link) == "bound" for relay in relays):
-            return []
-        problems = ((self._relay_problem(relay), relay) for relay in relays)
-        return [(problem, relay) for problem, relay in problems if problem]
+        return [by_name[name] for name in self.link.config.relays if name in by_name]
 
-    def _relay_problem(self, relay: RelayLink) -> str:
-        sockets, is_waiting = self.daemon.peer_sockets, relay.state_for(self.link) == "waiting"
-        may_fail = ("EPERM", *(() if sockets.absent_addresses() else UNROUTED))
-        if not relay.peer.is_up and any(self.moment.seen_at(relay, error) for error in may_fail):
-            return "not_sent"
-        if not self.link.is_overdue(self.now) or (self.link.is_closed and is_waiting):
-            return ""
-        if is_waiting:
-            return "not_bound"
-        if sockets.unresolved(relay.name):
-            return "name_not_resolved"
-        if self.moment.refused_by(relay) is not None:
-            return "wrong_psk"
-        return "relay_not_answering" if relay in self.moment.silent_relays else ""
+    @property
+    def lacks_relay(self) -> bool:
+        """Whether a relay is silent and no other one forwards to the peer: that has a line of its own."""
+        return not self.is_bound and any(relay in self.moment.silent_relays for relay in self.relays)
 
-    def relays_with(self, problem: str) -> list[RelayLink]:
-        """The relays of the peer with this problem."""
-        return [relay for one, relay in self.relay_problems if one == problem]
+    @cached_property
+    def is_bound(self) -> bool:
+        """Whether a relay forwards to the peer."""
+        return any(relay.peer.is_up and relay.state_for(self.link) == "bound" for relay in self.relays)
 
 
 class EndpointFacts(PartFacts):

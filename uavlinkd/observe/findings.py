@@ -29,7 +29,7 @@ def find(daemon: DaemonParts, history: History, now: float) -> list[Finding]:
         findings += _present(table.OF_PEER, peer, Subject.PEER, link.name)
         rows = table.OF_PEER_UP if link.peer.is_up else table.OF_PEER_DOWN
         of_state = list(_present(rows, peer, Subject.PEER, link.name))
-        if not of_state and not link.peer.is_up:
+        if not (of_state or link.peer.is_up or peer.lacks_relay):
             of_state = list(_present(table.OF_PEER_SILENT, peer, Subject.PEER, link.name))
         findings += of_state
     configs = {config.name: config for config in daemon.config.endpoints}

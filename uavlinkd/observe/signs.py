@@ -9,11 +9,10 @@ that is safe if the evidence is forged: no remedy accepts a key, a name or an ad
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from uavlinkd.config.keys import encode_key
-from uavlinkd.daemon.evidence import ELSEWHERE, EVIDENCE_S, REPORTED, Sighting
+from uavlinkd.daemon.evidence import ELSEWHERE, EVIDENCE_S, REPORTED
 from uavlinkd.daemon.peer_link import PeerLink
 from uavlinkd.daemon.switch import Port
 from uavlinkd.observe.facts import UNROUTED, Fields, Moment, PeerFacts, at, details_at, hosts_of, listed
@@ -236,29 +235,42 @@ def revoked_but_pinned(peer: PeerFacts) -> Signs:
 # Relays.
 
 
-def spare_relay_silent(moment: Moment) -> Signs:
-    """Relays that are silent while no peer needs them."""
+def relay_silent(moment: Moment) -> Signs:
+    """Each relay that does not answer: a warning while no peer needs it."""
     needed = {name for link in moment.down for name in link.config.relays}
-    spare = (relay for relay in moment.silent_relays if relay.config.name not in needed)
-    return (_silent_relay(moment, relay) for relay in spare)
+    for relay in moment.silent_relays:
+        if relay.peer.paths.configured or moment.daemon.peer_sockets.unresolved(relay.name):
+            yield _silent_relay(moment, relay) | ({} if relay.config.name in needed else {"severity": "warning"})
 
 
-def relay_silent(peer: PeerFacts) -> Signs:
-    return (_silent_relay(peer.moment, relay) for relay in peer.relays_with("relay_not_answering"))
+def _by_udp(moment: Moment, relay: RelayLink) -> tuple[str, str]:
+    """Why a relay does not answer by UDP, and the remedy, if there is a certain one."""
+    if names := sorted(moment.daemon.peer_sockets.unresolved(relay.name)):
+        return f"{', '.join(names)} has no address now", f"see `getent hosts {names[0]}`"
+    for error in ("EPERM", *UNROUTED):
+        if moment.seen_at(relay, error) is not None:
+            return web_problem(error)
+    if moment.refused_by(relay) is not None:
+        return (
+            "its response does not authenticate: the PSKs differ, or only one end has one",
+            "give both ends the same psk_file; never remove a PSK: the message may be forged",
+        )
+    if (reported := moment.reported(relay)) is not None:
+        error, path = reported
+        return f"{shown(path.address)}: {meaning_of(error).partition(':')[0]} ({error}, ICMP)", ""
+    if relay.peer.received_at is not None:
+        return "it did before, so it is off, or UDP to it or back is blocked", ""
+    return "it is off, its address is wrong, a firewall drops UDP here or there, or keys or suites differ", ""
 
 
 def _silent_relay(moment: Moment, relay: RelayLink) -> Fields:
-    error = moment.reported(relay)
-    why = "it is off, its address is wrong, a firewall drops UDP here or there, or keys or suites differ"
-    if error is not None:
-        why = f"{shown(error[1].address)}: {meaning_of(error[0]).partition(':')[0]} ({error[0]}, ICMP)"
-    elif relay.peer.received_at is not None:
-        why = "it did before, so it is off, or UDP to it or back is blocked"
     states = {} if (tls := moment.daemon.tls) is None else tls.states(relay.config.addresses)
     problems = {url: web_problem("silent" if state == CONNECTED else state) for url, state in states.items()}
     reasons = [f"by TLS ({url}) {what}" for url, (what, _) in problems.items()]
-    reasons += [f"by UDP {why}" if problems else why] if hosts_of(relay) else []
-    remedies = dict.fromkeys(remedy for _, remedy in problems.values() if remedy)
+    why, advice = _by_udp(moment, relay)
+    if hosts_of(relay) or not problems:
+        reasons.append(f"by UDP {why}" if problems else why)
+    remedies = dict.fromkeys(remedy for remedy in (advice, *(remedy for _, remedy in problems.values())) if remedy)
     return {
         "relay": titled("relay", relay.config.name),
         "name": relay.config.name,
@@ -269,7 +281,11 @@ def _silent_relay(moment: Moment, relay: RelayLink) -> Fields:
 
 
 def not_bound(peer: PeerFacts) -> Signs:
-    for relay in peer.relays_with("not_bound"):
+    if not peer.link.is_overdue(peer.now) or peer.link.is_closed or peer.is_bound:
+        return
+    for relay in peer.relays:
+        if not relay.peer.is_up or relay.state_for(peer.link) != "waiting":
+            continue
         name = relay.config.name
         advice = (
             f"compare both public_key with `uavlinkd pubkey`; write a [[relay]] for {name} into its file, and a"
@@ -284,20 +300,13 @@ def not_bound(peer: PeerFacts) -> Signs:
 
 
 def name_not_resolved(peer: PeerFacts) -> Signs:
-    relays = (relay.name for relay in peer.relays_with("name_not_resolved"))
-    for owner in (peer.name, *relays):
-        if names := sorted(peer.daemon.peer_sockets.unresolved(owner)):
-            yield {"names": ", ".join(names), "first": names[0]}
-
-
-def _sending(peer: PeerFacts) -> list[Callable[[str], Sighting | None]]:
-    """Where to look for errors of sending: the peer, and the relays to which nothing could be sent."""
-    return [peer.seen, *(partial(peer.moment.seen_at, relay) for relay in peer.relays_with("not_sent"))]
+    if names := sorted(peer.daemon.peer_sockets.unresolved(peer.name)):
+        yield {"names": ", ".join(names), "first": names[0]}
 
 
 def firewall_here(peer: PeerFacts) -> Signs:
-    sightings = (seen("EPERM") for seen in _sending(peer))
-    return ({"at": at(sighting)} for sighting in sightings if sighting is not None)
+    if (sighting := peer.seen("EPERM")) is not None:
+        yield {"at": at(sighting)}
 
 
 def no_route(peer: PeerFacts) -> Signs:
@@ -309,10 +318,9 @@ def no_route(peer: PeerFacts) -> Signs:
             advice = f"add {listen[0].wildcard(of_other_version=True)} to listen"
         yield {"at": peer.addresses, "why": "no socket of its address family", "advice": advice}
     if not sockets.absent_addresses():
-        for seen in _sending(peer):
-            errors = ((error, sighting) for error in UNROUTED if (sighting := seen(error)) is not None)
-            if (first := next(errors, None)) is not None:
-                yield {"at": at(first[1]), "why": first[0], "advice": meaning_of(first[0])}
+        errors = ((error, sighting) for error in UNROUTED if (sighting := peer.seen(error)) is not None)
+        if (first := next(errors, None)) is not None:
+            yield {"at": at(first[1]), "why": first[0], "advice": meaning_of(first[0])}
 
 
 # Hints: anything here may be forged.
@@ -348,12 +356,9 @@ def other_version(peer: PeerFacts) -> Signs:
 
 
 def wrong_psk(peer: PeerFacts) -> Signs:
-    """Responses of the peer, and of its relays, that this end refuses."""
+    """Responses of the peer that this end refuses."""
     if (sighting := peer.seen(DropReason.BAD_HANDSHAKE)) is not None:
         yield {"sender": at(sighting)}
-    for relay in peer.relays_with("wrong_psk"):
-        if (refused := peer.moment.refused_by(relay)) is not None:
-            yield {"sender": f"the {titled('relay', relay.config.name)} at {at(refused)}"}
 
 
 def no_common_suite(peer: PeerFacts) -> Signs:

@@ -50,13 +50,6 @@ _TWO_MACHINES: Final = (
     " only if a second machine has it: an attacker that holds handshakes back until a restart, or a captured"
     " peer, can also cause this",
 )
-_RELAY_SILENT: Final = (
-    "the {relay} does not answer at {addresses}: {why}",
-    "{advice}run `uavlinkd status` at {name}: it names the cause if datagrams arrive there; else start it, compare"
-    " its address, and open its firewall. `uavlinkd pubkey` there must print the public_key of the [[relay]] here,"
-    " and this daemon must be a member there",
-)
-
 OF_DAEMON: Final = (
     Row(
         *("own_key_elsewhere", SECURITY, signs.own_key_elsewhere),
@@ -144,7 +137,14 @@ OF_DAEMON: Final = (
         " reload` here: a key that arrives proves nothing. Of a fleet, `uavlinkd fleet list` shows whose key it is:"
         " let a member of yours run `uavlinkd enroll` again, and leave a revoked one out",
     ),
-    Row("relay_not_answering", WARNING, signs.spare_relay_silent, *_RELAY_SILENT),
+    Row(
+        *("relay_not_answering", FAULT, signs.relay_silent),
+        "the {relay} does not answer at {addresses}: {why}",
+        "{advice}run `uavlinkd status` at {name}: it names the cause if datagrams arrive there; else start it,"
+        " compare its address, and open its firewall. `uavlinkd pubkey` there must print the public_key of the"
+        " [[relay]] here, and this daemon must be a member there",
+        Exit.FAILED,
+    ),
     Row(
         *("line_noise", WARNING, signs.line_noise),
         "on the serial network {network}, {noise} of {pieces} pieces of the last 10 s are damaged",
@@ -267,7 +267,6 @@ OF_PEER_DOWN: Final = (
         " does not use it, or keys differ",
         "start {who}; `uavlinkd status` there and at the relay names the cause; {advice}",
     ),
-    _down("relay_not_answering", FAULT, signs.relay_silent, *_RELAY_SILENT),
     _down(
         *("wrong_key_here", FAULT, signs.wrong_key_here),
         "a sender uses {keys}, which this file does not have",
