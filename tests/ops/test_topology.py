@@ -88,7 +88,7 @@ def test_open_endpoint_is_marked_in_rows_of_one_line(tmp_path: Path) -> None:
     assert _line(printed, "autopilot").split() == ["autopilot", url, "no", "no", "wire"]
     assert _line(printed, "tablet").endswith("THE NETWORK")
     assert [line[9:] for line in printed.splitlines() if line.startswith("warning: ")] == list(config.warnings)
-    assert 'warning: endpoint "tablet": it listens beyond loopback' in printed
+    assert 'warning: endpoint "tablet": plain MAVLink leaves this machine' in printed
     assert max(map(len, printed.partition("Policy of")[2].partition("warning:")[0].splitlines())) <= 80
 
 
