@@ -64,40 +64,6 @@ def test_copies_by_two_routes_pass_once_for_each_sending() -> None:
     assert not r.route(command(), "radio", late + 0.99 * ROUTES_DIFFER_S)
 
 
-@pytest.mark.parametrize("delay", [0.001, 0.3, 1.5, 0.99 * REMEMBERED_S])
-@pytest.mark.parametrize("origin", ["a", "b", "other", "peer"])
-def test_frame_does_not_travel_in_a_circle(delay: float, origin: str) -> None:
-    """A client copies between two endpoints: a broadcast passes once, whoever sends it, also if nothing else does."""
-    world = World(router("a", "b", "other"))
-    world.bridges += [Bridge("a", "b", delay), Bridge("b", "a", delay)]
-    world.send(beat(b"x"), origin)
-    world.run()
-    assert set(world.delivered.values()) == {1}
-    circles = world.router.sendings.circles
-    assert circles
-    assert all(port in "ab" for port in circles)
-
-
-def test_bridge_that_doubles_each_frame_causes_no_storm() -> None:
-    """A frame of the bridge itself, whose copies return one after the other."""
-    world = World(router("a1", "b1"))
-    ways = [("a1", "b1"), ("b1", "a1")]
-    world.bridges += [Bridge(*way, delay) for way in ways for delay in (0.001, 0.003, 0.009)]
-    world.send(beat(b"x"), "b1")
-    world.run()
-    assert set(world.delivered.values()) == {1}
-
-
-def test_autopilot_joined_by_peer_and_radio_is_no_circle() -> None:
-    """The peer's frame goes out of the radio to its own sender, which forwards it to the peer's end."""
-    world = World(router("radio", "pilot"))
-    world.bridges.append(Bridge("radio", "peer", 0.01))
-    world.send(beat(b"1"), "radio")
-    world.send(beat(b"2"), "peer")
-    world.run()
-    assert world.delivered == {(b"1", "peer"): 1, (b"1", "pilot"): 1, (b"2", "radio"): 1, (b"2", "pilot"): 1}
-
-
 def test_client_that_repeats_a_broadcast_loses_one() -> None:
     """Its first repetition looks like a return. The second one shows that none was one: all further ones pass."""
     r = router("a", "b")

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from functools import partial
 from itertools import permutations
 
-import pytest
-
 from tests.network.attackers import Recorder
-from tests.network.network import Drone, Network, share_a_session
+from tests.network.network import Drone, Network
 from uavlinkd.lab.mitm.radio import RadioSettings
 from uavlinkd.protocol.drops import DropReason
 from uavlinkd.protocol.settings import Link, Timers
@@ -68,25 +65,3 @@ def test_replay_storm_delivers_nothing_twice_and_leaves_the_links_as_they_are() 
             # An old envelope from the address of a peer is a late copy, from any other address a replay.
             assert copies[DropReason.REPLAYED] > 5
             assert copies[DropReason.LATE_COPY] > 5
-
-
-@pytest.mark.parametrize(
-    "knows", ["both", *(pytest.param(knows, marks=pytest.mark.long) for knows in ("restarted", "other"))]
-)
-def test_link_comes_back_after_a_restart_amid_a_replay_storm(knows: str) -> None:
-    """The restarted drone remembers no initiation; hundreds of old ones do not block its link."""
-    with Network(f"storm and restart {knows}", RadioSettings(delay_s=0.02)) as network:
-        a, b = network.pair(FAST_REKEY, a_knows=knows != "other", b_knows=knows != "restarted")
-        network.talk(a, b)
-        recorder = Recorder(network)
-        network.run(30)
-        initiations = [datagram for datagram in recorder.recorded if datagram[0][0] == 1]
-        assert len(initiations) >= 15
-        begin = network.now
-        a.start(0.0)
-        recorder.recorded = initiations * 4 + recorder.recorded[-1000:]
-        _storm(network, recorder, per_s=200, duration_s=10)
-        network.run_until(partial(share_a_session, a, b), within_s=3)
-        network.run(begin + 10 - network.now)
-        for flow in (network.flow(a, b), network.flow(b, a)):
-            assert not flow.lost(begin + 3, network.now - 0.1), f"{flow.sender} to {flow.receiver}"

@@ -39,37 +39,6 @@ def test_link_is_back_after_a_restart_without_state(who_knows: str, delay_s: flo
             _assert_both_hear_within(network, a, b, BACK_WITHIN_S)
 
 
-@pytest.mark.parametrize("gap_s", [0.0, 0.4, 2.5])
-@pytest.mark.parametrize("a_alone_knows", [True, False])
-def test_link_is_back_after_both_restart(a_alone_knows: bool, gap_s: float) -> None:
-    """Both ends restart, together or one after the other: frames cross again within two seconds of the last."""
-    for seed in range(2):
-        with Network(f"both restart {a_alone_knows} {gap_s} {seed}", RadioSettings(delay_s=0.1)) as network:
-            a, b = network.linked(b_knows=not a_alone_knows)
-            a.start(0.0)
-            network.run(gap_s)
-            b.start(0.0)
-            _assert_both_hear_within(network, a, b, BACK_WITHIN_S)
-
-
-def test_late_confirmation_from_before_a_restart_does_not_pull_traffic_back() -> None:
-    """A confirmation delayed past the restart of its sender makes an older session of equal rank: it is not used."""
-    with Network("late confirmation", RadioSettings(delay_s=0.05)) as network:
-        a, b = network.pair(b_knows=False)
-        network.run(0.09)  # the response is in flight
-        network.set_radio(RadioSettings(delay_s=2.0))
-        network.run_until(lambda: a.session(b) is not None, within_s=1)
-        network.set_radio(RadioSettings(delay_s=0.05))
-        a.start(0.0)
-        network.talk(a, b)
-        network.run_until(lambda: share_a_session(a, b), within_s=1)
-        begin = network.now
-        network.run(4)
-        assert b.peer(a).traffic.handshakes == 2  # the late one came
-        assert share_a_session(a, b)
-        assert not network.flow(b, a).lost(begin, network.now - 0.1)
-
-
 STALE: tuple[Address, ...] = (("192.0.2.1", 5790), ("192.0.2.2", 5790), ("192.0.2.3", 5790))
 
 
