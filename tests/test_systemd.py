@@ -45,7 +45,7 @@ def test_unit_has_nothing_wrong(tmp_path: Path, name: str) -> None:
     units.mkdir(parents=True)
     instance = name.replace("@", "@drone0")
     shutil.copy(UNITS / name, units / instance)
-    for executable in ("opt/uavlinkd/bin/uavlinkd", "opt/uavlinkd/bin/uavlink-mitm", "bin/sh"):
+    for executable in ("opt/uavlinkd/bin/uavlinkd", "bin/sh"):
         (tmp_path / executable).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / executable).write_text("#!/bin/sh\n")
         (tmp_path / executable).chmod(0o755)

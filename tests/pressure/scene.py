@@ -7,7 +7,6 @@ import sys
 from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass, field
-from statistics import quantiles
 from time import monotonic
 
 from tests.kernel_queues import cpu_s
@@ -25,14 +24,13 @@ from uavlinkd.lab.child_processes import end_with_parent
 INTERVAL_S = 0.05
 LEAD_S = 1.0
 """Duration of the attack before the first frame is sent."""
-ALLOWED_S = 5.0
-"""In the percentiles a lost frame counts as this."""
 FAIR_CPU_S = 0.1
 """An attacked daemon spends at most this CPU time on others before it handles a frame: thirty turns. A daemon without
 turns would handle the whole queue first, which takes several times that."""
 FAIR_SHARE = 0.25
 """The least share of the frames of which this is to be seen. While another process does not run, frames wait too."""
 MORE_S = 30.0
+ALLOWED_S = 5.0
 ROUNDS = 8
 """How many times ``ALLOWED_S`` the measurement waits for frames that nothing explains as lost."""
 
@@ -91,36 +89,6 @@ class Seen:
     def lost(self) -> int:
         """Honest frames that did not arrive."""
         return self.sent - len(self.latencies_s)
-
-    def percentile_s(self, percent: int) -> float:
-        """A percentile of the latencies, with ``ALLOWED_S`` for lost frames."""
-        # A frame in flight at the end of the measurement took longer than any that arrived.
-        latencies_s = [*self.latencies_s, *[ALLOWED_S] * self.lost]
-        return quantiles(latencies_s, n=100, method="inclusive")[percent - 1]
-
-    def line(self) -> str:
-        """A row of a Markdown table."""
-        p50, p95, p99 = (f"{self.percentile_s(latency) * 1e3:.1f} ms" for latency in (50, 95, 99))
-        status = f"{max(self.status_s) * 1e3:.0f} ms" if not self.unanswered else f"{self.unanswered} unanswered"
-        linked = (
-            ""
-            if not self.plan.with_latecomer
-            else "no"
-            if self.linked_after_s is None
-            else f"{self.linked_after_s:.2f} s"
-        )
-        worst = ", ".join(f"{name} {count}" for name, count in self.drops.most_common(3))
-        cells = (
-            *(self.plan.name, f"{len(self.latencies_s)} of {self.sent}", p50, p95, p99, status, linked),
-            *(f"{self.cpu_share:.1%}", worst),
-        )
-        return f"| {' | '.join(cells)} |"
-
-
-HEADER = (
-    "| attack | frames that arrived | p50 | p95 | p99 | slowest `status` | a known peer links in | CPU | dropped |\n"
-    "|---|--:|--:|--:|--:|--:|--:|--:|---|"
-)
 
 
 async def watch(stage: Stage, plan: Plan, seconds: float, launcher: tuple[str, ...] = ()) -> Seen:

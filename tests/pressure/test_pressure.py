@@ -54,8 +54,8 @@ async def test_other_peers_lose_nothing(name: str) -> None:
         is_busy = stopwatch.calm_s < stopwatch.elapsed_s / 2
 
     # A busy machine delays frames by seconds: some are too old then, and not every such loss has a counter.
-    assert seen.lost <= max(seen.lost_to_waiting, seen.sent // 2 if is_busy else 0), seen.line()
-    assert seen.soon >= FAIR_SHARE * seen.sent > 0, seen.line()
+    assert seen.lost <= max(seen.lost_to_waiting, seen.sent // 2 if is_busy else 0), seen
+    assert seen.soon >= FAIR_SHARE * seen.sent > 0, seen
     assert seen.unanswered == 0
     assert (seen.linked_after_s is not None) == plan.with_latecomer
     assert reasons <= seen.drops.keys()

@@ -57,19 +57,6 @@ def test_bursts_have_their_length_and_share() -> None:
     assert radio.outcomes[Outcome.LOST_IN_BURST] == sum(lengths)
 
 
-def test_delay_is_exact_and_jitter_even() -> None:
-    """Each datagram takes the delay plus a jitter, whose mean is half of its maximum."""
-    radio = Radio(RadioSettings(delay_s=0.2, jitter_s=0.1), Random(6))
-    took = {datagram: moment for moment, datagram in _play(radio, _numbered(N))}
-    times = [took[datagram] - number * 0.01 for number, datagram in enumerate(_numbered(N))]
-    assert len(times) == N
-    assert min(times) >= 0.2 - 1e-9
-    assert max(times) <= 0.3 + 1e-9
-    assert abs(sum(times) / N - 0.25) < 4 * (0.1 / math.sqrt(12)) / math.sqrt(N)
-    quarters = Counter(int((seconds - 0.2) / 0.025) for seconds in times)
-    assert all(abs(quarters[quarter] - N / 4) < 4 * math.sqrt(N * 3 / 16) for quarter in range(4))
-
-
 def test_bandwidth_spaces_datagrams_and_the_queue_drops_its_tail() -> None:
     """A datagram takes its bits' time; what finds no room in the queue is dropped, what was queued is not."""
     settings = RadioSettings(bits_per_s=8000, overhead_bytes=28, queue_bytes=300, delay_s=0.5)
