@@ -133,27 +133,3 @@ async def test_fault_in_the_daemon_is_logged_and_answered(path: Path) -> None:
             await asyncio.to_thread(ask, path, request)
     assert [type(error) for error in logged] == [KeyError, OSError]
     await server.stop()
-
-
-async def test_answer_may_take_long(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With `on_waiting`, neither side times out, and the client is called after each wait."""
-    monkeypatch.setattr(control, "REQUEST_TIMEOUT_S", 0.05)
-    waited = 0
-    release = asyncio.Event()
-    loop = asyncio.get_running_loop()
-
-    async def answer(_: str) -> control.Answer:
-        await release.wait()
-        return {"problems": []}
-
-    def on_waiting() -> None:
-        nonlocal waited
-        waited += 1
-        if waited == 5:
-            loop.call_soon_threadsafe(release.set)
-
-    server = ControlServer(path, answer)
-    await server.start()
-    assert await asyncio.to_thread(ask, path, "reload", 0.05, on_waiting) == {"problems": []}
-    assert waited >= 5
-    await server.stop()

@@ -160,9 +160,9 @@ async def test_reloads_are_made_one_after_the_other(stage: Stage) -> None:
     a.config_file.unlink()
     os.mkfifo(a.config_file)
     socket = a.folder / "control.sock"
-    first = asyncio.create_task(asyncio.to_thread(ask, socket, "reload", 0.5, lambda: None))
+    first = asyncio.create_task(asyncio.to_thread(ask, socket, "reload", PATIENCE_S))
     await write_to(a.config_file, to_toml({**a.config, "peer": []}), before_the_end=a)
-    second = asyncio.create_task(asyncio.to_thread(ask, socket, "reload", 0.5, lambda: None))
+    second = asyncio.create_task(asyncio.to_thread(ask, socket, "reload", PATIENCE_S))
     assert await first == {"problems": [], "name": a.name}
     assert (await a.status())["peers"] == {}
     await write_to(a.config_file, to_toml({**a.config, "peer": peers}))

@@ -68,10 +68,6 @@ class Moment:
         """Evidence at an address of a relay since that went silent."""
         return self.current(self.daemon.evidence.seen_at_relay(kind, relay, self.now), kind, relay)
 
-    def refused_by(self, relay: RelayLink) -> Sighting | None:
-        """A response of a relay that does not authenticate."""
-        return self.daemon.evidence.seen_at(DropReason.BAD_HANDSHAKE, ("relay", relay.config.name), self.now)
-
     def reported_at(self, path: Path) -> str:
         """The error that ICMP messages report about an address now; empty for none."""
         evidence, place = self.daemon.evidence, ("address", path.address)

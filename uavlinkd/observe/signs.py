@@ -250,11 +250,6 @@ def _by_udp(moment: Moment, relay: RelayLink) -> tuple[str, str]:
     for error in ("EPERM", *UNROUTED):
         if moment.seen_at(relay, error) is not None:
             return web_problem(error)
-    if moment.refused_by(relay) is not None:
-        return (
-            "its response does not authenticate: the PSKs differ, or only one end has one",
-            "give both ends the same psk_file; never remove a PSK: the message may be forged",
-        )
     if (reported := moment.reported(relay)) is not None:
         error, path = reported
         return f"{shown(path.address)}: {meaning_of(error).partition(':')[0]} ({error}, ICMP)", ""

@@ -175,13 +175,10 @@ def _watch(sockets: Sequence[Path]) -> int:
 
 
 def _reload(options: argparse.Namespace) -> int:
-    from uavlinkd.ops.control import ask
-
-    def report_wait() -> None:
-        print("the daemon has not answered yet: it reads its file, or is busy. Still waiting", file=sys.stderr)
+    from uavlinkd.ops.control import RELOAD_TIMEOUT_S, ask
 
     socket = control_socket(options)
-    answer = ask(socket, "reload", on_waiting=report_wait)
+    answer = ask(socket, "reload", timeout_s=RELOAD_TIMEOUT_S)
     with _of_this_version():
         problems = "\n".join(answer["problems"])
         name = str(answer.get("name", socket))

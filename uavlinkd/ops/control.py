@@ -27,6 +27,8 @@ FAILED_INSIDE = (
 )
 REQUEST_TIMEOUT_S = 5.0
 """Limit for sending the request, and for reading the answer. Making the answer has no limit."""
+RELOAD_TIMEOUT_S = 60.0
+"""Limit for the answer to a reload: the daemon reads its file, and names in it may be slow."""
 MAX_CONNECTIONS = 8
 RECEIVE_BYTES = 65536
 MAX_ANSWER_BYTES = 64 << 20  # a status of 4,000 peers has 15 MB
@@ -131,13 +133,11 @@ def ask(
     path: Path,
     request: str,
     timeout_s: float = REQUEST_TIMEOUT_S,
-    on_waiting: Callable[[], None] | None = None,
     *,
     for_terminal: bool = True,
 ) -> dict[str, Any]:
     """Send a request to the daemon that listens at ``path``, and return its answer.
 
-    With ``on_waiting`` there is no time limit: it is called after each ``timeout_s`` without an answer.
     ``for_terminal``: no text in the answer acts on a terminal.
     Raises ControlError if no daemon listens, it refuses the client or the request, or does not answer in time.
     """
@@ -146,7 +146,7 @@ def ask(
             sock.settimeout(timeout_s)
             sock.connect(str(path))
             sock.sendall(request.encode() + b"\n")
-            answer = json.loads(_read_answer(sock, on_waiting))
+            answer = json.loads(_read_answer(sock))
             if for_terminal:
                 answer = _without_controls(answer)
     except PermissionError:
@@ -178,19 +178,11 @@ def _without_controls(value: Any) -> Any:
     return [_without_controls(one) for one in value] if isinstance(value, list) else value
 
 
-def _read_answer(sock: socket.socket, on_waiting: Callable[[], None] | None) -> bytes:
-    """Read until the daemon closes the connection. Raises OSError if none arrives in time without ``on_waiting``."""
+def _read_answer(sock: socket.socket) -> bytes:
+    """Read until the daemon closes the connection. Raises OSError if none arrives in time."""
     answer = bytearray()
-    while True:
-        try:
-            data = sock.recv(RECEIVE_BYTES)
-        except TimeoutError:
-            if on_waiting is None:
-                raise
-            on_waiting()
-            continue
-        if not data:
-            return bytes(answer)
+    while data := sock.recv(RECEIVE_BYTES):
         answer += data
         if len(answer) > MAX_ANSWER_BYTES:
             raise ValueError
+    return bytes(answer)

@@ -75,12 +75,7 @@ ERROR_MEANINGS: Final[Mapping[str, str]] = {
     " write the address of one machine: this is a broadcast address",
     "EBUSY": "another process has the device: end it (`fuser -v DEVICE` names it), often ModemManager",
     "ENOTTY": "it is not a serial device: name one, such as /dev/ttyUSB0",
-    "ENOSPC": "no space is left on the disk: delete files, or set min_free_bytes lower",
-    "EDQUOT": "the user's quota on the disk is used up",
-    "EROFS": "the file system is mounted read-only: after an error, check it with fsck",
-    "ENOTDIR": "a part of the path is a file: correct the path",
-    "EISDIR": "the path is a folder: name a file",
-    "folder_in_use": "another daemon records there: give each daemon a folder of its own",
+    "EISDIR": "it is a folder: name a device, such as /dev/ttyUSB0",
     # Limits of the process.
     "EMFILE": "the daemon has no file descriptor left: raise LimitNOFILE in its unit",
     "ENFILE": "the machine has no file descriptor left",
