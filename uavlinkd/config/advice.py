@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from itertools import combinations
 
+from uavlinkd.config.keys import looks_private
 from uavlinkd.config.model import Config, EndpointConfig, PeerConfig
 from uavlinkd.io.url import EndpointKind
 from uavlinkd.mavlink.policy.settings import read_settings
+from uavlinkd.protocol.path import RELAY_HOST
 
 _READABLE = (
     "a link through a relay is not confidential: its owner cannot alter the frames, but can read them; write"
@@ -17,6 +19,7 @@ _READABLE = (
 
 def advice(config: Config) -> Iterator[str]:
     """Yield the warnings. One that holds for several peers or endpoints comes once."""
+    yield from _keys(config)
     about: dict[str, list[str]] = {}
     senders: list[PeerConfig | EndpointConfig] = [*config.peers, *config.endpoints]
     for one in senders:
@@ -34,6 +37,26 @@ def advice(config: Config) -> Iterator[str]:
             ' vehicle can change the others through this daemon; link them directly as "swarm-member" instead,'
             " or let each vehicle accept only the operator's system_ids"
         )
+
+
+def _keys(config: Config) -> Iterator[str]:
+    """Warn of keys that are probably in the wrong place: a person who pastes a private key exposes it."""
+    if not looks_private(config.private_key.reveal()):
+        yield (
+            "private_key_file holds a key without the form of a private key, perhaps a public key: make one with"
+            " `uavlinkd keygen`, unless software other than `uavlinkd` and `wg` made it"
+        )
+    owners = [("peer", peer.settings) for peer in config.peers]
+    owners += [("relay", relay.settings) for relay in config.relays if relay.peer is None]
+    owners += [("member", member.peer) for member in config.relay_server.members] if config.relay_server else []
+    for what, owner in owners:
+        if looks_private(owner.public_key):
+            yield (
+                f'{what} "{owner.name.removeprefix(RELAY_HOST)}": public_key has the form of a private key.'
+                " `uavlinkd keygen` makes no such public key, `wg` one of 16: compare it with what `uavlinkd pubkey"
+                f" FILE` prints on the {what}. If it is its private key, it is exposed: make a new one there with"
+                " `uavlinkd keygen`, and write here the public key that it prints"
+            )
 
 
 def _named(one: PeerConfig | EndpointConfig) -> str:
@@ -67,18 +90,19 @@ def _of_endpoint(endpoint: EndpointConfig) -> Iterator[str]:
 def _shared(senders: Sequence[PeerConfig | EndpointConfig]) -> Iterator[str]:
     """Warn of system ids and PSKs of two peers. A local client may be another component of a system."""
     for (one, systems), (other, others) in combinations([(sender, _systems(sender)) for sender in senders], 2):
-        names = f"{_named(one)} and {_named(other)}"
-        if isinstance(one, PeerConfig) and (both := sorted(systems & others)):
+        if not isinstance(one, PeerConfig):
+            return
+        if both := sorted(systems & others):
             yield (
-                f"{names} may send as the same system {', '.join(map(str, both))}: receivers cannot distinguish their"
-                " frames, and one can impersonate the other; unless one carries the other's frames, allow each system"
-                " for one of them"
+                f"{_named(one)} and {_named(other)} may send as the same system {', '.join(map(str, both))}:"
+                " receivers cannot distinguish their frames, and one can impersonate the other; unless one carries"
+                " the other's frames, allow each system for one of them"
             )
-        psks = [each.settings.psk for each in (one, other) if isinstance(each, PeerConfig)]
-        if len(psks) == 2 and psks[0] is not None and psks[0] == psks[1]:
+        psk = one.settings.psk
+        if psk is not None and isinstance(other, PeerConfig) and psk == other.settings.psk:
             yield (
-                f"{names} have the same PSK: an attacker that captures one of them has it for both; make one for each"
-                " pair with `uavlinkd psk`"
+                f"{_named(one)} and {_named(other)} have the same PSK: an attacker that captures one of them has it"
+                " for both; make one for each pair with `uavlinkd psk`"
             )
 
 

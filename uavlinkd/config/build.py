@@ -18,12 +18,12 @@ from uavlinkd.config.model import (
     EndpointConfig,
     FleetConfig,
     Log,
+    NetworkConfig,
     PeerConfig,
     PolicyData,
     RelayConfig,
     RelayServer,
 )
-from uavlinkd.config.network_rules import network_of
 from uavlinkd.config.schema import LINK, POLICY
 from uavlinkd.config.section import Values
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
@@ -46,6 +46,14 @@ _PEERS_OF_MEMBER: Final = 256
 """Members that one member may ask for."""
 _RETRIES_BEFORE_REJECT: Final = 2
 """The ends need time to make new keys before they drop the old ones."""
+USUAL_BAUD: Final = 57600  # the baud rate of SiK modems as they are sold
+USUAL_AIR_BITS_S: Final = 24_000
+"""What such a modem carries by radio, in both directions together, beside its own overhead and turn-around times."""
+SLOW_LINE_SHARE: Final = 0.4
+"""Of the baud rate of a slower line: what is assumed that its radio carries."""
+SENDING_SHARE: Final = 0.4
+"""The part of the radio's rate that each end uses. The rest is for collisions, turn-around times and noise."""
+_BITS_PER_BYTE: Final = 10  # on a wire, with start and stop bit
 # A policy's messages repeat a group, a message, a command or a number, so that a person can search for it.
 # Any other text may be a secret, or control a terminal, or have a million digits.
 _WORD = re.compile(r"[A-Za-z0-9_:. -]{1,32}|[A-Z][A-Z0-9_]{0,55}|command:[A-Z0-9_]{1,55}")
@@ -69,7 +77,7 @@ def build(file: File, states: Path) -> Config:
         relays_frames=file.one("routing").get("relay"),
         control_socket=file.folder / socket if socket else None,
         log=Log(**file.one("log").valid),
-        networks=tuple(map(network_of, file["network"])),
+        networks=tuple(map(_network, file["network"])),
         relay_server=_relay_server(file) if file.is_relay else None,
         relays=tuple(_relay(file, relay, fleet) for relay in file.used_relays),
         fleet=fleet,
@@ -134,6 +142,19 @@ def _contact_peers(file: File, fleet: FleetConfig) -> Iterable[PeerConfig]:
     for section in file["contact"]:
         if role_of(section) in fleet.policies:
             yield member_peer(fleet, section.get("public_key"), section.get("certificate").certificate)
+
+
+def _network(section: Values) -> NetworkConfig:
+    """The network. This end sends the least of its budget, its part of the radio's rate, and the line's rate."""
+    values = {key: section.get(key) for key in section.keys}
+    line, air_bits_s, limits = values["serial"], values["air_bits_s"] or 0, [values["budget_bits_s"]]
+    if line is not None:
+        usual = USUAL_AIR_BITS_S if line.baud >= USUAL_BAUD else int(SLOW_LINE_SHARE * line.baud)
+        air_bits_s = air_bits_s or usual
+        limits.append(8 * line.baud // _BITS_PER_BYTE)
+    limits.append(int(SENDING_SHARE * air_bits_s))
+    least = min((limit for limit in limits if limit), default=0)
+    return NetworkConfig(**{**values, "air_bits_s": air_bits_s, "budget_bits_s": least})
 
 
 def _endpoint(section: Values) -> EndpointConfig:

@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from uavlinkd.config import checks, key_rules
+from uavlinkd.config import checks
 from uavlinkd.config.advice import advice
 from uavlinkd.config.build import build
 from uavlinkd.config.file import File, example_of
@@ -60,7 +60,7 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
     file.raise_any()
     states = environ.get(STATES, "").partition(":")[0]
     config = build(file, Path(states) if states else file.folder)
-    return replace(config, warnings=(*key_rules.advice(config.private_key.reveal(), file.others), *advice(config)))
+    return replace(config, warnings=tuple(advice(config)))
 
 
 async def load_in_thread(path: Path, environ: Mapping[str, str]) -> Config:

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Final
 
 from uavlinkd.authority.certificates import Certificate, MemberRole
 from uavlinkd.config.model import Config, FleetConfig, PeerConfig, PolicyData
-from uavlinkd.config.relay_rules import MOST_MEMBERS
 from uavlinkd.mavlink.policy.roles import ROLES
 from uavlinkd.mavlink.policy.settings import read_settings
 from uavlinkd.protocol import constants as c
@@ -19,6 +18,7 @@ if TYPE_CHECKING:
     from uavlinkd.authority.trust import Pinned
     from uavlinkd.relay.forwarding import MemberSettings
 
+MOST_MEMBERS: Final = 4000  # each has up to three sessions, of 65,535 indices
 _VEHICLE: Final[PolicyData] = {"role": "vehicle"}
 DEFAULT_POLICIES: Final[Mapping[MemberRole, Mapping[MemberRole, PolicyData]]] = {
     MemberRole.RELAY: {},
