@@ -14,14 +14,16 @@ def main() -> int:
     """The command line."""
     parser = argparse.ArgumentParser(prog="python -m tests.bench.cost", description=__doc__)
     parser.add_argument("--python", default=sys.executable, help="the interpreter of the daemons")
+    parser.add_argument("--idle", type=float, default=0.0, metavar="S", help="count seconds without frames too")
     options = parser.parse_args()
     if missing := missing_tools():
         print(f"needs {', '.join(missing)}", file=sys.stderr)
         return 2
     with TemporaryDirectory() as folder:
-        costs = count(Path(folder), python=options.python)
+        costs = count(Path(folder), python=options.python, idle_s=options.idle)
     for side, cost in costs.items():
-        print(f"{side}: {cost.instructions:,} instructions, {cost.lines:,} cache lines a frame")
+        unit = "second" if side == "idle" else "frame"
+        print(f"{side}: {cost.instructions:,} instructions, {cost.lines:,} cache lines a {unit}")
     return 0
 
 

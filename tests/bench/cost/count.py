@@ -39,26 +39,31 @@ def missing_tools() -> list[str]:
     return tools or ([] if Path("/usr/include/valgrind/callgrind.h").exists() else ["valgrind/callgrind.h"])
 
 
-def count(folder: Path, *, python: str = sys.executable) -> dict[str, Cost]:
-    """Count what frames cost, by the side. The folder gets callgrind's files.
+def count(folder: Path, *, python: str = sys.executable, idle_s: float = 0.0) -> dict[str, Cost]:
+    """Count what frames cost, by the side, and ``idle``: what a second costs one of both without frames.
 
-    Raises RuntimeError: the daemons failed.
+    ``idle_s``: for so many seconds of the daemons' clock, which is slow. The folder gets callgrind's files. Raises
+    RuntimeError: the daemons failed.
     """
     library, out = folder / "counting.so", folder / "out"
     subprocess.run(["gcc", "-O2", "-shared", "-fPIC", "-o", library, SOURCE, "-ldl"], check=True)
     command = [*VALGRIND, f"--callgrind-out-file={out}", python, "-m", "tests.bench.cost.pair"]
     environment = {**os.environ, "LD_PRELOAD": str(library), "PYTHONPATH": str(ROOT)}
-    arguments = [str(library), str(FRAMES)]
+    arguments = [str(library), str(FRAMES), str(idle_s)]
     done = subprocess.run(
         [*command, *arguments], env=environment, cwd=folder, capture_output=True, text=True, check=False
     )
     if done.returncode:
         raise RuntimeError(done.stderr)
     dumps = [_read(folder / f"out.{number}") for number in range(1, 2 * FRAMES + 1)]
-    return {
+    costs = {
         side: Cost(*(round(median(values)) for values in zip(*dumps[at * FRAMES : (at + 1) * FRAMES], strict=True)))
         for at, side in enumerate(SIDES)
     }
+    if idle_s:
+        totals = _read(folder / f"out.{2 * FRAMES + 1}")
+        costs["idle"] = Cost(*(round(total / (2 * idle_s)) for total in totals))
+    return costs
 
 
 def _read(file: Path) -> tuple[int, int]:

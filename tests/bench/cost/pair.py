@@ -23,6 +23,8 @@ from uavlinkd.system.addresses import Address
 
 SIDES: Final = ("sending", "receiving")
 WARM_UP: Final = 60
+SETTLES_S: Final = 5.0
+"""Work of the first seconds without frames is not counted: it is done once."""
 
 
 class Loop(asyncio.SelectorEventLoop):
@@ -103,8 +105,8 @@ class Pair:
         self._counting.dump("frame")
 
 
-async def run(loop: Loop, counting: Counting, frames: int) -> None:
-    """Count each side."""
+async def run(loop: Loop, counting: Counting, frames: int, idle_s: float) -> None:
+    """Count each side, and then both while nothing is sent."""
     pair = Pair(loop, counting)
     await pair.start()
     await asyncio.sleep(0.2)
@@ -113,14 +115,20 @@ async def run(loop: Loop, counting: Counting, frames: int) -> None:
     await pair.carry(WARM_UP, "")
     for side in SIDES:
         await pair.carry(frames, side)
+    if idle_s:
+        await asyncio.sleep(SETTLES_S)
+        counting.toggle()
+        await asyncio.sleep(idle_s)
+        counting.toggle()
+        counting.dump("idle")
 
 
 def main() -> None:
-    """``pair LIBRARY FRAMES``."""
+    """``pair LIBRARY FRAMES IDLE_S``."""
     loop = Loop()
-    library, frames = sys.argv[1:]
+    library, frames, idle_s = sys.argv[1:]
     gc.disable()
-    loop.run_until_complete(run(loop, Counting(library), int(frames)))
+    loop.run_until_complete(run(loop, Counting(library), int(frames), float(idle_s)))
 
 
 if __name__ == "__main__":
