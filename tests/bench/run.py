@@ -25,8 +25,8 @@ class Plan:
     """The extent of the measurements. Times in seconds."""
 
     rounds: int = 5
-    rates: tuple[int, ...] = (1_000, 10_000)
-    seconds: tuple[float, ...] = (5.0, 3.0)
+    rates: tuple[int, ...] = (50, 100, 300, 1_000, 10_000)
+    seconds: tuple[float, ...] = (20.0, 12.0, 6.0, 5.0, 3.0)
     """For each rate."""
     step_s: float = 1.0
     """One try of the search for the highest rate; 0: it is not searched."""
@@ -36,7 +36,7 @@ class Plan:
 
 PATIENCE = 20
 """A contender has so many times 0.6 s to carry its first frame."""
-QUICK = Plan(rounds=1, seconds=(2.0, 2.0), step_s=0.0)
+QUICK = Plan(rounds=1, rates=(100, 1_000, 10_000), seconds=(6.0, 2.0, 2.0), step_s=0.0)
 
 
 @contextmanager

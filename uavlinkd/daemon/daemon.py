@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     from uavlinkd.relay.client_link import RelayLink
 
 HOUSEKEEPING_S = INTERVAL_S
+LOOKS_EVERY = 2
+"""So many of these intervals are between two looks for findings, which cost as much as all else that is done then."""
 """How often links are measured, and idle clients forgotten."""
 
 
@@ -55,6 +57,7 @@ class Daemon:
         self._notes = PilotNotes(self.parts.switch.router.addresses)
         self._housekeeping: asyncio.TimerHandle | None = None
         self._reporting: asyncio.Handle | None = None
+        self._seconds = 0
         self._control: ControlServer | None = None
         self._supervisor = Supervisor(os.environ, os.getpid())
         self._reload_lock = asyncio.Lock()
@@ -228,7 +231,9 @@ class Daemon:
         self.observer.sample(now)
         run(parts.local.do_housekeeping, radio_figures(links), now)
         run(parts.local.write_note, self._notes.next(links, now), now)
-        self._reporting = self._loop.call_soon(self._report, now)  # datagrams must not wait for all of it
+        self._seconds += 1
+        if self._seconds % LOOKS_EVERY == 0:
+            self._reporting = self._loop.call_soon(self._report, now)  # datagrams must not wait for all of it
 
     def _feed_watchdog(self, now: float) -> None:
         """Feed it unless work that waited a second ago still waits, and nothing of its kind was done meanwhile."""

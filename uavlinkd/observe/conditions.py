@@ -104,7 +104,7 @@ class Conditions(Generic[K]):
         self._begin(key, condition, now)
 
     def check(self, now: float) -> None:
-        """Write the lines that are due. Call it about once a second."""
+        """Write the lines that are due. Call it every second or two."""
         # What begins is more urgent than what has ended.
         for key, condition in sorted(self._open.items(), key=lambda item: item[1].is_logged):
             if now - condition.seen_at >= condition.quiet_s:

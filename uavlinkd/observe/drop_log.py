@@ -99,7 +99,7 @@ class DropLog:
                 self._log.info(key[0], **self._facts(key), **omitted)
 
     def check(self, now: float) -> None:
-        """Read the drops, and write the lines that are due. Call it about once a second."""
+        """Read the drops, and write the lines that are due. Call it every second or two."""
         self._read()
         self._conditions.check(now)
 

@@ -54,7 +54,7 @@ class EventLog:
         )
 
     def check(self, now: float) -> None:
-        """Write the lines that are due. Call it about once a second."""
+        """Write the lines that are due. Call it every second or two."""
         for name, state in list(self._omitted_states.items()):
             if (omitted := self._limits.take("peer", name, now)) is not None:
                 del self._omitted_states[name]
@@ -136,7 +136,7 @@ class EventLog:
             self._log.warning("daemon_paused", seconds=round(pause_s, 3), **omitted)
 
     def write_findings(self, findings: Iterable[Finding], now: float) -> None:
-        """Note the present findings. Call it about once a second."""
+        """Note the present findings. Call it every second or two."""
         present = {}
         for finding in findings:
             if finding.cause in _OTHER_EVENTS:

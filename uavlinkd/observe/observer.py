@@ -1,4 +1,4 @@
-"""All that watches a daemon: it reads the parts once a second, and when a client asks. No frame's path calls it."""
+"""All that watches a daemon: it reads counters once a second, looks for findings every two. No frame's path calls it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Observer:
         self.parts = parts
         self.history = History(now)
         self.findings: list[Finding] = []
-        """The findings of the last look, at most a second ago."""
+        """The findings of the last look, at most two seconds ago."""
         limits = LineLimits()
         self.drops = DropLog(log, parts.journal, limits)
         self.events = EventLog(log, limits, parts.peer_sockets.network_name)
