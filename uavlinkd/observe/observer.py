@@ -1,4 +1,4 @@
-"""All that watches a daemon: it reads counters once a second, looks for findings every two. No frame's path calls it."""
+"""All that watches a daemon. It reads counters each second, and looks for findings every two. No frame calls it."""
 
 from __future__ import annotations
 
