@@ -26,12 +26,12 @@ from uavlinkd.daemon.evidence import Evidence
 from uavlinkd.daemon.journal import DaemonJournal
 from uavlinkd.daemon.peer_names import REFRESH_S
 from uavlinkd.daemon.peer_sockets import PeerSockets
+from uavlinkd.io.resolver import LONGEST_WAIT_S, RELAXED_WAIT_S
 from uavlinkd.io.sockets import Presence
 from uavlinkd.protocol.path import Path, relayed
 from uavlinkd.protocol.relay_records import wrap
 from uavlinkd.relay.client_link import RelayHandles
 from uavlinkd.system.addresses import Address
-from uavlinkd.system.resolver import LONGEST_WAIT_S, RELAXED_WAIT_S
 from uavlinkd.system.stall import StallWatch
 
 

@@ -14,9 +14,8 @@ from structlog.testing import capture_logs
 
 from tests.io.clients import Recorder, address_of, frame, recorder, unused_address, write
 from tests.waiting import PATIENCE_S, Stopwatch, until
-from uavlinkd.io import tcp
+from uavlinkd.io import resolver, tcp
 from uavlinkd.io.tcp import TcpClient, TcpServer, tcp_listener
-from uavlinkd.system import resolver
 from uavlinkd.system.addresses import Address
 
 ANY_PORT = Address("127.0.0.1", 0)

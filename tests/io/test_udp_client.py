@@ -13,9 +13,9 @@ import pytest
 from tests.io.clients import Recorder, address_of, frame, heartbeat, write
 from tests.processes.udp import open_socket
 from tests.waiting import until
+from uavlinkd.io import resolver
 from uavlinkd.io.udp import ATTEMPT_S, AVOIDED_S, REMOTE_SILENT_S, UdpClient
 from uavlinkd.lab.sim.loopback_ports import free_port
-from uavlinkd.system import resolver
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic
 

@@ -13,8 +13,8 @@ import pytest
 from tests.tls.web_streams import Loopback
 from tests.waiting import until
 from uavlinkd.io import sockets
+from uavlinkd.io.resolver import Resolved
 from uavlinkd.system.addresses import Address
-from uavlinkd.system.resolver import Resolved
 from uavlinkd.system.tasks import Threads
 from uavlinkd.tls import connect as web_connect
 from uavlinkd.tls.channel import client_tls

@@ -11,8 +11,8 @@ from structlog.typing import FilteringBoundLogger
 
 from uavlinkd.config.model import PeerAddress
 from uavlinkd.daemon.features import Reachable
+from uavlinkd.io.resolver import LONGEST_WAIT_S, RELAXED_WAIT_S, Resolved, keep_resolving, numeric
 from uavlinkd.protocol.path import Path
-from uavlinkd.system.resolver import LONGEST_WAIT_S, RELAXED_WAIT_S, Resolved, keep_resolving, numeric
 from uavlinkd.system.tasks import keep_running
 
 REFRESH_S: Final = 300.0

@@ -21,6 +21,7 @@ from uavlinkd.daemon.networks import NetworkBudget, Networks, Receive
 from uavlinkd.daemon.peer_names import PeerNames
 from uavlinkd.io.ports import failure_name
 from uavlinkd.io.reader import PAUSE_S, Reader
+from uavlinkd.io.resolver import Resolved
 from uavlinkd.io.sockets import (
     BindError,
     ErrorReports,
@@ -36,7 +37,6 @@ from uavlinkd.protocol.path_measures import limit_at
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.guard import run
-from uavlinkd.system.resolver import Resolved
 from uavlinkd.system.stall import StallWatch
 
 _EPHEMERAL = (Address("0.0.0.0", 0), Address("::", 0))

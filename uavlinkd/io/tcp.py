@@ -15,11 +15,11 @@ from contextlib import suppress
 from secrets import SystemRandom
 
 from uavlinkd.io.ports import CLIENT_SILENT_S, CLIENTS_PER_ENDPOINT, PortHandler, failure_name
+from uavlinkd.io.resolver import resolve
 from uavlinkd.io.sockets import bind, connect_tcp, new_socket, set_options
 from uavlinkd.io.stream_endpoint import STALLED_S, StreamEndpoint
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic
-from uavlinkd.system.resolver import resolve
 from uavlinkd.system.stall import Backlog
 from uavlinkd.system.tasks import Threads, keep_running
 

@@ -27,6 +27,7 @@ from uavlinkd.io.ports import (
     failure_name,
 )
 from uavlinkd.io.reader import Datagrams, Reader
+from uavlinkd.io.resolver import LONGEST_WAIT_S, Resolved, keep_resolving
 from uavlinkd.io.sockets import BindError, ErrorReports, family_of, send_again, udp_socket
 from uavlinkd.mavlink.frames import Frame, StreamSplitter, parse_frames
 from uavlinkd.mavlink.policy.delivery import Source
@@ -34,7 +35,6 @@ from uavlinkd.protocol.path import SocketAddress, remote_of
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.guard import report
-from uavlinkd.system.resolver import LONGEST_WAIT_S, Resolved, keep_resolving
 from uavlinkd.system.stall import STALE
 from uavlinkd.system.tasks import keep_running
 

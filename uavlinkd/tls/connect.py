@@ -16,9 +16,9 @@ from websockets.exceptions import InvalidProxy, InvalidProxyMessage, InvalidProx
 from websockets.proxy import Proxy, get_proxy, parse_proxy
 from websockets.uri import WebSocketURI, parse_uri
 
+from uavlinkd.io.resolver import Query, Resolved, resolve
 from uavlinkd.io.sockets import connect_tcp
 from uavlinkd.system.addresses import Address
-from uavlinkd.system.resolver import Query, Resolved, resolve
 from uavlinkd.system.stall import StallWatch
 from uavlinkd.system.tasks import Threads
 from uavlinkd.tls.channel import client_tls

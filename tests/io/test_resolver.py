@@ -18,9 +18,9 @@ from structlog.testing import capture_logs
 
 from tests.needs import need
 from tests.waiting import until
-from uavlinkd.system import resolver
+from uavlinkd.io import resolver
+from uavlinkd.io.resolver import Resolved, keep_resolving, resolve
 from uavlinkd.system.addresses import Address
-from uavlinkd.system.resolver import Resolved, keep_resolving, resolve
 
 V4, V6 = socket.AF_INET, socket.AF_INET6
 Names = dict[str, list[str]]
