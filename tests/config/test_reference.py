@@ -45,8 +45,6 @@ def _default(key: Key) -> object:
     """A key's default as the page writes it."""
     if key.default is REQUIRED:
         return "required"
-    if isinstance(key.default, list):
-        return [suite.name for suite in key.default]
     return "off" if key.default is None else key.default
 
 

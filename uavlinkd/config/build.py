@@ -32,6 +32,7 @@ from uavlinkd.protocol import constants as c
 from uavlinkd.protocol import wire
 from uavlinkd.protocol.path import RELAY_HOST
 from uavlinkd.protocol.settings import Link, PeerSettings, Redundancy, Timers
+from uavlinkd.protocol.suites import SUITES_BY_NAME, Suite
 from uavlinkd.system.addresses import IPV6_UDP_BYTES
 
 if TYPE_CHECKING:
@@ -190,7 +191,7 @@ def _link(keys: Values) -> Link:
     timers = {key: keys.get(key) for key in same}
     least_s = timers["rekey_after_s"] + _RETRIES_BEFORE_REJECT * timers["retry_max_s"]
     return Link(
-        suites=tuple(keys.get("suites")),
+        suites=_suites(keys),
         confidential=keys.get("confidential"),
         tag_bytes=tag_bytes,
         max_envelope=keys.get("max_envelope_bytes"),
@@ -205,6 +206,10 @@ def _link(keys: Values) -> Link:
         idle_probe_s=keys.get("idle_probe_s"),
         verify_interval_s=verify_interval_s(keys.get("budget_bits_s"), tag_bytes),
     )
+
+
+def _suites(keys: Values) -> tuple[Suite, ...]:
+    return tuple(SUITES_BY_NAME[name] for name in keys.get("suites"))
 
 
 def _egress(keys: Values) -> EgressSettings:
@@ -260,7 +265,7 @@ def _leaf(value: Any) -> object:
 def _relay(file: File, section: Values, fleet: FleetConfig | None) -> RelayConfig:
     """A relay. It inherits the suites of ``[link]``."""
     is_contact = section.kind == "contact"
-    link = Link(tuple(file.one("link").get("suites")), timers=TIMERS, features=c.KNOWN_FEATURES & ~c.FEATURE_FLEET)
+    link = Link(_suites(file.one("link")), timers=TIMERS, features=c.KNOWN_FEATURES & ~c.FEATURE_FLEET)
     peer = with_same_key(section, file["peer"])
     if fleet is not None and is_contact and role_of(section) in fleet.policies:
         peer = section

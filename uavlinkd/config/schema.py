@@ -17,13 +17,13 @@ from uavlinkd.authority.certificates import LAST_SERIAL, parse_bulletin, parse_c
 from uavlinkd.config.keys import decode_key, is_canonical_public_key
 from uavlinkd.config.model import SERIAL, HttpsServer, PeerAddress
 from uavlinkd.config.section import Choice, Key, Keys, Kind, Number, anything, boolean, each, integer, text
-from uavlinkd.io.url import SerialUrl, parse_line, parse_url
+from uavlinkd.io.url import parse_line, parse_url
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.mavlink.policy.settings import KEYS as POLICY_KEYS
 from uavlinkd.protocol import constants as c
 from uavlinkd.protocol.crypto import AuthorityKey, is_usable_public_key
 from uavlinkd.protocol.drops import Drop
-from uavlinkd.protocol.suites import SUITES_BY_NAME, X25519, Suite
+from uavlinkd.protocol.suites import SUITES_BY_NAME, X25519
 from uavlinkd.system.addresses import Address, AddressError, parse_address, parse_place
 from uavlinkd.system.base64_text import from_base64
 
@@ -68,27 +68,6 @@ def _public_key(value: Any) -> bytes:
         problem = "is not a public key of X25519, but perhaps a private key, which must stay secret"
         raise ValueError(f"{problem}: {remedy}")
     return decoded
-
-
-def _suite(value: Any) -> Suite:
-    if (suite := SUITES_BY_NAME.get(text(value))) is None:
-        raise ValueError(f"is not a suite: write one of {', '.join(SUITES_BY_NAME)}")
-    return suite
-
-
-def _suites(value: Any) -> list[Suite]:
-    suites: list[Suite] = each(_suite)(value)
-    if not suites:
-        raise ValueError('must name a suite: write ["x25519"]')
-    return suites
-
-
-def _addresses(value: Any) -> list[PeerAddress]:
-    addresses: list[PeerAddress] = each(_peer_address)(value)
-    everywhere = {one.address for one in addresses if not one.network}
-    if any(one.network and one.address in everywhere for one in addresses):
-        raise ValueError("names an address with a network and without, which stands for every network: write one")
-    return addresses
 
 
 def _budget(value: Any) -> float:
@@ -174,10 +153,6 @@ def _certificate(data: bytes) -> HeldCertificate:
     return HeldCertificate(parse_certificate(data), data)
 
 
-def _line(value: Any) -> SerialUrl:
-    return parse_line(text(value))
-
-
 def _seconds(default: float, least: float, most: float) -> Key:
     return Key(Number(least, most), default)
 
@@ -188,7 +163,7 @@ _CERTIFICATE: Final = Key(_signed(_certificate, "a certificate"), written=_SIGNE
 _FRAME_ROLE: Final = Choice("vehicle", "operator", "observer")
 
 LINK: Final[Keys] = {
-    "suites": Key(_suites, [X25519], '["x25519"]'),
+    "suites": Key(each(Choice(*SUITES_BY_NAME), least=1), [X25519.name], '["x25519"]'),
     "confidential": Key(boolean, False),
     "tag_bits": Key(Choice(64, 96, 128), 128),
     "max_envelope_bytes": Key(integer(c.MIN_ENVELOPE_LIMIT, c.MAX_ENVELOPE_LIMIT), c.DEFAULT_ENVELOPE_LIMIT),
@@ -241,7 +216,7 @@ REPEATED: Final[dict[str, Keys]] = {
         "name": Key(_name, written='"lte"'),
         "interface": Key(_name, None, '"wwan0"'),
         "address": Key(_own_address, None, '"10.0.0.5"'),
-        "serial": Key(_line, None, '"/dev/ttyUSB0:57600"'),
+        "serial": Key(lambda value: parse_line(text(value)), None, '"/dev/ttyUSB0:57600"'),
         "air_bits_s": Key(integer(LEAST_BITS_S, 10_000_000), None, "24000"),
         "metered": Key(boolean, False),
         "budget_bits_s": Key(_budget, 0),
@@ -256,17 +231,17 @@ REPEATED: Final[dict[str, Keys]] = {
     "peer": {
         **_WITH_KEY,
         "psk_file": Key(_file_name, None, '"drone0-drone1.psk"'),
-        "addresses": Key(_addresses, [], '["10.13.0.2:5790"]'),
+        "addresses": Key(each(_peer_address), [], '["10.13.0.2:5790"]'),
         "relays": Key(each(_name), None, "[]"),
         **POLICY,
         **LINK,
     },
     "member": _WITH_KEY,
-    "relay": {**_WITH_KEY, "addresses": Key(_addresses, [], '["relay.example.org:5790"]')},
+    "relay": {**_WITH_KEY, "addresses": Key(each(_peer_address), [], '["relay.example.org:5790"]')},
     "contact": {
         "public_key": Key(_public_key, written=_SIGNED),
         "certificate": _CERTIFICATE,
-        "addresses": Key(_addresses, [], '["relay.example.org:5790"]'),
+        "addresses": Key(each(_peer_address), [], '["relay.example.org:5790"]'),
         "relays": Key(boolean, False),
     },
     "fleet_role": {"name": Key(_FRAME_ROLE, written='"operator"'), **POLICY},

@@ -69,8 +69,8 @@ class Choice:
         raise ValueError(f"must be {', '.join(most)} or {last}")
 
 
-def each(kind: Kind) -> Kind:
-    """The kind of a list of different values."""
+def each(kind: Kind, least: int = 0) -> Kind:
+    """The kind of a list of different values, at least so many."""
 
     def read_list(value: Any) -> list[Any]:
         if not isinstance(value, list):
@@ -85,6 +85,8 @@ def each(kind: Kind) -> Kind:
             raise ListError(messages)
         if len(set(values)) != len(values):
             raise ValueError("names one twice: write each once")
+        if len(values) < least:
+            raise ValueError("is empty")
         return values
 
     return read_list
