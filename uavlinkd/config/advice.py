@@ -7,8 +7,6 @@ from itertools import combinations
 
 from uavlinkd.config.keys import looks_private
 from uavlinkd.config.model import Config, EndpointConfig, PeerConfig
-from uavlinkd.io.url import EndpointKind
-from uavlinkd.mavlink.policy.settings import read_settings
 from uavlinkd.protocol.path import RELAY_HOST
 
 _READABLE = (
@@ -89,7 +87,7 @@ def _of_endpoint(endpoint: EndpointConfig) -> Iterator[str]:
 
 def _shared(senders: Sequence[PeerConfig | EndpointConfig]) -> Iterator[str]:
     """Warn of system ids and PSKs of two peers. A local client may be another component of a system."""
-    for (one, systems), (other, others) in combinations([(sender, _systems(sender)) for sender in senders], 2):
+    for (one, systems), (other, others) in combinations([(sender, sender.systems) for sender in senders], 2):
         if not isinstance(one, PeerConfig):
             return
         if both := sorted(systems & others):
@@ -104,15 +102,3 @@ def _shared(senders: Sequence[PeerConfig | EndpointConfig]) -> Iterator[str]:
                 f"{_named(one)} and {_named(other)} have the same PSK: an attacker that captures one of them has it"
                 " for both; make one for each pair with `uavlinkd psk`"
             )
-
-
-def _systems(one: PeerConfig | EndpointConfig) -> frozenset[int]:
-    """The systems that it may send as, if the file names them."""
-    return read_settings(one.policy, is_local=isinstance(one, EndpointConfig)).systems or frozenset()
-
-
-def exposure(endpoint: EndpointConfig) -> str:
-    """Where an endpoint can be reached from, in two or three words."""
-    if endpoint.url.kind is EndpointKind.SERIAL:
-        return "wire"
-    return "THE NETWORK" if endpoint.url.is_exposed else "this machine"

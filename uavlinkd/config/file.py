@@ -74,7 +74,7 @@ class File:
             self.add(values.at(place), message)
         for key in table:
             if key not in keys:
-                self.add(values.at(key if _BARE_KEY.fullmatch(key) else "…"), unknown_key(key, keys))
+                self.add(values.at(key if _BARE_KEY.fullmatch(key) else "…"), unknown_key(key, values.kind))
         return values
 
     @property
@@ -165,31 +165,29 @@ _KNOWN: dict[str, str] = {
         ("max_peers", "member_max_peers"),
         "was removed: delete the line: each member may ask a relay for 256 others",
     ),
+    "member.bits_s": "was removed: write member_bits_s in [relay_server], which is the limit of each member",
+    **dict.fromkeys(
+        ("relay.psk_file", "member.psk_file"),
+        "was removed: delete the line; against a later quantum computer, write a suite with ML-KEM in [link]",
+    ),
     "metrics": "was removed: delete [metrics]; `uavlinkd web` serves http://127.0.0.1:8790/metrics",
 }
 """The remedies for keys and sections of earlier versions, and for keys of WireGuard."""
 
 
-_REMOVED_OF_RELAYS = {
-    "bits_s": "write member_bits_s in [relay_server], which is the limit of each member",
-    "psk_file": "delete the line; against a later quantum computer, write a suite with ML-KEM in [link]",
-}
-"""The remedies for keys that only ``[[relay]]`` and ``[[member]]`` had in earlier versions."""
-
-
-def unknown_key(key: str, keys: Keys) -> str:
-    if keys in (SECTIONS["relay"], SECTIONS["member"]) and key in _REMOVED_OF_RELAYS:
-        return f"was removed: {_REMOVED_OF_RELAYS[key]}"
+def unknown_key(key: str, kind: str) -> str:
+    """The message for a key that the sections of a kind do not have."""
+    keys = SECTIONS.get(kind, TOP)
     plain = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|[ -]", "_", key).lower()
     if key in TITLES:
         return f"does not belong here: write {TITLES[key]}, a section of its own"
-    if plain in _KNOWN:
-        return _KNOWN[plain]
+    if remedy := _KNOWN.get(f"{kind}.{plain}") or _KNOWN.get(plain):
+        return remedy
     if places := [TITLES[section] for section, others in SECTIONS.items() if key in others]:
         return f"does not belong here: write it in {' or '.join(places)}"
     if key in TOP:
         return "does not belong here: write it at the top of the file, before the first section"
-    known = [*keys, *(TITLES if keys is TOP else ())]
+    known = [*keys, *(() if kind else TITLES)]
     if close := get_close_matches(plain, known, n=1, cutoff=0.7):
         return f"is not known: did you mean {TITLES.get(close[0], close[0])}?"
     return f"is not known here: the keys are {', '.join(known)}"

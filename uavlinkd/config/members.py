@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Final
 from uavlinkd.authority.certificates import Certificate, MemberRole
 from uavlinkd.config.model import Config, FleetConfig, PeerConfig, PolicyData
 from uavlinkd.mavlink.policy.roles import ROLES
-from uavlinkd.mavlink.policy.settings import read_settings
 from uavlinkd.protocol import constants as c
 from uavlinkd.protocol.settings import Link, PeerSettings
 
@@ -75,14 +74,9 @@ def reserved(config: Config, fleet: FleetConfig) -> Pinned:
     return Pinned(
         keys={one.public_key for one in all_reserved},
         names={one.name for one in all_reserved},
-        system_ids={number: peer.name for peer in pinned for number in _systems_of(peer)},
+        system_ids={number: peer.name for peer in pinned for number in peer.systems},
         denied=fleet.denied,
     )
-
-
-def _systems_of(peer: PeerConfig) -> frozenset[int]:
-    """The system ids that a peer of the configuration has alone: none if it may have any."""
-    return read_settings(peer.policy, is_local=False).systems or frozenset()
 
 
 def relay_member(fleet: FleetConfig, key: bytes, certificate: Certificate) -> MemberSettings:

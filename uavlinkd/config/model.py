@@ -12,6 +12,7 @@ from uavlinkd.authority.certificates import MemberRole
 from uavlinkd.io.url import EndpointUrl, SerialUrl
 from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.mavlink.policy.compilation import Policy
+from uavlinkd.mavlink.policy.settings import read_settings
 from uavlinkd.protocol.crypto import AuthorityKey, Secret
 from uavlinkd.protocol.path import RELAY_HOST, SERIAL_HOST
 from uavlinkd.protocol.settings import Link, PeerSettings
@@ -62,6 +63,11 @@ class EndpointConfig:
     policy: PolicyData = field(default_factory=dict)
     radio_status: bool = False
     status_text: bool = False
+
+    @property
+    def systems(self) -> frozenset[int]:
+        """The systems that its clients may send as, if the file names them."""
+        return read_settings(self.policy, is_local=True).systems or frozenset()
 
     def make_policy(self) -> Policy:
         """A new policy: its counters at zero, its rates unused."""
@@ -144,6 +150,11 @@ class PeerConfig:
     def is_called(self) -> bool:
         """Whether this daemon initiates to it: it has an address, or a relay."""
         return bool(self.addresses or self.relays)
+
+    @property
+    def systems(self) -> frozenset[int]:
+        """The systems that it may send as: empty if it may send as any."""
+        return read_settings(self.policy, is_local=False).systems or frozenset()
 
     def make_policy(self) -> Policy:
         return Policy(self.policy)

@@ -9,9 +9,9 @@ from typing import Final
 
 from uavlinkd.authority.certificates import parse_bulletin
 from uavlinkd.authority.enrolment import fingerprint_of, ids_of
-from uavlinkd.config.advice import exposure
 from uavlinkd.config.keys import encode_key, looks_private
 from uavlinkd.config.model import Config, EndpointConfig, FleetConfig, NetworkConfig, PeerConfig, PolicyData
+from uavlinkd.io.url import SerialUrl
 from uavlinkd.mavlink import dialect
 from uavlinkd.mavlink.policy.compilation import Policy, PolicyRow
 from uavlinkd.mavlink.policy.roles import ROLES
@@ -134,9 +134,16 @@ def _peer(peer: PeerConfig) -> Row:
     )
 
 
+def _exposure(endpoint: EndpointConfig) -> str:
+    """Where an endpoint can be reached from, in two or three words."""
+    if isinstance(endpoint.url, SerialUrl):
+        return "wire"
+    return "THE NETWORK" if endpoint.url.is_exposed else "this machine"
+
+
 def _endpoint(endpoint: EndpointConfig) -> Row:
     is_told = _yes(endpoint.radio_status), _yes(endpoint.status_text)
-    return endpoint.name, str(endpoint.url), *is_told, exposure(endpoint)
+    return endpoint.name, str(endpoint.url), *is_told, _exposure(endpoint)
 
 
 # Policies, for a review.
