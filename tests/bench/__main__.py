@@ -24,6 +24,7 @@ from uavlinkd.lab.evaluation.records import EvaluationError, Record, RecordWrite
 PAGE: Final = "RESULTS.md"
 SHOWN: Final[Mapping[str, Sequence[str]]] = {
     "rate": ("cpu_left_us", "cpu_right_us", "loss", "latencies_s", "rss_left", "rss_right", "wire_bytes_per_frame"),
+    "flight": ("rate", "cpu_left_us", "cpu_right_us", "loss", "latencies_s"),
     "highest": ("highest",),
 }
 """By the kind of a record, the values of which the page has the medians."""

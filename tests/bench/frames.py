@@ -7,7 +7,8 @@ what receives it on the same machine knows how long it took.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Sequence
+from array import array
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 from itertools import islice
@@ -45,6 +46,8 @@ class FrameSet:
     """Frames to carry, over and over, and where they are from."""
 
     frames: tuple[bytes, ...]
+    times_s: tuple[float, ...]
+    """When the vehicle sent each of them, from the first one on."""
     source: str
 
     @property
@@ -60,23 +63,24 @@ def load_frames(flight: Path = FLIGHT) -> FrameSet:
     Without what a ground station's daemon would not take from a vehicle, what the dialect does not have, and what is
     for one system alone: routers drop that until they have received a frame of the other.
     """
-    said: Iterable[bytes] = _simulated()
+    said: Iterable[tuple[float, bytes]] = _simulated()
     source = "a flight of `uavlinkd sim`, as no recorded one is there"
     if flight.exists():
-        said = (record.frame for record in read_tlog(flight))
+        said = ((record.time_us / 1e6, record.frame) for record in read_tlog(flight))
         source = f"{flight.name}: a recorded flight"
     frames = list(islice(_carried(said), MOST_FRAMES))
     whole = len(frames) - len(frames) % (PROBE_EVERY - 1)
-    mixed: list[bytes] = []
+    mixed: list[tuple[float, bytes]] = []
     for start in range(0, whole, PROBE_EVERY - 1):
-        mixed += [bytes(probe()), *frames[start : start + PROBE_EVERY - 1]]
-    return FrameSet(tuple(mixed), source)
+        mixed += [(frames[start][0], bytes(probe())), *frames[start : start + PROBE_EVERY - 1]]
+    began_at = mixed[0][0]
+    return FrameSet(tuple(raw for _, raw in mixed), tuple(at - began_at for at, _ in mixed), source)
 
 
-def _carried(said: Iterable[bytes]) -> Iterable[bytes]:
+def _carried(said: Iterable[tuple[float, bytes]]) -> Iterable[tuple[float, bytes]]:
     gate = Policy({"role": "vehicle", "system_ids": [SYSTEM]}).incoming
     passes = {message for message in MESSAGES if gate.decide(message, is_known=True) is None} - {PING}
-    return (raw for raw in said if _is_plain(raw) and message_of(raw) in passes and not _has_target(raw))
+    return ((at, raw) for at, raw in said if _is_plain(raw) and message_of(raw) in passes and not _has_target(raw))
 
 
 def _is_plain(raw: bytes) -> bool:
@@ -94,12 +98,12 @@ def message_of(raw: bytes) -> int:
     return int.from_bytes(raw[7:HEADER_BYTES], "little")
 
 
-def _simulated() -> Iterable[bytes]:
+def _simulated() -> Iterable[tuple[float, bytes]]:
     from uavlinkd.lab.sim.autopilot import Autopilot, AutopilotSettings
 
     autopilot = Autopilot(AutopilotSettings(system_id=SYSTEM))
     for tick in range(100_000):
-        yield from autopilot.advance(tick * 0.01)
+        yield from ((tick * 0.01, raw) for raw in autopilot.advance(tick * 0.01))
 
 
 def probe(system: int = SYSTEM) -> bytearray:
@@ -143,15 +147,19 @@ def length_at(datagram: bytes, offset: int) -> int:
     return 0
 
 
-def write_frames(path: Path, frames: Sequence[bytes]) -> None:
-    """For the generator: back to back; their headers say where each ends."""
-    path.write_bytes(b"".join(frames))
+def write_frames(path: Path, frames: FrameSet) -> None:
+    """For the generator: their times, and then the frames, back to back; their headers say where each ends."""
+    times = array("d", frames.times_s)
+    path.write_bytes(len(times).to_bytes(4, "little") + times.tobytes() + b"".join(frames.frames))
 
 
-def read_frames(path: Path) -> list[bytes]:
-    data, frames, offset = path.read_bytes(), [], 0
+def read_frames(path: Path) -> tuple[list[bytes], list[float]]:
+    """The frames, and when the vehicle sent each of them."""
+    content, frames, offset = path.read_bytes(), list[bytes](), 0
+    end = 4 + 8 * int.from_bytes(content[:4], "little")
+    times, data = array("d", content[4:end]), content[end:]
     while offset < len(data):
         size = length_at(data, offset)
         frames.append(data[offset : offset + size])
         offset += size
-    return frames
+    return frames, times.tolist()

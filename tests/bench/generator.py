@@ -1,4 +1,4 @@
-"""Sends frames at an even rate: a process of its own, whose work is not counted.
+"""Sends frames at an even rate, or when the vehicle sent them: a process of its own, whose work is not counted.
 
 It reads an order a line (JSON) from standard input, and answers each with a line: how many frames were sent, in what
 time, and how evenly. Each datagram has its own deadline on the monotonic clock; one whose deadline passed is sent at
@@ -13,12 +13,14 @@ import os
 import socket
 import sys
 import time
-from collections.abc import Sequence
+from bisect import bisect_left
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final, NamedTuple
 
 from tests.bench.frames import is_probe, read_frames, stamp
+from tests.bench.traffic import AS_RECORDED
 
 PR_SET_TIMERSLACK: Final = 29
 """Of prctl(2): by how much the kernel may let a sleep last longer. the default is 50 us."""
@@ -64,17 +66,17 @@ def pack(frames: Sequence[bytes], per_datagram: int) -> list[Datagram]:
 
 
 class Pace:
-    """Deadlines at an even distance, and how well they were kept."""
+    """Deadlines of datagrams, and how well they were kept. ``due_ns``: those, from the beginning on."""
 
-    def __init__(self, per_s: float) -> None:
-        self._interval_ns = 1e9 / per_s
+    def __init__(self, due_ns: Callable[[int], int]) -> None:
+        self._due_ns = due_ns
         self._began_ns = time.monotonic_ns() + START_NS
         self._late_ns: list[int] = []
         self._together = self._together_most = 0
 
     def wait(self, number: int) -> None:
         """Until the deadline of the datagram of this number; not at all where it has passed."""
-        due = self._began_ns + int(number * self._interval_ns)
+        due = self._began_ns + self._due_ns(number)
         now = time.monotonic_ns()
         if now < due:
             time.sleep((due - now) / 1e9)
@@ -92,13 +94,11 @@ class Pace:
         return Sent(frames, refused, took, p50, p99, most, self._together_most)
 
 
-def send_evenly(
-    sock: socket.socket, datagrams: Sequence[Datagram], per_s: float, seconds: float, per_datagram: int
+def send_all(
+    sock: socket.socket, datagrams: Sequence[Datagram], count: int, pace: Pace, per_datagram: int = 1
 ) -> Sent:
-    """Send so many datagrams a second, over and over, to where the socket is connected."""
-    pace = Pace(per_s)
+    """Send so many of these datagrams, over and over, to where the socket is connected."""
     wait, send, size = pace.wait, sock.send, len(datagrams)
-    count = max(1, round(per_s * seconds))
     refused = 0
     for number in range(count):
         wait(number)
@@ -117,7 +117,7 @@ def main() -> None:
     ctypes.CDLL(None).prctl(PR_SET_TIMERSLACK, 1, 0, 0, 0)
     # Before all that is measured, and all else: late frames would come in bursts, which are cheaper than even ones.
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
-    frames = read_frames(Path(sys.argv[1]))
+    frames, times_s = read_frames(Path(sys.argv[1]))
     packed: dict[int, list[Datagram]] = {}
     socks: dict[tuple[str, int], socket.socket] = {}
     print(json.dumps({"ready": True}), flush=True)
@@ -130,8 +130,14 @@ def main() -> None:
             sock = socks[target] = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
             sock.connect(target)
-        per_s = order["rate"] / per_datagram
-        sent = send_evenly(socks[target], packed[per_datagram], per_s, order["seconds"], per_datagram)
+        if order["rate"] == AS_RECORDED:
+            pace = Pace(lambda number: int(times_s[number] * 1e9))
+            count = bisect_left(times_s, order["seconds"])
+        else:
+            interval_ns = 1e9 * per_datagram / order["rate"]
+            pace = Pace(lambda number: int(number * interval_ns))  # noqa: B023  it is used in this turn of the loop
+            count = max(1, round(order["seconds"] * 1e9 / interval_ns))
+        sent = send_all(socks[target], packed[per_datagram], count, pace, per_datagram)
         print(json.dumps(asdict(sent)), flush=True)
 
 

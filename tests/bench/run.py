@@ -13,7 +13,7 @@ from tests.bench.cable import Cable
 from tests.bench.contenders import Contender, NotMeasuredError, Running, last_words
 from tests.bench.frames import FrameSet, write_frames
 from tests.bench.measure import Bench, at_rate, highest_rate, rotated, until_carried
-from tests.bench.traffic import SINK_PORT, Traffic, Worker
+from tests.bench.traffic import AS_RECORDED, SINK_PORT, Traffic, Worker
 from tests.namespaces import NamespaceError
 from uavlinkd.lab.evaluation.records import Record, RecordWriter, Status, Value
 
@@ -28,6 +28,8 @@ class Plan:
     rates: tuple[int, ...] = (50, 100, 300, 1_000, 10_000)
     seconds: tuple[float, ...] = (20.0, 12.0, 6.0, 5.0, 3.0)
     """For each rate."""
+    flight_s: float = 15.0
+    """So much of the flight is carried with its own timing."""
     step_s: float = 1.0
     """One try of the search for the highest rate; 0: it is not searched."""
     packed: int = 8
@@ -36,7 +38,7 @@ class Plan:
 
 PATIENCE = 20
 """A contender has so many times 0.6 s to carry its first frame."""
-QUICK = Plan(rounds=1, rates=(100, 1_000, 10_000), seconds=(6.0, 2.0, 2.0), step_s=0.0)
+QUICK = Plan(rounds=1, rates=(100, 1_000, 10_000), seconds=(6.0, 2.0, 2.0), flight_s=4.0, step_s=0.0)
 
 
 @contextmanager
@@ -44,7 +46,7 @@ def laboratory(frames: FrameSet) -> Iterator[Bench]:
     """Two hosts, the generator and the sink."""
     with tempfile.TemporaryDirectory(prefix="uavbench-") as folder, Cable() as cable:
         path = Path(folder) / "frames"
-        write_frames(path, frames.frames)
+        write_frames(path, frames)
         sink = Worker(cable.right, "sink", str(SINK_PORT))
         yield Bench(cable, Traffic(Worker(cable.left, "generator", str(path)), sink))
 
@@ -99,6 +101,9 @@ class Run:
         for rate, seconds in zip(plan.rates, plan.seconds, strict=True):
             point: dict[str, Value] = {"contender": name, "round": number, "rate": rate, "per_datagram": 1}
             self.record("rate", point, partial(at_rate, bench, running, rate, seconds))
+        if plan.flight_s:
+            point = {"contender": name, "round": number, "per_datagram": 1}
+            self.record("flight", point, partial(at_rate, bench, running, AS_RECORDED, plan.flight_s))
         if plan.step_s:
             for per_datagram in (1, plan.packed):
                 point = {"contender": name, "round": number, "per_datagram": per_datagram}

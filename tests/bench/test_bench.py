@@ -18,7 +18,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from tests.bench.cable import Cable
 from tests.bench.contenders import Contender, NotMeasuredError, Running, all_contenders
 from tests.bench.frames import PROBE_EVERY, SYSTEM, is_probe, load_frames, probe, said_by
-from tests.bench.generator import pack, send_evenly
+from tests.bench.generator import Pace, pack, send_all
 from tests.bench.measure import Bench, at_rate, highest_rate
 from tests.bench.run import at_work, laboratory
 from tests.bench.sink import Count
@@ -176,7 +176,7 @@ def test_generator_keeps_its_pace() -> None:
         into.settimeout(60)
         out.connect(into.getsockname())
         before = time.monotonic_ns()
-        sent = send_evenly(out, pack(load_frames().frames, 2), per_s=500, seconds=0.4, per_datagram=2)
+        sent = send_all(out, pack(load_frames().frames, 2), 200, Pace(lambda number: 2_000_000 * number), 2)
         datagrams = [into.recv(2_000) for _ in range(200)]
     assert (sent.frames, sent.refused) == (400, 0)
     assert 0.39 < sent.seconds < 60

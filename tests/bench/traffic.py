@@ -14,6 +14,8 @@ from tests.bench.cable import Host
 
 REPOSITORY: Final = Path(__file__).parents[2]
 SINK_PORT: Final = 14600
+AS_RECORDED: Final = 0.0
+"""In place of a rate: each frame when the vehicle sent it."""
 SETTLED_S: Final = 0.25
 """After this time without a frame, the flow has ended."""
 POLL_S: Final = 0.03
