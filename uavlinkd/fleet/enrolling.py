@@ -8,16 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from uavlinkd.authority.certificates import Certificate, parse_bulletin, parse_certificate
+from uavlinkd.authority.certificates import Certificate, is_certified, parse_bulletin
 from uavlinkd.authority.enrolment import (
     FleetError,
     Reply,
     Request,
+    certificate_in,
     check_name,
     fingerprint_of,
     ids_of,
     parse_reply,
-    verify_reply,
 )
 from uavlinkd.config import keys
 from uavlinkd.config.load import load_config, read_toml
@@ -25,7 +25,7 @@ from uavlinkd.config.model import ConfigError
 from uavlinkd.fleet.files import listen_on, new_table, with_fleet, written
 from uavlinkd.fleet.manifest import file_errors
 from uavlinkd.mavlink.dialect import SYSTEM_ID
-from uavlinkd.protocol.crypto import x25519_public_key
+from uavlinkd.protocol.crypto import AuthorityKey, x25519_public_key
 from uavlinkd.protocol.drops import Drop
 from uavlinkd.system.base64_text import from_base64
 from uavlinkd.system.folders import sync_folder, write_new
@@ -89,13 +89,13 @@ def finish(
     Returns sentences for the person who ran the command.
     """
     reply = parse_reply(line)
-    certificate = parse_certificate(reply.certificate)
+    certificate = reply.certificate
     name = certificate.name
     place = MemberFiles(config or Path(f"{name}.toml"), folder)
     table = place.table()
     _check_present(table.get("fleet"), reply, certificate, place.config)
     own = str(table.get("private_key_file", f"{name}.key"))
-    key, contacts = _verified(reply, name, place, (_numbered(own, 1), own))
+    key = _certified_key(reply, place, (_numbered(own, 1), own))
     listen = listen or ([] if "listen" in table else listen_on(reply))
     former = own if own != key else _numbered(key, -1)
     is_replaced = "fleet" in table and former != key and place.key(former).exists()
@@ -110,10 +110,12 @@ def finish(
     if is_replaced:
         with file_errors():
             place.key(former).unlink()
+    fingerprint = fingerprint_of(reply.authority)
+    contacts = ", ".join(certificate_in(contact).name for contact in reply.contacts)
     ids = f"the id of the ground control station, to system id {ids_of(certificate)}"
     return [
-        f"{name} is a member of fleet {fingerprint_of(reply.authority)}: compare this with the line of `fleet sign`.",
-        f"{place.config}: {certificate.role.name.lower()}, contacts {', '.join(contacts) or 'none'}",
+        f"{name} is a member of fleet {fingerprint}: compare this with the line of `fleet sign`.",
+        f"{place.config}: {certificate.role.name.lower()}, contacts {contacts or 'none'}",
         *([f"Set {SYSTEM_ID} of the autopilot, or {ids}."] if ids_of(certificate) else []),
         f"Then: uavlinkd run --config {place.config}; if the daemon runs already, restart it.",
         *([f"The former key, {place.key(former)}, was deleted."] if is_replaced else []),
@@ -149,8 +151,8 @@ def _check_present(fleet: Any, reply: Reply, certificate: Certificate, config: P
     if fleet is None:
         return
     try:
-        authority, signed, published = (from_base64(fleet[key]) for key in ("authority", "certificate", "bulletin"))
-        present, bulletin, new = parse_certificate(signed), parse_bulletin(published), parse_bulletin(reply.bulletin)
+        authority, bulletin = from_base64(fleet["authority"]), parse_bulletin(from_base64(fleet["bulletin"]))
+        present, new = certificate_in(fleet), reply.bulletin
         number = 0 if bulletin is None else bulletin.number
     except (LookupError, TypeError, ValueError, Drop):
         raise FleetError(f"{config}: [fleet] is damaged: `uavlinkd check` says how; or move the file away") from None
@@ -168,18 +170,25 @@ def _check_present(fleet: Any, reply: Reply, certificate: Certificate, config: P
         )
 
 
-def _verified(reply: Reply, name: str, place: MemberFiles, files: Sequence[str]) -> tuple[str, list[str]]:
-    """The key file whose key was certified for the member of this name, and the names of the contacts."""
-    reason = (
-        f"the line is for {name}, and there is no {place.key(files[-1])}: run `uavlinkd enroll NAME` here, and sign"
-        " its line"
-    )
-    for file in files:
-        if (path := place.key(file)).exists():
-            try:
-                trust = verify_reply(reply, x25519_public_key(keys.read_secret_file(path).reveal()))
-            except FleetError as error:
-                reason = str(error)
-            else:
-                return file, [held.certificate.name for held in trust.held.values()]
-    raise FleetError(reason)
+def _certified_key(reply: Reply, place: MemberFiles, files: Sequence[str]) -> str:
+    """The key file whose key was certified. The rules of the configuration verify all other signatures."""
+    certificate, bulletin = reply.certificate, reply.bulletin
+    if bulletin is None or bulletin.refuses(certificate.serial):
+        raise FleetError(f"the line has a revoked certificate, serial {certificate.serial}: sign the request again")
+    try:
+        authority = AuthorityKey(reply.authority)
+    except ValueError as error:
+        raise FleetError(f"the line has no valid authority: the key {error}") from None
+    paths = [place.key(file) for file in files]
+    if not any(path.exists() for path in paths):
+        raise FleetError(
+            f"the line is for {certificate.name}, and there is no {paths[-1]}: run `uavlinkd enroll NAME` here, and"
+            " sign its line"
+        )
+    for file, path in zip(files, paths, strict=True):
+        if path.exists():
+            public = x25519_public_key(keys.read_secret_file(path).reveal())
+            if is_certified(from_base64(reply.fleet["certificate"]), public, authority):
+                return file
+    text = f"the line has the certificate of another key, named {certificate.name}, or is not signed"
+    raise FleetError(f"{text}: use the line for this one")

@@ -7,46 +7,40 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
 
-from uavlinkd.authority.certificates import MemberRole, parse_certificate
-from uavlinkd.authority.enrolment import Contact, FleetError, Reply, ids_of
-from uavlinkd.fleet.manifest import Fleet, Member, toml_text
+from uavlinkd.authority.certificates import MemberRole
+from uavlinkd.authority.enrolment import FleetError, Reply, certificate_in, ids_of
+from uavlinkd.fleet.manifest import Fleet, Member, parse_addresses, toml_text
 from uavlinkd.protocol.drops import Drop
-from uavlinkd.protocol.path import WEB_HOST
-from uavlinkd.protocol.suites import SUITES_BY_NAME
-from uavlinkd.system.addresses import parse_place
-from uavlinkd.system.base64_text import from_base64, to_base64
+from uavlinkd.system.base64_text import to_base64
 
 Table = dict[str, Any]
 
 
 def reply_for(fleet: Fleet, member: Member) -> Reply:
     """What a member needs beside its private key."""
-    return Reply(
-        SUITES_BY_NAME[fleet.suite],
-        fleet.calls(member.role),
-        member.relays,
-        tuple(map(str, member.addresses)),
-        fleet.authority.public,
-        member.signed,
-        fleet.published,
-        tuple(
-            Contact(
-                contact.public_key,
-                contact.signed,
-                # A member that relays uses no URL of another relay.
-                tuple(str(one) for one in contact.addresses if not (one.resource and member.relays)),
-                contact.relays,
-            )
-            for contact in fleet.contacts_of(member.name)
-        ),
-    )
+    contacts = [
+        {
+            "public_key": to_base64(contact.public_key),
+            "certificate": to_base64(contact.signed),
+            # A member that relays uses no URL of another relay.
+            "addresses": [str(one) for one in contact.addresses if not (one.resource and member.relays)],
+            "relays": contact.relays and contact.role is not MemberRole.RELAY,
+        }
+        for contact in fleet.contacts_of(member.name)
+    ]
+    facts = {
+        "authority": to_base64(fleet.authority.public),
+        "certificate": to_base64(member.signed),
+        "bulletin": to_base64(fleet.published),
+    }
+    calls = sorted(role.name.lower() for role in fleet.calls(member.role))
+    return Reply(facts, calls, contacts, list(map(str, member.addresses)), fleet.suite, member.relays)
 
 
 def listen_on(reply: Reply) -> list[str]:
     """Where a member listens, so that others reach it at its addresses."""
     listen: list[str] = []
-    for text in reply.addresses:
-        address = parse_place(text)
+    for text, address in zip(reply.addresses, parse_addresses("the line", reply.addresses), strict=True):
         if address.resource:
             continue  # [relay_server] has that
         if address.ip is not None:  # a loopback address is for tests
@@ -60,14 +54,14 @@ def new_table(
     reply: Reply, private_key_file: str, control_socket: str, url: str | None, listen: Sequence[str]
 ) -> Table:
     """A new configuration without the fleet's facts. ``url``: of the autopilot, or of the ground control software."""
-    certificate = parse_certificate(reply.certificate)
+    certificate = reply.certificate
     role, is_vehicle = certificate.role, certificate.role is MemberRole.VEHICLE
     table: Table = {
         "name": certificate.name,
         "private_key_file": private_key_file,
         "listen": list(listen),
         "control_socket": control_socket,
-        "link": {"suites": [reply.suite.name]},
+        "link": {"suites": [reply.suite]},
     }
     if role is not MemberRole.RELAY:
         endpoint = {
@@ -93,35 +87,21 @@ def with_fleet(table: Table, reply: Reply) -> Table:
     added: Table = {}
     if "fleet" not in table:
         added["link"] = {**link, "confidential": True}
-        if MemberRole.VEHICLE in reply.calls:
-            fleet = {"call": sorted(role.name.lower() for role in reply.calls)}
+        if "vehicle" in reply.calls:
+            fleet = {"call": reply.calls}
     if reply.relays:
         added["relay_server"] = relay_server
-    facts = {
-        "authority": to_base64(reply.authority),
-        "certificate": to_base64(reply.certificate),
-        "bulletin": to_base64(reply.bulletin),
-    }
     if "endpoint" in table and "fleet" in table:
         added["endpoint"] = _endpoints(table, reply)
-    contacts = [
-        {
-            "public_key": to_base64(contact.public_key),
-            "certificate": to_base64(contact.certificate),
-            "addresses": _addresses(contact, table),
-            "relays": contact.relays and parse_certificate(contact.certificate).role is not MemberRole.RELAY,
-        }
-        for contact in reply.contacts
-    ]
-    if contacts:
-        added["contact"] = contacts
+    if reply.contacts:
+        added["contact"] = [one | {"addresses": _addresses(one, table)} for one in reply.contacts]
     kept = {key: value for key, value in table.items() if key != "contact"}
-    return {**kept, "fleet": fleet | facts, **added}
+    return {**kept, "fleet": fleet | reply.fleet, **added}
 
 
 def written(table: Table) -> str:
     """The text of a configuration."""
-    certificate = parse_certificate(from_base64(table["fleet"]["certificate"]))
+    certificate = certificate_in(table["fleet"])
     ids = ids_of(certificate)
     head = (
         f"# {certificate.name}: {certificate.role.name.lower()}{f', MAVLink system id {ids}' if ids else ''}.\n"
@@ -137,26 +117,19 @@ def _endpoints(table: Table, reply: Reply) -> Any:
     """The endpoints, with other system ids where those were all of the certificate before."""
     endpoints = table["endpoint"]
     try:
-        before = list(parse_certificate(from_base64(table["fleet"]["certificate"])).systems)
-        now = list(parse_certificate(reply.certificate).systems)
+        before = list(certificate_in(table["fleet"]).systems)
+        now = list(reply.certificate.systems)
         return [each | {"system_ids": now} if each.get("system_ids") == before else each for each in endpoints]
     except (LookupError, TypeError, ValueError, AttributeError, Drop):
         return endpoints
 
 
-def _addresses(contact: Contact, table: Table) -> list[Any]:
-    """The signed addresses, and what a person wrote beside them: those of one network, and URLs if none is signed."""
-    has_url = any(parse_place(text).resource for text in contact.addresses)
-    by_hand = _written(table.get("contact"), parse_certificate(contact.certificate).name)
-    kept = [one for one in by_hand if isinstance(one, dict) or (str(one).startswith(WEB_HOST) and not has_url)]
-    replaced = [one.get("address") for one in kept if isinstance(one, dict)]
-    return [*(text for text in contact.addresses if text not in replaced), *kept]
-
-
-def _written(contacts: Any, name: str) -> list[Any]:
-    """The addresses of a contact in a file, which may be damaged."""
-    for contact in contacts if isinstance(contacts, list) else ():
+def _addresses(contact: Table, table: Table) -> list[Any]:
+    """The signed addresses. If a person wrote a network or a URL beside them, they stay as they are."""
+    name = certificate_in(contact).name
+    for present in table.get("contact", ()):
         with suppress(LookupError, TypeError, ValueError, Drop):
-            if parse_certificate(from_base64(contact["certificate"])).name == name:
-                return list(contact["addresses"])
-    return []
+            is_same = certificate_in(present).name == name
+            if is_same and any(isinstance(one, dict) or "://" in one for one in present["addresses"]):
+                return list(present["addresses"])
+    return list(contact["addresses"])
