@@ -164,7 +164,7 @@ def test_url_of_an_existing_file_is_not_changed(place: Path, say: Say) -> None:
 def test_revoked_member_returns_as_it_was(place: Path, say: Say) -> None:
     """With a new key, and `--replace`."""
     enrolled(say, "v7", "--role observer --id 70")
-    say("fleet revoke v7")
+    say("fleet remove v7")
     enrolled(say, "v7", "--replace v7")
     member = read_manifest(place / "fleet").member("v7")
     assert (member.role, member.ids, member.certificate.serial) == (MemberRole.OBSERVER, "70", 3)
@@ -221,7 +221,7 @@ def test_file_that_a_daemon_would_refuse_is_not_changed(place: Path, say: Say) -
 def test_members_are_listed(place: Path, say: Say) -> None:
     """Former ones too."""
     enrolled(say, "v7", "--ids 70-79")
-    assert "Now publish the bulletin" in say("fleet revoke v7")
+    assert "have not heard of it" in say("fleet remove v7")
     rows = [line.split() for line in say("fleet list").splitlines()]
     assert rows[0][2:] == ["bulletin", "2"]
     assert [row[:4] for row in rows[2:]] == [["relay", "relay", "-", "1"], ["v7", "vehicle", "70-79", "2"]]

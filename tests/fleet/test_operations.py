@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import shutil
-import signal
-import subprocess
-import sys
 import threading
 import tomllib
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -25,12 +22,10 @@ from uavlinkd.fleet.files import reply_for
 from uavlinkd.fleet.manifest import Fleet, parse_addresses, read_manifest, toml_text
 from uavlinkd.fleet.operations import lock
 from uavlinkd.fleet.signing import Identity
-from uavlinkd.lab.child_processes import end_with_parent
 from uavlinkd.system import folders
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.base64_text import to_base64
 
-COMMAND = end_with_parent(sys.executable, "-m", "uavlinkd", "fleet", "revoke", "drone1", "--out", "fleet")
 AT = Address("relay.example.org", 5790)
 RELAY = Identity(MemberRole.RELAY, None, (Address("198.51.100.9", 5790),))
 
@@ -295,28 +290,8 @@ def test_failed_write_changes_nothing(folder: Path, monkeypatch: pytest.MonkeyPa
         create(folder.parent / "another")
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("is_interrupted", [False, True])
-def test_second_command_waits_for_the_first(folder: Path, is_interrupted: bool) -> None:
-    """It reads the files only when it has the lock, so it keeps the first's change. Ctrl-C ends the wait."""
-    changed = folder.with_name("changed")
-    shutil.copytree(folder, changed)
-    operations.revoke(changed, "drone2", unasked)
-    with ExitStack() as stack:
-        held = stack.enter_context(ExitStack())
-        held.enter_context(lock(folder))
-        second = stack.enter_context(
-            subprocess.Popen(COMMAND, cwd=folder.parent, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-        )
-        stack.callback(second.kill)
-        assert second.stderr is not None
-        assert second.stderr.readline() == "waiting for another fleet command in fleet\n"
-        shutil.copytree(changed, folder, dirs_exist_ok=True)
-        if is_interrupted:
-            second.send_signal(signal.SIGINT)
-        else:
-            held.close()
-        assert second.wait(PATIENCE_S) == is_interrupted
-    revoked = ["drone2"] if is_interrupted else ["drone1", "drone2"]
-    fleet = read_manifest(folder)
-    assert [member.name for member in fleet.members if fleet.is_revoked(member)] == revoked
+def test_second_command_is_refused(folder: Path) -> None:
+    """While another one has the lock: neither overwrites the other's change."""
+    with lock(folder), refused(folder, "another fleet command runs"):
+        operations.revoke(folder, "drone1", unasked)
+    operations.revoke(folder, "drone1", unasked)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import shutil
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -12,7 +12,7 @@ from tests.fleet.conftest import Say
 from tests.fleet.vehicles import create, loaded
 from uavlinkd.authority.trust import BulletinVerdict, Trust
 from uavlinkd.fleet.authority_key import load_key, paper_copy
-from uavlinkd.fleet.manifest import Fleet, read_manifest
+from uavlinkd.fleet.manifest import Fleet, read_manifest, toml_text
 from uavlinkd.fleet.recovery import SERIALS_LEFT_OUT
 from uavlinkd.system.addresses import Address
 
@@ -30,7 +30,7 @@ def lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Fleet, str]:
     for member in fleet.members:
         if member.public_key != relay.public_key:
             trust.hold(member.public_key, member.signed)
-    (tmp_path / "members.json").write_text(json.dumps(trust.known()))
+    (tmp_path / "members.toml").write_text(toml_text(trust.known()))
     shutil.copy(tmp_path / "fleet" / "drone1" / "drone1.toml", tmp_path)
     shutil.rmtree(tmp_path / "fleet")
     return fleet, paper
@@ -45,7 +45,7 @@ def test_paper_and_members_restore_a_fleet(lost: tuple[Fleet, str], say: Say, tm
     said = say(RESTORE, paper)
     assert said.startswith("refused: fleet has no fleet.toml")
     assert "--member" in said
-    say(f"{RESTORE} --member drone1.toml --member members.json", paper)
+    say(f"{RESTORE} --member drone1.toml --member members.toml", paper)
     restored = read_manifest(tmp_path / "fleet")
     assert {member.name for member in restored.members} == {member.name for member in fleet.members}
     assert restored.contacts_of("v9") == fleet.contacts_of("v9")
@@ -53,7 +53,7 @@ def test_paper_and_members_restore_a_fleet(lost: tuple[Fleet, str], say: Say, tm
     line = say("fleet sign --id 9", say("enroll v9"))
     assert len(line) > 500
     assert read_manifest(tmp_path / "fleet").member("v9").certificate.serial == 5 + SERIALS_LEFT_OUT - 1
-    say("fleet revoke drone2")
+    say("fleet remove drone2")
     after = read_manifest(tmp_path / "fleet")
     trust = Trust(fleet.authority, fleet.members[0].public_key, fleet.members[0].signed, fleet.published)
     assert trust.receive_bulletin(after.published)[0] is BulletinVerdict.NEWER
@@ -77,16 +77,16 @@ def test_sources_that_do_not_fit_are_refused(lost: tuple[Fleet, str], say: Say, 
     """Forged parts, another fleet's, no fleet's, and a paper copy of another authority: nothing is written."""
     _, paper = lost
     create(tmp_path / "other", drones=1, relays=(Address("relay.example.org", 5790),))
-    known = json.loads((tmp_path / "members.json").read_text())
+    known = tomllib.loads((tmp_path / "members.toml").read_text())
     known["contact"][0]["public_key"] = known["contact"][1]["public_key"]
-    (tmp_path / "forged.json").write_text(json.dumps(known))
-    (tmp_path / "list.json").write_text("[1]")
+    (tmp_path / "forged.toml").write_text(toml_text(known))
+    (tmp_path / "other.toml").write_text("[1]")
     other = Path("other", "drone1", "drone1.toml")
     for sources, reason in (
-        ("--member forged.json", "damaged, or not signed"),
-        (f"--member members.json --member {other}", "damaged, or not signed by one"),
+        ("--member forged.toml", "damaged, or not signed"),
+        (f"--member members.toml --member {other}", "damaged, or not signed by one"),
         (f"--member {other}", "another authority"),
-        ("--member list.json", "neither a member's configuration"),
+        ("--member other.toml", "neither a member's configuration"),
         ("--member none.toml", "cannot be read"),
     ):
         assert reason in say(f"{RESTORE} {sources}", paper), sources

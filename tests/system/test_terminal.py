@@ -33,7 +33,7 @@ def test_kept_characters_are_unchanged() -> None:
     [
         ["fleet", "remove", "x\x1b]0;title\x07"],
         ["fleet", "sign", "x", "--address", "\x1b[2J:1"],
-        ["fleet", "revoke", "x\x1b[31m\nall is well"],
+        ["fleet", "remove", "x\x1b[31m\nall is well"],
         ["enroll", "x\x1b[31m"],
         ["enroll", "--finish", "\x1b[31m"],
         ["fleet", "sign", "\x9b31m"],

@@ -23,7 +23,7 @@ from uavlinkd.fleet.authority_key import (
     passphrase_from,
     read_paper,
 )
-from uavlinkd.fleet.manifest import FILE_NAME, Fleet, Member, parse_addresses, read_manifest
+from uavlinkd.fleet.manifest import FILE_NAME, Fleet, Member, parse_addresses, read_manifest, toml_text
 from uavlinkd.fleet.recovery import read_source
 from uavlinkd.fleet.signing import Identity
 from uavlinkd.ops.commands import control_socket, control_sockets
@@ -72,12 +72,6 @@ def _sign(options: argparse.Namespace) -> None:
         after = f"`enroll --finish`, then `uavlinkd fleet publish`, then restart {member.name}"
         _note(f"serial {former[-1]} is revoked: {after}")
     _note_contacts(before, fleet)
-    try:
-        for socket in control_sockets(options):
-            operations.introduce(fleet, socket)
-    except CommandError:
-        text = f"lets its status show {member.name} before it comes"
-        _note(f"`uavlinkd fleet publish` beside a station's daemon {text}")
 
 
 def _note_contacts(before: Fleet, after: Fleet) -> None:
@@ -96,15 +90,11 @@ def _identity(options: argparse.Namespace) -> Identity:
     return Identity(role, (ends[0], ends[-1]) if is_given else None, parse_addresses("--address", options.address))
 
 
-def _revoke(options: argparse.Namespace) -> None:
-    """Run ``revoke`` or ``remove``."""
+def _remove(options: argparse.Namespace) -> None:
     ask = passphrase_from(options.passphrase_file)
     before, fleet = operations.revoke(options.out, options.name, ask)
     _say(f"{options.name} is revoked, by bulletin {fleet.bulletin.number}.")
     _note_contacts(before, fleet)
-    if options.action == "revoke":
-        _say("Now publish the bulletin with `uavlinkd fleet publish`: until then members accept the old certificate.")
-        return
     try:
         _publish_here(options, ask)
     except CommandError as error:
@@ -138,7 +128,7 @@ def _publish_here(options: argparse.Namespace, ask: Passphrase, *, merges: bool 
 
 
 def _members(options: argparse.Namespace) -> None:
-    print(json.dumps(ask_daemon(control_socket(options), "fleet")))
+    print(toml_text(ask_daemon(control_socket(options), "fleet")), end="")
 
 
 def _paper(options: argparse.Namespace) -> None:
@@ -153,7 +143,7 @@ def _restore(options: argparse.Namespace) -> None:
         raise FleetError(
             f"{options.out} has no {FILE_NAME}: copy it from another machine, or name what members know, each file"
             " with --member: a copy of one's configuration (ssh v7 cat v7.toml > v7.toml), and what its daemon knows"
-            " of the others (ssh v7 uavlinkd fleet members --config v7.toml > members.json)"
+            " of the others (ssh v7 uavlinkd fleet members --config v7.toml > members.toml)"
         )
     sources = list(map(read_source, options.member))
     _prompt("type both lines of the paper copy, then press Ctrl-D")
@@ -248,8 +238,7 @@ def _note(text: str) -> None:
 ACTIONS: dict[str, Callable[[argparse.Namespace], None]] = {
     "init": _init,
     "sign": _sign,
-    "revoke": _revoke,
-    "remove": _revoke,
+    "remove": _remove,
     "publish": _publish,
     "list": _list,
     "paper": _paper,

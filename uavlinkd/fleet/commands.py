@@ -9,7 +9,7 @@ from pathlib import Path
 from uavlinkd.system.terminal import OK, add_json, without_echo
 
 _ROLES = ("vehicle", "operator", "observer", "relay")
-_TYPED = frozenset({"init", "revoke", "remove", "publish", "paper"})
+_TYPED = frozenset({"init", "remove", "publish", "paper"})
 """Actions that read a passphrase from the terminal, and nothing else."""
 
 
@@ -48,14 +48,12 @@ def add_fleet(fleet: argparse.ArgumentParser) -> None:
     ids.add_argument("--ids", metavar="A-B", help="a range of them")
     text = "where members reach it from the start; a relay's wss:// URL, behind its HOST:PORT, is one more"
     _add_list(sign, "--address", "HOST:PORT", text)
-    revoke = add("revoke", "sign a bulletin that refuses a member")
     remove = add("remove", "revoke a member, and publish the bulletin")
-    for action in (revoke, remove):
-        action.add_argument("name", metavar="NAME")
+    remove.add_argument("name", metavar="NAME")
     publish = add("publish", "hand the bulletin and the members to a running daemon, which passes the bulletin on")
     publish.add_argument("--merge", action="store_true", help="the fleet has a newer bulletin: sign the union")
     members = add("members", "print what a running daemon knows of its fleet, for `restore`", signs=False)
-    for action in (sign, publish, remove, members):
+    for action in (publish, remove, members):
         daemon = action.add_mutually_exclusive_group()
         daemon.add_argument("--config", metavar="FILE", type=Path, help="the daemon's configuration")
         daemon.add_argument("--socket", metavar="PATH", type=Path, help="the daemon's control socket")

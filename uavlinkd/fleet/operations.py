@@ -10,7 +10,6 @@ from __future__ import annotations
 import os
 import secrets
 import shutil
-import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -38,7 +37,6 @@ from uavlinkd.ops.control import ask as ask_daemon
 from uavlinkd.protocol.crypto import Secret, SigningKey, signing_key_pem
 from uavlinkd.system.base64_text import to_base64
 from uavlinkd.system.folders import replace_file
-from uavlinkd.system.terminal import printable
 
 _AT_ONCE = 30  # certificates in a request, which has at most 8,192 bytes
 
@@ -140,19 +138,13 @@ def publish(folder: Path, socket: Path, ask: Passphrase, *, merges: bool = False
             before = read_manifest(folder)
             fleet = signing.merge(before, _signer(folder, before, ask), bulletin)
             _save(folder, fleet)
-    introduce(fleet, socket, theirs)
+    certificates = [f"{to_base64(one.public_key)}:{to_base64(one.signed)}" for one in fleet.current]
+    for at in range(0, len(certificates), _AT_ONCE):
+        ask_daemon(socket, " ".join(["publish", theirs, *certificates[at : at + _AT_ONCE]]))
     verdict = ask_daemon(socket, f"publish {to_base64(fleet.published)}").get("verdict")
     if verdict not in (BulletinVerdict.NEWER.value, BulletinVerdict.KNOWN.value):
         raise FleetError(f"the daemon refused bulletin {fleet.bulletin.number}: {verdict}")
     return fleet
-
-
-def introduce(fleet: Fleet, socket: Path, theirs: str | None = None) -> None:
-    """Hand the certificates of all members to a daemon, which shows them from then on. ``theirs``: its bulletin."""
-    theirs = theirs or str(ask_daemon(socket, "bulletin").get("bulletin"))
-    certificates = [f"{to_base64(one.public_key)}:{to_base64(one.signed)}" for one in fleet.current]
-    for at in range(0, len(certificates), _AT_ONCE):
-        ask_daemon(socket, " ".join(["publish", theirs, *certificates[at : at + _AT_ONCE]]))
 
 
 def _signer(folder: Path, fleet: Fleet, ask: Passphrase) -> SigningKey:
@@ -169,11 +161,11 @@ def _save(folder: Path, fleet: Fleet) -> None:
 
 @contextmanager
 def lock(folder: Path) -> Iterator[None]:
-    """Hold the lock of a fleet's folder. If another command holds it, say so on standard error and wait: neither must
-    overwrite the other's change.
+    """Hold the lock of a fleet's folder: two commands must not overwrite each other's change.
 
     The lock is on the folder itself: no lock file remains, and the kernel releases it when the process ends,
-    however it ends. Raises FleetError if the folder does not exist, FleetFileError if it cannot be locked.
+    however it ends. Raises FleetError if the folder does not exist or another command has the lock, FleetFileError if
+    it cannot be locked.
     """
     import fcntl  # noqa: PLC0415  Windows has no such module
 
@@ -184,16 +176,9 @@ def lock(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise FleetFileError(f"{folder} cannot be read: {error.strerror}") from None
     try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            print(printable(f"waiting for another fleet command in {folder}"), file=sys.stderr, flush=True)
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
-    except OSError as error:  # NFS, for one, locks no folders
-        os.close(descriptor)
-        reason = f"{error.strerror}: keep the fleet on a local file system"
-        raise FleetFileError(f"{folder} cannot be locked: {reason}") from None
-    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         yield
+    except BlockingIOError:
+        raise FleetError(f"another fleet command runs in {folder}: run this one again when it has ended") from None
     finally:
         os.close(descriptor)

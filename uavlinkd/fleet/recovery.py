@@ -7,7 +7,6 @@ source knows is not in the new manifest, and goes on flying. Its serial must not
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Final
@@ -31,16 +30,11 @@ SERIALS_LEFT_OUT: Final = 1000
 
 
 def read_source(path: Path) -> dict[str, Any]:
-    """What a file has of a fleet: a member's configuration, or the line of `fleet members`. Raises FleetError."""
-    try:
-        table: Any = json.loads(path.read_text("utf-8"))
-    except OSError as error:
-        raise FleetError(f"{path} cannot be read: {error.strerror}") from None
-    except (ValueError, RecursionError):
-        table = read_toml(path)
-    if type(table) is not dict or type(table.get("fleet")) is not dict:
-        raise FleetError(f"{path} is neither a member's configuration nor the line of `uavlinkd fleet members`")
-    return dict(table)
+    """What a file has of a fleet: a member's configuration, or the text of `fleet members`. Raises FleetError."""
+    table = read_toml(path)
+    if type(table.get("fleet")) is not dict:
+        raise FleetError(f"{path} is neither a member's configuration nor the text of `uavlinkd fleet members`")
+    return table
 
 
 def recovered(sources: Iterable[dict[str, Any]]) -> Fleet:
