@@ -68,18 +68,6 @@ def test_daemon_without_a_certificate() -> None:
     assert known.receive_bulletin(bulletin(2, 1)) == (BulletinVerdict.NEWER, [KEY])
 
 
-def test_own_certificate_is_replaced_by_a_newer_one() -> None:
-    """For the own key, with a higher serial."""
-    known = trust()
-    newer = signed(vehicle(1, 9), OWN)
-    assert not known.replace_own(signed(vehicle(1, 9), KEY))
-    assert known.replace_own(newer)
-    assert not known.replace_own(newer)
-    assert not known.replace_own(OWN_DATA)
-    assert known.own is not None
-    assert known.own.data == newer
-
-
 @pytest.mark.parametrize(
     ("data", "reason"),
     [

@@ -6,6 +6,7 @@ Pure: no I/O, no clock, no randomness. Whether a certificate may be accepted dep
 from __future__ import annotations
 
 from collections.abc import Collection, Container, Iterable, Iterator, Mapping
+from contextlib import suppress
 from enum import Enum
 from typing import NamedTuple
 
@@ -67,15 +68,13 @@ class Trust:
         if parsed is None:
             raise ValueError("is not a bulletin of this fleet")
         self.bulletin, self.bulletin_bytes = parsed, bulletin
-        self.own: HeldCertificate | None = None
         self.held: dict[bytes, HeldCertificate] = {}  # by static public key, without the own one
         self.roster: dict[str, tuple[bytes, HeldCertificate]] = {}
         """The key and certificate of each member for people to see, by name. It admits no member."""
         self._claims: dict[str | int, bytes] = {}
         """Who was held last with a name or a system id: a relay holds thousands, and must not compare all of them."""
         self.pinned = Pinned()
-        if certificate and not self.replace_own(certificate):
-            raise ValueError("is not a certificate of this fleet for the key of this daemon")
+        self.own = self._read_own(certificate) if certificate else None
 
     @property
     def digest(self) -> bytes:
@@ -93,17 +92,12 @@ class Trust:
             ],
         }
 
-    def replace_own(self, data: bytes) -> bool:
-        """Use a newer certificate for the own key. Returns whether it is one."""
-        try:
+    def _read_own(self, data: bytes) -> HeldCertificate:
+        with suppress(Drop):
             certificate = parse_certificate(data)
-        except Drop:
-            return False
-        is_newer = self.own is None or certificate.serial > self.own.certificate.serial
-        if not is_newer or not self._is_signed(certificate, self.own_key, data):
-            return False
-        self.own = HeldCertificate(certificate, data)
-        return True
+            if self._is_signed(certificate, self.own_key, data):
+                return HeldCertificate(certificate, data)
+        raise ValueError("is not a certificate of this fleet for the key of this daemon")
 
     # Certificates of others.
 

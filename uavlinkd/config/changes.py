@@ -23,6 +23,8 @@ _FIXED: Final[dict[str, Callable[[Config], object]]] = {
     "member": lambda config: config.relay_server is None,
     "relay_server.https": lambda config: config.relay_server and config.relay_server.https,
     "fleet.authority": lambda config: config.fleet and (config.fleet.authority, config.fleet.state_file),
+    "fleet.certificate": lambda config: config.fleet and config.fleet.own,
+    "contact": lambda config: config.fleet and config.fleet.contacts,
     "endpoint": lambda config: [replace(endpoint, policy={}) for endpoint in config.endpoints],
 }
 """What cannot change while the daemon runs, by its key in the file."""

@@ -74,7 +74,8 @@ class FleetMembers(Feature):
         self._disk = FleetDisk(fleet.state_file, self._state, self._on_written)
         self.trust.reserve(reserved(config, fleet))
         self._hold_contacts(monotonic())
-        self._show_certificate()
+        if self.trust.own is not None:
+            self._node.set_certificate(self.trust.own.data)
         self._disk.write()  # the configuration may have a newer bulletin
 
     @property
@@ -103,26 +104,14 @@ class FleetMembers(Feature):
     def follow(self, config: Config, fleet: FleetConfig, now: float) -> None:
         """Apply a new configuration. Call it before its peers are added, which may have names and keys of members."""
         before, self.config = self.config, fleet
-        old, new = ({contact.key for contact in one.contacts} for one in (before, fleet))
-        leaving = {link.key for link in self._links.values()}  # with the configuration, as relays do
-        leaving |= {relay.config.settings.public_key for relay in self._relays.by_name.values()}
-        for key in old - new:
-            self.trust.held.pop(key, None)
-            if self._relay is not None:
-                self._relay.end(key, now)
-            if key not in leaving:  # it was a member of this relay only: it has to show its certificate again
-                self._end(key, now)
-        self.trust.replace_own(fleet.own.data)
-        self._show_certificate()
-        met = [key for key in new - old if key in self.trust.held]  # from now on the configuration has their peers
-        for key in (*self.trust.reserve(reserved(config, fleet)), *met):
+        for key in self.trust.reserve(reserved(config, fleet)):
             self._end(key, now)
         self._publish(fleet.bulletin, now)
         self._hold_contacts(now)
         for key, held in list(self.trust.held.items()):
-            link, has_policy = self._links.get(held.certificate.name), held.certificate.role in fleet.policies
-            if key in new:
+            if self._is_contact(key):
                 continue
+            link, has_policy = self._links.get(held.certificate.name), held.certificate.role in fleet.policies
             if not self._is_wanted(held.certificate) or has_policy is (link is None) or fleet.link != before.link:
                 del self.trust.held[key]
                 self._end(key, now)
@@ -326,10 +315,6 @@ class FleetMembers(Feature):
             self._disk.write()
         if reaction.event:
             self._events[reaction.event] = now, who
-
-    def _show_certificate(self) -> None:
-        if self.trust.own is not None:
-            self._node.set_certificate(self.trust.own.data)
 
     def _send(self, key: bytes, record: FleetRecord, now: float) -> None:
         if (peer := self._node.find(key)) is not None:
