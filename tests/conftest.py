@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, settings
 
 from tests.needs import MAY_BE_MISSING
 from tests.traces import END_S, no_trace, open_once
-from uavlinkd.system import core_dumps
+from uavlinkd.system import process
 
 WORKERS_PER_CORE = 2
 """Most long tests wait for daemons, clients and containers. The others compute: one worker for each core."""
@@ -159,7 +159,7 @@ def _shares_a_fixture(request: pytest.FixtureRequest) -> bool:
 @pytest.fixture
 def undone_settings(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Undo what a command of the package sets for its process: the log, and that it dumps no core."""
-    monkeypatch.setattr(core_dumps, "forbid_core_dumps", lambda: None)  # a limit that only root could raise again
+    monkeypatch.setattr(process, "forbid_core_dumps", lambda: None)  # a limit that only root could raise again
     before = structlog.get_config()
     yield
     structlog.configure(**before)

@@ -201,7 +201,7 @@ def _run(options: argparse.Namespace) -> int:
 def _run_daemon(options: argparse.Namespace) -> int:
     import asyncio
 
-    from uavlinkd.system.core_dumps import forbid_core_dumps
+    from uavlinkd.system.process import forbid_core_dumps, return_free_memory
 
     forbid_core_dumps()
     if not sys.stderr.isatty():
@@ -218,6 +218,7 @@ def _run_daemon(options: argparse.Namespace) -> int:
 
     async def work() -> None:
         daemon = Daemon(config)
+        return_free_memory()
         gc.freeze()
         gc.enable()
         await daemon.run()

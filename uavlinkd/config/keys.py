@@ -6,7 +6,6 @@ No message repeats the content of a key file, not even in part: a message about 
 from __future__ import annotations
 
 import os
-import secrets
 import shlex
 import stat
 from collections.abc import Mapping
@@ -39,7 +38,7 @@ def generate_private_key() -> str:
     every private key from every public key.
     """
     while True:
-        key = bytearray(secrets.token_bytes(KEY_BYTES))
+        key = bytearray(os.urandom(KEY_BYTES))
         key[0] &= 248
         key[31] = key[31] & 127 | 64
         if not looks_private(x25519_public_key(bytes(key))):
@@ -56,7 +55,7 @@ def looks_private(key: bytes) -> bool:
 
 def generate_psk() -> str:
     """A new pre-shared key, from the operating system's generator."""
-    return encode_key(secrets.token_bytes(KEY_BYTES))
+    return encode_key(os.urandom(KEY_BYTES))
 
 
 def public_key_text(private_text: str) -> str:

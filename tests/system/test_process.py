@@ -9,7 +9,7 @@ from tests.needs import need
 
 _ASK = """
 import ctypes, resource
-from uavlinkd.system.core_dumps import forbid_core_dumps
+from uavlinkd.system.process import forbid_core_dumps
 dumpable = lambda: ctypes.CDLL(None).prctl(3, 0, 0, 0, 0)
 before = dumpable()
 forbid_core_dumps()
