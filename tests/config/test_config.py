@@ -214,7 +214,7 @@ def test_keys_come_from_systemd_where_there_is_no_file(
     private = (credentials / f"{prefix}drone0.key").read_text().strip()
     assert keys.encode_key(config.private_key.reveal()) == private
     monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(credentials))
-    with pytest.raises(ConfigError, match="there is no file"):
+    with pytest.raises(ConfigError, match="no such file"):
         load_config(path, {})
 
 

@@ -142,18 +142,13 @@ def _read_secret(file: File, section: Values, key: str, environ: Mapping[str, st
     if (name := section.valid.pop(key, None)) is None:
         return
     path, is_credential = find_secret_file(name, file.folder, environ)
-    is_service = bool(environ.get(CREDENTIALS))
-    if os.path.lexists(path):
-        try:
-            section.valid[key] = read_secret_file(path, credential=is_credential)
-        except KeyFileError as error:
-            file.add(
-                section.at(key), f"{error}; {_FOR_A_SERVICE}" if is_service and not is_credential else str(error)
-            )
-    elif is_service:
-        file.add(section.at(key), f"there is no file {path} and no systemd credential of that name: {_FOR_A_SERVICE}")
-    else:
-        file.add(section.at(key), f"there is no file {path}: {_how_to_get(key, path)}")
+    try:
+        section.valid[key] = read_secret_file(path, credential=is_credential)
+    except KeyFileError as error:
+        is_of_service = bool(environ.get(CREDENTIALS)) and not is_credential
+        missing = "" if os.path.lexists(path) else _how_to_get(key, path)
+        remedy = _FOR_A_SERVICE if is_of_service else missing
+        file.add(section.at(key), f"{error}; {remedy}" if remedy else str(error))
 
 
 _FOR_A_SERVICE = (
