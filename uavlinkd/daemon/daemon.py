@@ -20,10 +20,9 @@ from uavlinkd.daemon.parts import DaemonParts
 from uavlinkd.daemon.peer_link import radio_figures
 from uavlinkd.mavlink.own_frames import INTERVAL_S
 from uavlinkd.observe.observer import Observer
-from uavlinkd.observe.status import daemon_status, overview, state_of
+from uavlinkd.observe.status import daemon_status, overview
 from uavlinkd.ops import LOG_SCHEMA
 from uavlinkd.ops.control import ControlServer
-from uavlinkd.ops.log import shown
 from uavlinkd.ops.sdnotify import Supervisor
 from uavlinkd.system.base64_text import to_base64
 from uavlinkd.system.clock import monotonic
@@ -34,7 +33,6 @@ from uavlinkd.system.terminal import printable
 if TYPE_CHECKING:
     from collections.abc import Hashable
 
-    from uavlinkd.relay.client_link import RelayLink
 
 HOUSEKEEPING_S = INTERVAL_S
 LOOKS_EVERY = 2
@@ -157,7 +155,8 @@ class Daemon:
                     return {"problems": str(error).splitlines()}
                 return {"problems": [], "name": parts.config.name}
             case ("netcheck", "", ""):
-                return {**netcheck(parts), "web": {} if parts.tls is None else await parts.tls.probe()}
+                status = daemon_status(self.observer, monotonic())
+                return {"relays": status["relays"], "web": {} if parts.tls is None else await parts.tls.probe()}
             case ("bulletin", "", "") if parts.fleet is not None:
                 return {"bulletin": to_base64(parts.fleet.trust.bulletin_bytes)}
             case ("fleet", "", "") if parts.fleet is not None:
@@ -255,31 +254,3 @@ class Daemon:
         for link in self.parts.links.values():
             run(link.report_problems, codes, now)
         self.carrier.arm()
-
-
-def netcheck(parts: DaemonParts) -> dict[str, object]:
-    """Which addresses of each relay answer, and this daemon's public addresses as the relays see them."""
-    return {
-        "relays": {name: _reach(parts, relay) for name, relay in parts.relay_links.items()},
-        "is_relay": parts.relay is not None,
-    }
-
-
-def _reach(parts: DaemonParts, relay: RelayLink) -> dict[str, object]:
-    states = [state for state in relay.peer.paths.states if state.path.is_udp]
-    answering = [state for state in states if relay.peer.is_up and state.works and state.is_validated]
-    return {
-        "state": state_of(relay.peer),
-        "is_udp": bool(answering),
-        "round_trip_s": relay.peer.round_trip_s,
-        "silent": [shown(state.path.address) for state in states if state.is_configured and state not in answering],
-        "unresolved": sorted(parts.peer_sockets.unresolved(relay.name if relay.link is None else relay.link.name)),
-        "views": [
-            {
-                "seen_as": str(seen_as),
-                "relay_address": shown(path.address),
-                "network": parts.peer_sockets.network_name(path.socket),
-            }
-            for path, seen_as in relay.views()
-        ],
-    }

@@ -1,1 +1,1 @@
-"""Sockets and serial ports: the local MAVLink endpoints, and what reads and sends datagrams."""
+"""Sockets and serial ports: the local MAVLink endpoints, names, and what reads and sends datagrams."""

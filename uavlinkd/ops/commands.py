@@ -189,13 +189,13 @@ def _reload(options: argparse.Namespace) -> int:
 
 
 def _netcheck(options: argparse.Namespace) -> int:
-    from uavlinkd.ops.netcheck import folded, report
+    from uavlinkd.ops.netcheck import report
 
     def show(answer: dict[str, Any]) -> int:
         if options.json:
             print(json.dumps(answer))
         for line in () if options.json else report(answer):
-            print(folded(printable(line)))
+            print(printable(line))
         return OK if any(relay["state"] == "up" for relay in answer["relays"].values()) else FAILED
 
     return _for_each(control_sockets(options), "netcheck", show)

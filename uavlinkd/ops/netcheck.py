@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from textwrap import fill
 from typing import Any
 
 from uavlinkd.system.error_meanings import web_problem
@@ -30,41 +29,23 @@ def report(answer: Answer) -> Iterator[str]:
     """The lines of ``netcheck``: whether UDP and TLS reach each relay, and the public addresses of this daemon."""
     relays = answer["relays"]
     if not relays:
-        yield (
-            "This file has no [[relay]]: netcheck asks relays how they see this machine. To add one, see"
-            " uavlinkd/relay/README.md"
-        )
-        if answer["is_relay"]:
-            yield "This daemon is a relay itself: run netcheck at its members"
+        yield "no [[relay]] in this file: netcheck asks relays how they see this machine (uavlinkd/relay/README.md)"
         return
+    is_complete = True
     for name, relay in relays.items():
-        yield f"UDP          {name}: {_by_udp(relay)}"
-        for address in relay["silent"]:
-            yield f"             no answer at {address}"
+        by_udp = [path for path in relay["paths"] if path["network"] != "TLS"]
+        answers = any(path["state"] == "usable" for path in by_udp) and relay["state"] == "up"
+        time_s = relay["round_trip_s"]
+        what = "answers" if time_s is None else f"answers, {1000 * time_s:.0f} ms"
+        what_else = "does not answer; it does by TLS" if relay["state"] == "up" else "does not answer"
+        yield f"UDP          {name}: {what if answers else what_else}"
+        silent = [path for path in by_udp if path["is_configured"] and path["state"] != "usable"]
+        yield from (f"             no answer at {path['address']}" for path in silent)
+        is_complete = is_complete and answers and not silent
     for url, result in answer["web"].items():
         through = f" through the proxy {result['proxy']}" if result["proxy"] else ""
-        yield f"TLS          {url}{through}: {_by_tls(result['error'])}"
-    for name, relay in relays.items():
-        for view in relay["views"]:
-            network = f" on {view['network']}" if view["network"] else ""
-            yield f"seen as      {view['seen_as']} by {name} at {view['relay_address']}{network}"
-    if any(relay["silent"] or not relay["is_udp"] for relay in relays.values()):
+        problem = ": ".join(filter(None, web_problem(result["error"]))) if result["error"] else "connects"
+        yield f"TLS          {url}{through}: {problem}"
+    yield from (f"seen as      {seen} by {name}" for name, relay in relays.items() for seen in relay["seen_as"])
+    if not is_complete:
         yield "`uavlinkd status` here and at the relay names the cause"
-
-
-def _by_udp(relay: Answer) -> str:
-    if relay["is_udp"]:
-        return "answers" if relay["round_trip_s"] is None else f"answers, {1000 * relay['round_trip_s']:.0f} ms"
-    if names := relay["unresolved"]:
-        return f"{', '.join(names)} has no address now: see `getent hosts {names[0]}`"
-    return "does not answer; it does by TLS" if relay["state"] == "up" else "does not answer"
-
-
-def _by_tls(error: str) -> str:
-    return ": ".join(filter(None, web_problem(error))) if error else "connects"
-
-
-def folded(line: str) -> str:
-    """Fold a line of the report to 80 columns, beside its label. Names and addresses stay whole."""
-    indent = " " * 13 if line[11:13] == "  " else ""
-    return fill(line, 80, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)

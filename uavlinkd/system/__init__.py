@@ -1,1 +1,1 @@
-"""What the daemon needs of the operating system: addresses, names, clocks, threads, pauses."""
+"""What the daemon needs of the operating system: addresses, clocks, threads, pauses."""
