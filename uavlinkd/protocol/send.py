@@ -21,7 +21,7 @@ from uavlinkd.protocol.settings import Class
 from uavlinkd.protocol.timers import Timer
 from uavlinkd.protocol.wire import QUESTION_BYTES
 
-_NEARLY_WORN_OUT: Final = c.REKEY_AFTER_ENVELOPES - 4096
+_NEARLY_WORN_OUT: Final = c.REKEY_AFTER_ENVELOPES - 2**20
 """From this counter on each call looks whether the keys may seal all its payloads, which are fewer than the rest."""
 STREAM, CRITICAL, PROBE, SILENCE = Class.STREAM, Class.CRITICAL, Timer.PROBE, Timer.SILENCE
 """Members that each frame needs. The class of an enumeration looks them up by a Python function."""
