@@ -46,7 +46,7 @@ class FeatureHost(Protocol):
     arm: Callable[[], object]
     """Sets the timer of the daemon: a feature may have an earlier deadline."""
 
-    def perform(self, outputs: Iterable[Output]) -> None:
+    def perform(self, outputs: Sequence[Output]) -> None:
         """Execute outputs of the core."""
 
     def drop_datagram(self, reason: DropReason, name: str = "", path: Path | None = None) -> None:

@@ -114,7 +114,7 @@ class Line:
             path = paths[address] = Path(socket, address)
         return path
 
-    def perform(self, outputs: Iterable[Output]) -> None:
+    def perform(self, outputs: Sequence[Output]) -> None:
         """Execute outputs of the core. Frames that it delivers are forwarded at once, or at the end of the turn.
 
         A fault costs one output, or the frames of one link.
@@ -147,11 +147,12 @@ class Line:
                             self._drops.add("frames_dropped", reason, link.name, count, monotonic())
                     elif link.output.repair.is_on:
                         link.note_requests(frames, self.read_at)
-                    gathered = self._frames.get(link)
-                    if gathered is None:
-                        self._frames[link] = frames
+                    if len(outputs) == 1 and not self.is_turn:
+                        self.forward(link, frames, self.read_at, self.epoch)
+                    elif link in self._frames:
+                        self._frames[link] += frames
                     else:
-                        gathered += frames
+                        self._frames[link] = frames
                 else:
                     self.on_output(output)
             except Exception as error:

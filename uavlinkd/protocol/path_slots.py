@@ -46,6 +46,8 @@ class PathSlots:
         self.best: PathState | None = None
         """Where frames go; a path that failed stays the best while there is no other."""
         self._departed = Totals(0, 0, 0)
+        self.inlet: tuple[Path | None, PathState | None] = None, None
+        """The path along which the last envelope came, and its slot: the next one costs no look-up."""
         self.outlet: Outlet | None = None
         """None where :func:`.send_frames` must decide: about classes, questions, long frames, the probe's timer."""
         self.unproven = 0
@@ -94,7 +96,7 @@ class PathSlots:
             hosts[path.socket, path.host] += 1
             if hosts[path.socket, path.host] <= c.PATHS_PER_HOST and len(wanted) < c.CONFIGURED_PATHS:
                 wanted.append(path)
-        before, self.outlet = self.by_path, None
+        before, self.outlet, self.inlet = self.by_path, None, (None, None)
         if any(path.is_relayed and path not in before for path in wanted):  # the peer may have another address
             for state in before.values():
                 least_s = c.PROBE_INTERVAL_S if state.is_metered and state is not self.best else c.PROBE_FAST_S
@@ -142,13 +144,14 @@ class PathSlots:
         state = self._new(path, now, is_configured=False, others=self.by_path)
         if (asked := self._asked.pop(path, None)) is not None:
             state.take_questions(asked)
-        self.by_path[path], self.outlet = state, None
+        self.by_path[path] = state
+        self.outlet, self.inlet = None, (None, None)
         return state
 
     def remove(self, state: PathState) -> None:
         """Free a slot."""
         del self.by_path[state.path]
-        self.outlet = None
+        self.outlet, self.inlet = None, (None, None)
         self._drop(state)
         if state is self.best:
             self.best = None

@@ -103,7 +103,9 @@ class DatagramReceiver:
                 return copied
             out: list[Output] = []
             sessions = peer.sessions
-            state = peer.paths.by_path.get(path)
+            last, state = peer.paths.inlet
+            if last is not path:
+                peer.paths.inlet = path, (state := peer.paths.by_path.get(path))
             is_candidate = False
             if state is None or sessions.unconfirmed:
                 state, is_candidate = _settle(peer, session, path, now, out)
