@@ -115,7 +115,7 @@ def _refill(pair: Pair, now: float) -> None:
         inside.refill(node, now)
         for peer in node.peers.values():
             peer.group_work = peer.proven_group_work = TokenBucket(*c.GROUP_WORK_PER_PEER, now)
-            peer.answers = peer.answers_while_up = TokenBucket(*c.ANSWERS, now)
+            peer.answers = TokenBucket(*c.ANSWERS, now)
 
 
 def _refused(outputs: list[Output]) -> DropReason:

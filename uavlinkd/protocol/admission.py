@@ -90,8 +90,7 @@ class Admission:
         """An authentic initiation of this peer is to be answered. Raises ``COOKIE_REQUIRED`` or ``RATE_LIMITED``."""
         # Recorded initiations of this peer can be replayed from anywhere: they may use up the answers to all senders,
         # not those to a sender that proves its address.
-        answers = peer.answers_while_up if peer.is_up else peer.answers
-        self._admit(answers, peer.cookied_answers, message, now)
+        self._admit(peer.answers, peer.cookied_answers, message, now)
 
     def admit_group(self, peer: Peer, suite: Suite, message: Message, now: float) -> None:
         """An authentic initiation costs the arithmetic of its group.

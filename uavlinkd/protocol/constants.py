@@ -111,10 +111,8 @@ UNCONFIRMED_LIFETIME_S = 10.0
 """A session waits so long for its first envelope: several retries of the initiator on a slow path."""
 PENDING_LIFETIME_S = 10.0
 """How long an own initiation may be answered."""
-ANSWERS = Rate(4.0, 8)
-"""Responses to one peer without a cookie: an honest handshake has 2 s to confirm before replays could push it out."""
-ANSWERS_WHILE_UP = Rate(2.0, 8)
-"""Responses to one peer with which a link is up: on a slow radio they take room from its frames."""
+ANSWERS = Rate(2.0, 8)
+"""Responses to one peer without a cookie: replays take little from a slow radio, and push no honest handshake out."""
 PENDING_PER_PEER = 8
 """Own initiations that may still be answered, so a slow path's response finds its initiation."""
 USABLE_PER_PEER = 3

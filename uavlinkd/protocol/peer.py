@@ -71,7 +71,7 @@ class Peer:
     """The link with one peer. It is compared by identity; its parts do not refer to it."""
 
     __slots__ = (
-        *("answers", "answers_while_up", "asked_at", "candidate_questions", "claims", "cookied_answers", "durations"),
+        *("answers", "asked_at", "candidate_questions", "claims", "cookied_answers", "durations"),
         *("early", "echo_after_s", "echo_at", "echo_requests", "entropy", "established_at", "group_work"),
         *("handshake_after_s", "handshake_s", "hinted_at", "indices", "initiator", "is_up", "losses"),
         *("lost_after_s", "name", "offered_at", "paths"),
@@ -103,7 +103,6 @@ class Peer:
         """Ephemerals of its initiations, the oldest first."""
         self.answers = TokenBucket(*c.ANSWERS, now)
         """Responses that it may get without a cookie."""
-        self.answers_while_up = TokenBucket(*c.ANSWERS_WHILE_UP, now)
         self.cookied_answers = TokenBucket(c.COOKIED_ANSWERS_PER_S, c.COOKIED_ANSWERS_PER_S, now)
         """Responses that it may get with cookies, at all addresses together."""
         self.group_work = TokenBucket(*c.GROUP_WORK_PER_PEER, now)
