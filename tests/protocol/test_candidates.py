@@ -102,13 +102,6 @@ def test_peer_that_names_victims_causes_a_bounded_number_of_questions(pair: Pair
     assert later == pytest.approx(10 * c.CANDIDATE_QUESTIONS_PER_S, abs=1)
 
 
-def test_forgotten_candidate_answers_in_vain(pair: Pair) -> None:
-    """Another list replaced it: its answer is that of an unknown question."""
-    answer = answered(pair)
-    ask(pair, 1.0, at(1))
-    assert DropReason.UNEXPECTED_ANSWER in reasons(pair.a.node.receive(answer.datagram, DIRECT, 1.01))
-
-
 def test_questions_in_vain_are_not_a_loss_of_the_path(pair: Pair) -> None:
     """Otherwise a search would start repair. What the path itself loses is a loss."""
     best = pair.a.peer.paths.best

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.admitting import AdmittingNode
-from tests.authority.signing import AUTHORITY, CERTIFICATE, FLEET, SIGNER, published, signed
+from tests.authority.signing import AUTHORITY, CERTIFICATE, FLEET, published, signed
 from tests.protocol.harness import (
     AT_A,
     AT_B,
@@ -47,22 +47,10 @@ from uavlinkd.protocol.drops import Drop, DropReason
 from uavlinkd.protocol.node import Node
 from uavlinkd.protocol.outputs import PeerAdmitted, PeerExpired, PeerUp, RecordReceived
 from uavlinkd.protocol.peer import Peer
-from uavlinkd.protocol.relay_records import BulletinRecord, CertificateRecord, Have, Who, parse_record
+from uavlinkd.protocol.relay_records import BulletinRecord, Have
 from uavlinkd.protocol.settings import PeerSettings
 
 # Formats.
-
-
-def test_certificate_has_the_specified_bytes() -> None:
-    """The layout of the specification, computed by hand; the signature covers the static key."""
-    data = signed(CERTIFICATE, KEY_A.public)
-    header = b"\1" + FLEET + struct.pack(">IBBBBH", 7, 0, 2, 7, 7, 0) + b"v7".ljust(21, b"\0")
-    assert data[:36] == header
-    assert len(data) == wire.CERTIFICATE_BYTES == 100
-    SIGNER.public_key().verify(data[36:], b"uavlink certificate 1" + header + KEY_A.public)
-    assert parse_certificate(data) == CERTIFICATE
-    assert is_certified(data, KEY_A.public, AUTHORITY)
-    assert not is_certified(data, KEY_B.public, AUTHORITY)
 
 
 @pytest.mark.parametrize(
@@ -180,25 +168,6 @@ def test_authority_key_of_small_order(public: bytes) -> None:
     """Everyone can sign under it, so it is refused."""
     with pytest.raises(ValueError, match=r"is not a public key|small order"):
         AuthorityKey(public)
-
-
-@pytest.mark.parametrize(
-    "record",
-    [
-        Have(1 << 24 | 3, b"abcd", 5, 6),
-        BulletinRecord(published(Bulletin(FLEET, 1, 1, ()))),
-        CertificateRecord(KEY_A.public, signed(CERTIFICATE, KEY_A.public)),
-        Who(0b1100, 77),
-    ],
-    ids=lambda record: type(record).__name__,
-)
-def test_records(record: Have | BulletinRecord | CertificateRecord | Who) -> None:
-    """Each record arrives as it was made; another length is refused."""
-    assert parse_record(record.encode()) == record
-    for other in (record.encode()[:1], record.encode()[:1] + b"x" * 11 if record[0] != 7 else b"\7"):
-        if len(other) == 1 or not isinstance(record, BulletinRecord):
-            with pytest.raises(Drop):
-                parse_record(other)
 
 
 # Initiations.

@@ -122,15 +122,6 @@ def test_second_response_is_a_duplicate() -> None:
     assert reasons(radios.a.node.receive(foreign, at_b(1), 0.2)) == [DropReason.UNEXPECTED_RESPONSE]
 
 
-def test_response_from_another_address_makes_the_session_where_it_was_asked() -> None:
-    """A relay's address, or one that the NAT has just changed: traffic goes along the likeliest path."""
-    radios = Radios()
-    response = only(datagrams(radios.b.node.receive(initiation(radios)[1], at_a(1), 0.0)))
-    assert of(radios.a.node.receive(response, ELSEWHERE, 0.1), SessionEstablished)
-    assert radios.a.peer.path == at_b(0)
-    assert radios.a.peer.paths.find(ELSEWHERE) is None
-
-
 def test_session_of_lower_rank_is_confirmed_where_it_was_made() -> None:
     """Generations are at their end: the session of the smaller key's initiation stays the current one."""
     pair = Pair(link_a=quiet(), link_b=quiet(), swapped=True)

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import pytest
 
-from tests.protocol.harness import AT_B, ELSEWHERE, Pair, datagrams, lively, of, only, quiet, reasons, with_macs
+from tests.protocol.harness import AT_B, ELSEWHERE, Pair, datagrams, lively, of, only, reasons, with_macs
 from uavlinkd.protocol import constants as c
 from uavlinkd.protocol import establish, wire
 from uavlinkd.protocol.drops import DropReason
@@ -62,18 +62,6 @@ def test_first_wait_is_short_again_when_the_peer_was_received_meanwhile() -> Non
     pair.a.timeout(2.7)
     assert datagrams(pair.a.timeout(15.0), wire.INITIATION)
     assert pair.a.peer.initiator.attempts == 1
-
-
-def test_repeated_initiations_on_a_link_that_is_up_are_counted() -> None:
-    """The first one is not counted as repeated, nor are those to a peer that is not up."""
-    pair = Pair(link_a=quiet(), link_b=quiet()).establish()
-    initiations(pair, 1, c.REKEY_AFTER_S)
-    assert pair.a.peer.traffic.handshakes_unanswered == 0
-    initiations(pair, 3, c.REKEY_AFTER_S + c.RETRY_MAX_S)
-    assert pair.a.peer.traffic.handshakes_unanswered == 3
-    away = Pair()
-    initiations(away, 5)
-    assert away.a.peer.traffic.handshakes_unanswered == 0
 
 
 # What.

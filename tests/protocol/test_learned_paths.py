@@ -9,7 +9,6 @@ import pytest
 
 from tests.protocol.harness import (
     AT_A,
-    AT_B,
     ELSEWHERE,
     FRAME,
     Pair,
@@ -72,13 +71,6 @@ def test_question_that_was_too_long_follows_when_enough_came(pair: Pair) -> None
     assert ELSEWHERE not in {sent.path for sent in of(begin, Transmit)}
     asked = [datagrams(pair.b.receive(pair.a.envelope(now), now, ELSEWHERE)) for now in (1.01, 1.02)]
     assert [len(those) for those in asked] == [1, 0]
-
-
-def test_envelope_from_an_unknown_address_causes_a_question_there(pair: Pair) -> None:
-    """The frames are delivered, and traffic does not go there before the answer: it may be forwarded."""
-    assert probe_in(pair.a, question_to(pair, 1.0)).question
-    for now in (1.0, 1.1, 2.0, 30.0):
-        assert [targets(pair.b, now, cls) for cls in Class] == [[AT_A]] * 3
 
 
 def test_overtaken_envelope_causes_a_question_and_a_copy_or_a_forgery_takes_no_slot(pair: Pair) -> None:
@@ -159,14 +151,6 @@ def test_answer_asks_back_if_it_is_no_longer_than_its_question(pair: Pair, count
 
 
 # The answer.
-
-
-@pytest.mark.parametrize("place", [AT_A, AT_B, Path(1, ELSEWHERE.address), Path(0, ("198.51.100.9", 4001))])
-def test_answer_from_another_place_is_refused(pair: Pair, place: Path) -> None:
-    """The answer proves the path along which it comes, and only the one that was asked."""
-    answer = only(datagrams(pair.a.receive(question_to(pair, 1.0), 1.0)))
-    assert DropReason.UNEXPECTED_ANSWER in reasons(pair.b.receive(answer, 1.1, place))
-    assert condition(pair.b, ELSEWHERE) is PathCondition.UNPROVEN
 
 
 def test_answer_counts_once_for_five_seconds_and_cannot_be_made_up(pair: Pair) -> None:

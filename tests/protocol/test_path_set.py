@@ -143,18 +143,6 @@ def test_least_useful_learned_path_makes_room(kept: str) -> None:
     assert all(paths.with_number(state.number) is state for state in paths.states)
 
 
-def test_best_path_never_makes_room() -> None:
-    """Not even if it is the only one that was never validated."""
-    paths = path_set()
-    paths.prefer(PLACES[0], 0.0)
-    for place in PLACES[1:4]:
-        paths.learn(place, 1.0)
-        of(paths, place).answered_at = 1.0
-    paths.learn(PLACES[6], 2.0)
-    assert paths.find(PLACES[0]) is not None
-    assert len(paths.states) == c.LEARNED_PATHS
-
-
 def test_addresses_where_peers_were_are_known() -> None:
     """From the session or the first answer on, until the last of them has freed its slot."""
     known = Counter[SocketAddress]()
@@ -383,15 +371,6 @@ def test_stream_begins_with_more_than_four_envelopes_a_second() -> None:
     assert not any(paths.note_stream(20.0 + number / 4) for number in range(12))
     assert [paths.note_stream(30.0 + number / 5) for number in range(6)] == [False] * 4 + [True, False]
     assert paths.stream_at == 31.0
-
-
-def test_only_path_is_asked_by_echo_requests() -> None:
-    """No probe is sent, but while a session waits for its first answer, for ten seconds at most."""
-    paths = busy(linked(LTE), 2.0)
-    assert paths.interval_s(of(paths, LTE), 2.0) == NEVER
-    assert of(paths, LTE).question_at == NEVER
-    paths = path_set()
-    assert paths.interval_s(paths.prefer(LTE, 0.0), 9.0) == c.PROBE_FAST_S
 
 
 def test_path_that_is_down_is_asked_ever_less() -> None:

@@ -111,13 +111,6 @@ def test_radio_that_slept_is_not_slow() -> None:
     assert state.wait_s == c.LEAST_ANSWER_S
 
 
-def test_echo_along_the_only_path_measures_it() -> None:
-    """It validates as an answered question does."""
-    state = fresh(is_configured=False)
-    state.note_echo(0.25, 3.0)
-    assert (state.is_validated, state.is_proven, state.srtt_s) == (True, True, 0.25)
-
-
 # Suspect, down, and recovery.
 
 

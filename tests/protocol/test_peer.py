@@ -163,24 +163,6 @@ def test_frames_that_are_there_together_share_envelopes() -> None:
     assert all(len(one) + len(other) > limit - len(frames[-1]) for one, other in pairwise(received))
 
 
-def test_frame_larger_than_an_envelope_is_dropped_alone(pair: Pair) -> None:
-    """What can never fit is counted, and the frames around it are sent."""
-    limit = pair.a.session.payload_limit
-    fits, too_large = b"\xfd" + bytes(limit - 1), b"\xfd" + bytes(limit)
-    outputs = pair.a.send(1.0, FRAME, too_large, fits, too_large)
-    assert of(outputs, Dropped) == [Dropped(DropReason.TOO_LARGE, pair.a.peer, None, 2)]
-    delivered = [payload for datagram in datagrams(outputs) for payload in payloads(pair.b.receive(datagram, 1.0))]
-    assert delivered == [FRAME, fits]
-    assert pair.a.peer.traffic.drops[DropReason.TOO_LARGE] == 2
-
-
-def test_without_a_session_frames_are_counted_and_dropped() -> None:
-    """Nothing is kept for later: an old position is worth nothing."""
-    pair = Pair()
-    assert pair.a.send(0.0, FRAME, FRAME, FRAME) == [Dropped(DropReason.NO_SESSION, pair.a.peer, None, 3)]
-    assert pair.establish().carries(0.0)
-
-
 def test_session_at_its_last_counter_sends_no_more(watchful: Pair) -> None:
     """Frames beyond the last counter are dropped, timers stay quiet, and the side still accepts envelopes."""
     a = watchful.a

@@ -183,16 +183,6 @@ def test_relayed_path_that_becomes_suspect_is_reported(pair: Pair) -> None:
     assert LTE_A in suspected(pair.a.timeout(4.0 + pair.a.peer.echo_after_s))
 
 
-def test_relayed_path_that_is_down_at_once_is_reported(pair: Pair) -> None:
-    """The daemon did not run in the time in which it would have been suspect."""
-    paths = pair.a.peer.paths
-    paths.configure([LTE, LTE_A], 1.0)
-    for path in (LTE, LTE_A):
-        answer(paths, path, 1.0)
-    assert [event.path for event in fail(paths, LTE_A, 4.0) if isinstance(event, PathSuspected)] == [LTE_A]
-    assert not paths.by_path[LTE_A].works
-
-
 def test_relays_are_asked_when_a_direct_path_from_their_socket_fails(pair: Pair) -> None:
     """The NAT has perhaps forgotten both, and relayed paths are probed rarely."""
     paths = pair.a.peer.paths

@@ -67,19 +67,6 @@ def test_waiting_sessions_are_bounded_and_the_oldest_of_its_kind_goes(sessions: 
     assert list(sessions.unconfirmed) == [*range(10, 26), *range(30, 46)]
 
 
-def test_close_ends_this_session_and_lower_ones(sessions: Sessions) -> None:
-    """A close ends the session that carried it and those before it, not what came after. Clearing ends all."""
-    kept = [session(generation, generation) for generation in (1, 2, 3)]
-    for kept_session in kept:
-        sessions.confirm(kept_session, 0.0)
-    assert sessions.end_up_to(kept[1], 1.0) == [kept[1], kept[0]]
-    assert sessions.confirmed == [kept[2]]
-    sessions.wait(unconfirmed(4))
-    sessions.clear(1.0)
-    assert (sessions.confirmed, sessions.unconfirmed, sessions.current) == ([], {}, None)
-    assert [sessions._indices.is_quarantined(index, 1.0) for index in (3, 4)] == [True, False]
-
-
 # Indices.
 
 

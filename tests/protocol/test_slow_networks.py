@@ -143,12 +143,6 @@ def test_pace_of_a_line(budget: float, interval_s: float, hold_s: float, ask_s: 
     assert facts(budget).pace(LINE) == pytest.approx(Pace(interval_s, hold_s, ask_s), rel=1e-4)
 
 
-def test_a_longer_message_is_repeated_later() -> None:
-    """The longest bulletin takes 1.3 s at 1,600 bit/s, and its answer as long as that of an echo request."""
-    assert facts(1_600).repeat_s(LINE, 263) == pytest.approx(c.ASK_AIRTIMES * 8 * (76 + 263 + 2 * 5) / 1_600)
-    assert facts().repeat_s(Path(LTE, PLACE.address), 263) == 0
-
-
 def test_peers_share_a_budget_but_not_that_of_a_point_to_point_network() -> None:
     """So each is asked less often. At the other end of a line is one peer, however many the node has."""
     alone, three = facts().pace(PLACE), facts(peers=3).pace(PLACE)
