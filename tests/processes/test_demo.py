@@ -9,7 +9,6 @@ import os
 import signal
 import subprocess
 import sys
-import termios
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
@@ -32,21 +31,15 @@ def _handle_signals() -> None:
 
 @asynccontextmanager
 async def demo(
-    *arguments: str, folder: Path, terminal: int = subprocess.PIPE, login: int | None = None
+    *arguments: str, folder: Path, terminal: int = subprocess.PIPE
 ) -> AsyncIterator[asyncio.subprocess.Process]:
-    """The demo as a process, with its files below ``folder``, on a pipe or a terminal. ``login``: the one of keys."""
-
-    def prepare() -> None:
-        _handle_signals()
-        if login is not None:
-            os.login_tty(login)
-
+    """The demo as a process, with its files below ``folder``, on a pipe or a terminal."""
     process = await asyncio.create_subprocess_exec(
         *end_with_parent(sys.executable, "-m", "uavlinkd", "demo", *arguments),
         stdout=terminal,
         stderr=subprocess.PIPE,
         env={**os.environ, "TMPDIR": str(folder), "TERM": "xterm-256color"},
-        preexec_fn=prepare,
+        preexec_fn=_handle_signals,
     )
     try:
         yield process
@@ -93,20 +86,6 @@ async def test_interrupted_it_cleans_up_and_leaves_its_screen(short_folder: Path
         assert not any(is_running(pid) for pid in pids)
         _, _, left = (await reading).rpartition(b"every frame, byte for byte")
         assert b"\x1b[2K" not in left, "erased"
-
-
-async def test_q_ends_it_with_its_summary(short_folder: Path) -> None:
-    """As if its time were over. The terminal echoes again afterwards."""
-    master, slave = os.openpty()
-    async with demo("--seconds", "600", folder=short_folder, login=slave) as process:
-        reading = asyncio.create_task(asyncio.to_thread(read_all, master))
-        await until(lambda: linked(short_folder))
-        os.write(master, b"q")
-        await asyncio.wait_for(process.wait(), ENDED_S)
-        assert termios.tcgetattr(slave)[3] & termios.ECHO
-        os.close(slave)
-        assert b"frames delivered" in await reading
-        assert process.returncode == 0
 
 
 def read_all(terminal: int) -> bytes:

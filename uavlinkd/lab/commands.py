@@ -37,7 +37,7 @@ def _add_sim(sim: argparse.ArgumentParser) -> None:
 def _add_demo(demo: argparse.ArgumentParser) -> None:
     demo.set_defaults(command=_demo)
     demo.add_argument("--seconds", type=float, metavar="N", help="of traffic (default: 15, or 3 for each attack)")
-    demo.add_argument("--web", action="store_true", help="until q or Ctrl-C, serve a daemon's page for a browser")
+    demo.add_argument("--web", action="store_true", help="until Ctrl-C, serve a daemon's page for a browser")
     demo.add_argument(
         "--attack",
         metavar="NAME[,key=value]",

@@ -24,7 +24,7 @@ async def test_page_of_a_demo_under_attack(tmp_path: Path) -> None:
     async with demo("--web", "--attack", "forge-data", "--seconds", "2", folder=tmp_path) as process:
         assert process.stdout is not None
         line = (await asyncio.wait_for(process.stdout.readline(), ENDED_S)).decode()
-        url = line.removeprefix("the page is at ").removesuffix(" until q or Ctrl-C\n")
+        url = line.removeprefix("the page is at ").removesuffix(" until Ctrl-C\n")
         assert url.startswith("http://127.0.0.1:")
         page = await asyncio.to_thread(lambda: urlopen(url).read())
         assert b"<title>" in page

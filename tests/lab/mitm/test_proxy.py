@@ -96,7 +96,7 @@ async def test_strangers_have_addresses_of_their_own_and_hear_answers() -> None:
         b.send(b"who is there", b.sources[0])
         await _until(lambda: bool(proxy.amplification.bytes_back))
         assert proxy.amplification.bytes_back == len(b"who is there")
-        await _until(lambda: proxy.journal.counts["flood-garbage", "injected"] == 300)
+        await _until(lambda: proxy.interventions["flood-garbage", "injected"] == 300)
 
 
 async def test_control_socket_changes_and_tells(tmp_path: Path) -> None:

@@ -8,13 +8,9 @@ from __future__ import annotations
 
 import asyncio
 import math
-import os
-import sys
-import termios
-import tty
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import AbstractAsyncContextManager, ExitStack, contextmanager, nullcontext
+from collections.abc import Callable
+from contextlib import AbstractAsyncContextManager, ExitStack, nullcontext
 from pathlib import Path
 from time import monotonic
 
@@ -113,11 +109,10 @@ async def run_demo(
         # The summary replaces the live screen; after Ctrl-C it remains.
         live = stack.enter_context(Live(console=console, auto_refresh=False)) if show and not serve else None
         try:
-            async with DaemonStage(NAMES, folder, MiddleHere(NAMES, 0), link, rate_hz=RATE_HZ) as stage:
-                demo = Demo(stage, live)
-                with _ended_by_q(demo) if show else nullcontext():
-                    async with serve(stage.drones[NAMES[0]].socket) if serve else nullcontext():
-                        summary = await demo.run(seconds, specs, lingers=serve is not None)
+            stage = DaemonStage(NAMES, folder, MiddleHere(NAMES, 0), link, rate_hz=RATE_HZ)
+            page = serve(stage.drones[NAMES[0]].socket) if serve else nullcontext()
+            async with stage, page:
+                summary = await Demo(stage, live).run(seconds, specs, lingers=serve is not None)
         except asyncio.CancelledError:
             if show:
                 console.print("Interrupted. The daemons have stopped, and their keys are deleted.")
@@ -129,34 +124,6 @@ async def run_demo(
     return summary
 
 
-@contextmanager
-def _ended_by_q(demo: Demo) -> Iterator[None]:
-    """End the demo's traffic when a person presses q."""
-    loop, keys = asyncio.get_running_loop(), sys.stdin.fileno()
-    try:
-        is_foreground = os.tcgetpgrp(keys) == os.getpgrp()
-    except OSError:  # not a terminal
-        is_foreground = False
-    if not is_foreground:  # a background process would be stopped
-        yield
-        return
-
-    def read() -> None:
-        typed = os.read(keys, 64)
-        demo.is_ended |= b"q" in typed.lower()
-        if not typed:  # the terminal is gone
-            loop.remove_reader(keys)
-
-    before = termios.tcgetattr(keys)
-    tty.setcbreak(keys)
-    loop.add_reader(keys, read)
-    try:
-        yield
-    finally:
-        loop.remove_reader(keys)
-        termios.tcsetattr(keys, termios.TCSADRAIN, before)
-
-
 class Demo:
     """A demo that runs, with the results of its attacks."""
 
@@ -164,8 +131,6 @@ class Demo:
         self.stage = stage
         self.results: list[AttackResult] = []
         self.is_attacking = False
-        self.is_ended = False
-        """Whether a person ended the traffic."""
         self._live = live
         self._began = stage.ledger.mark()
         self._drops_before = Counter[str]()
@@ -181,12 +146,10 @@ class Demo:
         if specs is None:
             await self.until(began_at + seconds)
         for spec in specs or ():
-            if not self.is_ended:
-                await self.attack(spec, seconds / len(specs or ()))
+            await self.attack(spec, seconds / len(specs or ()))
         is_attacked = specs is not None
         if is_attacked and lingers:
             await self.until(math.inf)
-        self.is_ended = False  # the last frames may still arrive
         end, elapsed_s = ledger.mark(), monotonic() - began_at
         if not is_attacked:
             await self.until(monotonic() + DRAIN_S, lambda: len(set(ledger.count(self._began, end))) == 1)
@@ -232,8 +195,6 @@ class Demo:
         await middle.attack([])
         await self.until(begin_at + share_s + (_DETECTION_S if spec.name in _WITHHOLDS else 0.0))
         self.is_attacking = False
-        if self.is_ended:  # it may have found no target yet
-            self.results.pop()
 
     async def _attempts(self, name: str) -> int:
         return sum((await self.stage.middle.statistics()).of([name]).values())
@@ -247,7 +208,7 @@ class Demo:
         return noticed
 
     async def until(self, done_at: float, is_done: Callable[[], bool] = lambda: False) -> bool:
-        while not (is_done() or self.is_ended) and monotonic() < done_at:
+        while not is_done() and monotonic() < done_at:
             await self._look(done_at)
             await asyncio.sleep(min(SCREEN_S, max(0.0, done_at - monotonic())))
         await self._look(done_at)

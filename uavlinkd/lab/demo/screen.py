@@ -87,7 +87,7 @@ def render(
         Panel(table, title="two daemons on this machine, each with a client", border_style="dim"),
         Panel(lines, title="every frame, byte for byte", border_style="dim"),
         *([Panel(_results(attacks[-_SHOWN:]), title="the man in the middle", border_style="red")] if attacks else []),
-        Text(f"{max(0.0, seconds_left):.1f} s left; q ends it", style="dim", justify="center"),
+        Text(f"{max(0.0, seconds_left):.1f} s left", style="dim", justify="center"),
     )
 
 

@@ -16,7 +16,7 @@ from uavlinkd.web.page import Page
 async def serving(control_socket: Path) -> AsyncIterator[None]:
     """Serve the page of this daemon, and print where."""
     with Page(control_socket, Address(HOST, 0)) as page:
-        print(f"the page is at {page.url} until q or Ctrl-C", flush=True)
+        print(f"the page is at {page.url} until Ctrl-C", flush=True)
         task = asyncio.create_task(page.run())
         try:
             yield

@@ -83,7 +83,7 @@ class MiddleLine:
             self._modems.link.release(end, monotonic())
 
     async def statistics(self) -> Interventions:
-        counts = self._modems.journal.counts
+        counts = self._modems.interventions
         return Interventions({f"{attack}: {operation}": count for (attack, operation), count in counts.items()})
 
     async def stop(self) -> None:

@@ -21,7 +21,7 @@ from uavlinkd.io.reader import RECEIVE_BYTES
 from uavlinkd.io.sockets import udp_socket
 from uavlinkd.lab.hostile.relay_attacks import ALL_ATTACKS, Lie, RelayAttack, RelayContext
 from uavlinkd.lab.mitm.attack import Action, AttackContext, AttackObject, Direction, Intervention
-from uavlinkd.lab.mitm.attack_service import ChannelService, Journal
+from uavlinkd.lab.mitm.attack_service import ChannelService
 from uavlinkd.lab.mitm.channel import AttackChannel
 from uavlinkd.lab.mitm.proxy import received
 from uavlinkd.protocol.crypto import Secret
@@ -120,7 +120,6 @@ class HostileRelay(ChannelService):
         except BaseException:
             await self._close()
             raise
-        self.journal = Journal(self.log)
         self._serve(now)
         for number, sock in enumerate(self._sockets):
             asyncio.get_running_loop().add_reader(sock, self._on_readable, number, sock)
@@ -185,9 +184,6 @@ class HostileRelay(ChannelService):
     def victim(self) -> tuple[str, int]:
         host, port = self._victim.getsockname()
         return host, port
-
-    def record(self, done: Intervention) -> None:
-        self.journal.add(done)
 
     def report_all(self) -> None:
         handles: dict[tuple[str, Path], dict[bytes, list[int]]] = {}
@@ -265,7 +261,7 @@ class HostileRelay(ChannelService):
     def _act(self, actions: Sequence[Action]) -> None:
         for action in actions:
             if isinstance(action, Intervention):
-                self.journal.add(action)
+                self.count(action)
             elif (target := self._targets.get(action.direction)) is not None:
                 handle, path = target
                 self.sent[action.direction] += 1
@@ -284,7 +280,6 @@ class HostileRelay(ChannelService):
             if now >= self._housekeeping_at:
                 self._housekeeping_at = now + HOUSEKEEPING_S
                 self._service.do_housekeeping(now)
-                self.journal.flush(now)
             self._act(self.channel.due(now))
             self._settle()
             await asyncio.sleep(TICK_S)

@@ -38,7 +38,7 @@ class AttackedRelay(Protocol):
     def victim(self) -> tuple[str, int]:
         """An address that is not a member's."""
 
-    def record(self, done: Intervention) -> None:
+    def count(self, done: Intervention) -> None:
         """Count an attempt."""
 
     def report_all(self) -> None:
@@ -72,7 +72,7 @@ class RelayAttack(Timed):
 
     def record(self, operation: Operation, member: str, length: int, now: float, detail: str) -> None:
         direction = Direction(self.relay.name, member)
-        self.relay.record(Intervention(now, self.name, operation, direction, 0, DatagramKind.OTHER, length, detail))
+        self.relay.count(Intervention(now, self.name, operation, direction, 0, DatagramKind.OTHER, length, detail))
 
 
 class Lie(RelayAttack, rate_per_s=20.0):

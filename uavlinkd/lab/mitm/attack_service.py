@@ -1,4 +1,4 @@
-"""What a man in the middle, emulated modems and a hostile relay share while they run: totals and a timer."""
+"""What a man in the middle, emulated modems and a hostile relay share while they run: counters and a timer."""
 
 from __future__ import annotations
 
@@ -11,56 +11,10 @@ from types import MappingProxyType
 from typing import ClassVar
 
 import structlog
-from structlog.typing import FilteringBoundLogger
 
 from uavlinkd.lab.mitm.attack import NEVER, Attack, AttackContext, AttackObject, Intervention
 from uavlinkd.lab.mitm.attacks import ATTACKS, AttackSpec, parse_attack
 from uavlinkd.lab.mitm.channel import AttackChannel
-
-SUM_INTERVAL_S = 10.0
-"""How often the totals of attacks that go on are logged."""
-
-
-class Journal:
-    """Counts the interventions, and logs the start and the totals of each attack for the operator."""
-
-    def __init__(self, log: FilteringBoundLogger) -> None:
-        self.counts: Counter[tuple[str, str]] = Counter()
-        self._log = log
-        self._logged: Counter[tuple[str, str]] = Counter()
-        self._sum_at = NEVER
-
-    def add(self, done: Intervention) -> None:
-        key = (done.attack, done.operation.value)
-        self.counts[key] += 1
-        if self.counts[key] == 1:
-            self._log.warning(
-                "attack_began",
-                attack=done.attack,
-                operation=key[1],
-                direction=str(done.direction),
-                detail=done.detail,
-            )
-        if self._sum_at == NEVER:
-            self._sum_at = done.at + SUM_INTERVAL_S
-
-    def flush(self, now: float) -> None:
-        if now < self._sum_at:
-            return
-        self._sum_at = NEVER
-        for key, count in self.counts.items():
-            if count > self._logged[key]:
-                self._log.warning("attack_continued", attack=key[0], operation=key[1], count=count)
-                self._logged[key] = count
-
-    def next_flush(self) -> float:
-        return self._sum_at
-
-    def close(self) -> None:
-        """Log the last totals."""
-        self._sum_at = min(self._sum_at, 0.0)
-        self.flush(NEVER)
-
 
 LOOP_TICK_S = 0.001
 """An event loop may fire a timer up to one clock tick early."""
@@ -75,7 +29,8 @@ class Service(ABC):
     def __init__(self, seed: int) -> None:
         self.log = structlog.get_logger().bind(daemon=self.kind)
         self.seed = seed
-        self.journal: Journal
+        self.interventions: Counter[tuple[str, str]] = Counter()
+        """By attack and operation."""
         self._began_at = monotonic()
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at = NEVER
@@ -97,7 +52,6 @@ class Service(ABC):
         statistics = self.statistics()
         await self._close()
         self.event("stopped", **statistics)
-        self.journal.close()
 
     @abstractmethod
     async def _close(self) -> None:
@@ -106,9 +60,17 @@ class Service(ABC):
     def event(self, name: str, **facts: object) -> None:
         self.log.info(f"{self.kind}_{name}", **facts)
 
+    def count(self, done: Intervention) -> None:
+        """Count an intervention, and log the first of its kind."""
+        key = (done.attack, done.operation.value)
+        self.interventions[key] += 1
+        if self.interventions[key] == 1:
+            facts = {"attack": done.attack, "operation": key[1], "direction": str(done.direction)}
+            self.log.warning("attack_began", **facts, detail=done.detail)
+
     def statistics(self) -> dict[str, object]:
         """The counters of this run, as plain data."""
-        counts = self.journal.counts.items()
+        counts = self.interventions.items()
         return {
             "seconds": round(monotonic() - self._began_at, 3),
             "seed": self.seed,
@@ -124,7 +86,7 @@ class Service(ABC):
         del now
 
     def arm(self) -> None:
-        deadline = min(self.next_deadline(), self.journal.next_flush())
+        deadline = self.next_deadline()
         if deadline < self._timer_at:
             self._stop_timer()
             self._timer_at = deadline
@@ -135,7 +97,6 @@ class Service(ABC):
         now = monotonic()
         self._timer_at = NEVER
         self.act(now)
-        self.journal.flush(now)
         self.arm()
 
     def _stop_timer(self) -> None:

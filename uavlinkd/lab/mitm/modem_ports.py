@@ -17,7 +17,7 @@ from pathlib import Path
 from random import Random
 from time import monotonic
 
-from uavlinkd.lab.mitm.attack_service import Journal, Service
+from uavlinkd.lab.mitm.attack_service import Service
 from uavlinkd.lab.mitm.line_attacks import LineAttack, LineAttacker
 from uavlinkd.lab.mitm.modem import ModemEnd, ModemLink, ModemSettings
 
@@ -54,7 +54,6 @@ class ModemPorts(Service):
     async def start(self) -> None:
         self._loop = asyncio.get_running_loop()
         self._began_at = monotonic()
-        self.journal = Journal(self.log)
         try:
             for end in ModemEnd:
                 self._open_device(end)
@@ -62,7 +61,7 @@ class ModemPorts(Service):
             await self._close()
             raise
         rng = Random(f"line {self.seed}")  # noqa: S311  not a secret
-        self.attacker = LineAttacker(self.link, rng, self.journal.add)
+        self.attacker = LineAttacker(self.link, rng, self.count)
         devices = {str(end): str(self.settings.device(end)) for end in ModemEnd}
         self.event("started", seed=self.seed, devices=devices)
         self.arm()

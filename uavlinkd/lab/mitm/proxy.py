@@ -19,7 +19,7 @@ from typing import Any
 from uavlinkd.io.reader import DATAGRAMS_PER_WAKE_UP, RECEIVE_BYTES
 from uavlinkd.io.sockets import BindError, udp_socket
 from uavlinkd.lab.mitm.attack import Action, AttackContext, AttackError, Direction, Intervention
-from uavlinkd.lab.mitm.attack_service import ChannelService, Journal
+from uavlinkd.lab.mitm.attack_service import ChannelService
 from uavlinkd.lab.mitm.channel import AttackChannel
 from uavlinkd.lab.mitm.proxy_settings import ProxySettings
 from uavlinkd.ops.control import ControlServer
@@ -129,7 +129,6 @@ class Proxy(ChannelService):
         except BaseException:
             await self._close()
             raise
-        self.journal = Journal(self.log)
         loop = asyncio.get_running_loop()
         for direction, sock in self._sockets.items():
             loop.add_reader(sock, self._on_listener_readable, sock, direction)
@@ -240,7 +239,7 @@ class Proxy(ChannelService):
     def _perform(self, actions: Sequence[Action]) -> None:
         for action in actions:
             if isinstance(action, Intervention):
-                self.journal.add(action)
+                self.count(action)
                 continue
             datagram, direction, stranger = action
             to = self._addresses.get((direction.receiver, direction.path))

@@ -20,13 +20,10 @@ class Mode(IntEnum):
     """Flight modes, with ArduCopter's custom_mode numbers."""
 
     STABILIZE = 0
-    ALT_HOLD = 2
     GUIDED = 4
     LOITER = 5
     RTL = 6
     LAND = 9
-    POSHOLD = 16
-    BRAKE = 17
 
 
 class Landed(IntEnum):
