@@ -18,7 +18,6 @@ from tests.processes.test_reload import reload
 from tests.relay.core_member import CoreMember
 from uavlinkd.config.keys import decode_key, encode_key
 from uavlinkd.lab.sim.loopback_ports import free_port, has_ipv6
-from uavlinkd.protocol.crypto import KeyPair
 from uavlinkd.system.addresses import Address
 
 INNER = b"\x40datagram"
@@ -59,33 +58,6 @@ def member_of(status: Status, name: str) -> dict[str, Any]:
     """The member in a status."""
     member: dict[str, Any] = status["relay"]["members"][name]
     return member
-
-
-@pytest.mark.short
-async def test_members_reach_each_other_through_the_relay(relay: DaemonProcess, make_member: MakeMember) -> None:
-    """Handles, data in both directions, the addresses that the relay sees, and its counters."""
-    drone, station = make_member("drone1"), make_member("station")
-    await relay.start()
-    to_station, to_drone = await connect(drone, station)
-    assert (drone.bounds[-1].host, drone.bounds[-1].port) == drone.address
-    drone.send(to_station, INNER)
-    await station.until(lambda: station.data == [to_drone.to_bytes(2, "big") + INNER])
-    station.send(to_drone, INNER)
-    await drone.until(lambda: drone.data == [to_station.to_bytes(2, "big") + INNER])
-    status = await relay.until(lambda status: status["relay"]["connections"] == 1)
-    assert status["frames_pass"]
-    assert status["relay"]["dropped"] == {}
-    host, port = drone.address
-    size = 3 + len(INNER)
-    expected = {
-        "is_up": True,
-        "addresses": [f"{host}:{port}"],
-        "bound": 1,
-        "waiting": 0,
-        "datagrams": 1,
-        "bytes": size,
-    }
-    assert member_of(status, "drone1").items() >= expected.items()
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
@@ -147,23 +119,3 @@ async def test_member_may_become_a_peer_too(relay: DaemonProcess, make_member: M
     status = await relay.until(lambda status: status["peers"]["drone1"]["frames_received"] == 1)
     assert status["relay"]["connections"] == 1
     assert "frames_not_allowed" not in status["drops"]
-
-
-async def test_names_and_keys_of_members_may_go_to_others(relay: DaemonProcess, make_member: MakeMember) -> None:
-    """In one reload: a renamed member's name to a peer with another key."""
-    drone, station = make_member("drone1"), make_member("station")
-    await relay.start()
-    await connect(drone, station)
-    other = encode_key(KeyPair(bytes([7]) * 32).public)
-    relay.config["peer"] = [{"name": "drone1", "public_key": other, "role": "all", "system_ids": "all", "relays": []}]
-    relay.config["member"] = [
-        {"name": "drone2", "public_key": encode_key(drone.key)},
-        {"name": "station", "public_key": encode_key(station.key)},
-    ]
-    assert await reload(relay) == []
-    status = await relay.status()
-    assert set(status["relay"]["members"]) == {"drone2", "station"}
-    assert set(status["peers"]) == {"drone1"}
-    made = drone.peer.traffic.handshakes
-    await drone.until(lambda: drone.peer.traffic.handshakes > made)
-    await connect(drone, station)

@@ -7,7 +7,6 @@ import errno
 import socket
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
@@ -19,12 +18,12 @@ from uavlinkd.daemon.features import NetworkFacts, PathKind, Reachable, Sender
 from uavlinkd.daemon.journal import DaemonJournal, ShellReason
 from uavlinkd.daemon.networks import NetworkBudget, Networks, Receive
 from uavlinkd.daemon.peer_names import PeerNames
+from uavlinkd.daemon.peer_socket import PeerSocket
 from uavlinkd.io.ports import failure_name
-from uavlinkd.io.reader import PAUSE_S, Reader
+from uavlinkd.io.reader import PAUSE_S
 from uavlinkd.io.resolver import Resolved
 from uavlinkd.io.sockets import (
     BindError,
-    ErrorReports,
     is_absent,
     is_here,
     send_again,
@@ -41,9 +40,6 @@ from uavlinkd.system.stall import StallWatch
 
 _EPHEMERAL = (Address("0.0.0.0", 0), Address("::", 0))
 """Without a listen address the daemon only connects to peers, from any port."""
-RELAY_BUFFER_BYTES: Final = 1 << 22
-"""Requested for the receive buffers of a relay: 10,000 short datagrams, a busy relay's in 0.2 s. The kernel may grant
-less (net.core.rmem_max)."""
 LOOK_AGAIN_S: Final = 0.1
 """After failed sends, the networks are looked at this often at most."""
 _NETWORK_CHANGED: Final = frozenset(
@@ -56,24 +52,6 @@ _NETWORK_CHANGED: Final = frozenset(
 
 Wrap = Callable[[bytes, Path], tuple[bytes, SocketAddress] | None]
 """Returns what is sent instead of a datagram along a relayed path, and where; None if the handle is gone."""
-
-
-def _send_nowhere(datagram: bytes, address: SocketAddress) -> int:
-    """Send from a socket that is closed because its network is absent."""
-    raise OSError(errno.ENODEV, "the network is absent")
-
-
-@dataclass(slots=True, eq=False)
-class _Slot:
-    """The place of a socket, by number: the socket may be replaced while the daemon runs."""
-
-    number: int
-    family: int
-    send: Sender = _send_nowhere
-    sock: socket.socket | None = None
-    reader: Reader | None = None
-    """None until the daemon reads it."""
-    reports: ErrorReports | None = None
 
 
 class PeerSockets:
@@ -100,7 +78,7 @@ class PeerSockets:
         self._evidence = evidence
         self._log = log
         self._node = node
-        self._slots: list[_Slot] = []
+        self._slots: list[PeerSocket] = []
         self._kinds: list[PathKind] = []
         self._envelope_limits: dict[int, int] = {}
         self._wrap: Wrap | None = None
@@ -185,7 +163,7 @@ class PeerSockets:
         if networks:
             self.networks = Networks(networks, addresses, self.put, self.open_sockets, self._node, self._log)
             for one in self.networks.sockets.values():
-                self._slots.append(_Slot(one.number, one.family))
+                self._slots.append(PeerSocket(one.number, one.family))
             self.networks.open(monotonic())
         else:
             for number, address in enumerate(addresses or _EPHEMERAL):
@@ -193,7 +171,7 @@ class PeerSockets:
                     sock = udp_socket(address, may_come_later=True)
                 except BindError as error:
                     raise BindError(f"listen: {error}") from None
-                self._slots.append(_Slot(number, sock.family))
+                self._slots.append(PeerSocket(number, sock.family))
                 self.put(number, sock)
         for network in self.networks.networks:
             if network.config.budget_bits_s:  # its sockets share it
@@ -213,7 +191,7 @@ class PeerSockets:
     ) -> int:
         """Reserve the next socket number for a path of another kind, and return it."""
         number = len(self._slots)
-        self._slots.append(_Slot(number, socket.AF_UNSPEC, send))
+        self._slots.append(PeerSocket(number, send=send))
         if budget is not None:
             self.budgets[number] = budget
         if envelope_limit is not None:
@@ -237,16 +215,10 @@ class PeerSockets:
 
     def put(self, number: int, sock: socket.socket | None) -> None:
         """Use this socket under a number from now on, and close the one before. None: there is no socket."""
-        slot = self._slots[number]
-        if slot.reader is not None:
-            slot.reader.stop()
-        if slot.sock is not None:
-            slot.sock.close()
-        slot.sock, slot.reader, slot.reports = sock, None, None
-        slot.send = _send_nowhere if sock is None else sock.sendto
+        self._slots[number].put(sock)
         self._choose_senders()
         if self._is_started:
-            self._read(slot)
+            self._read(self._slots[number])
 
     def start(
         self,
@@ -269,20 +241,13 @@ class PeerSockets:
         if self.networks.networks:
             self.check_networks()
 
-    def _read(self, slot: _Slot) -> None:
-        if slot.sock is not None:
-            if not self.pause_s:
-                slot.sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RELAY_BUFFER_BYTES)
-            receive, on_failure = partial(self._receive, slot.number), partial(self._on_read_error, slot)
-            slot.reader = Reader(slot.sock, receive, on_failure, self._stall, self.pause_s)
-            slot.reader.start()
-            slot.reports = ErrorReports(slot.sock)
+    def _read(self, slot: PeerSocket) -> None:
+        slot.read(self._receive, partial(self._on_read_error, slot), self._stall, self.pause_s)
 
     def do_housekeeping(self) -> None:
         """Have the kernel report errors again, and look at the networks. Call it once a second."""
         for slot in self._slots:
-            if slot.reports is not None:
-                slot.reports.renew()
+            slot.renew_reports()
         self.check_networks()
         for kind in self._kinds:
             run(kind.do_housekeeping)
@@ -342,18 +307,15 @@ class PeerSockets:
             # Not now: the core may be in the middle of its outputs.
             asyncio.get_running_loop().call_soon(self.check_networks)
 
-    def _on_read_error(self, slot: _Slot, error: OSError) -> None:
+    def _on_read_error(self, slot: PeerSocket, error: OSError) -> None:
         if not self._take_errors(slot):
             self._count_failure(error, None)
 
-    def _take_errors(self, slot: _Slot) -> bool:
+    def _take_errors(self, slot: PeerSocket) -> bool:
         """Note the ICMP errors of earlier datagrams. Returns whether there were any."""
-        if slot.reports is None or slot.reader is None:  # not started
-            return False
-        reports = slot.reports.take()
+        reports = slot.take_errors()
         for address, code in reports:
             self._evidence.add_error(REPORTED + errno.errorcode.get(code, "OSError"), address, monotonic())
-        slot.reader.renew()
         return bool(reports)
 
     def _count_failure(self, error: OSError, address: SocketAddress | None) -> None:
