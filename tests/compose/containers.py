@@ -11,7 +11,7 @@ from typing import Any
 
 from tests.compose import images
 from tests.compose.cluster import run, until
-from tests.fleet.vehicles import create
+from tests.fleet.folders import create
 from uavlinkd.ops.control import ControlError, ask
 from uavlinkd.system.addresses import Address
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.fleet.vehicles import create, join
+from tests.fleet.folders import create, join
 from tests.waiting import PATIENCE_S
 from uavlinkd.authority.certificates import MemberRole
 from uavlinkd.authority.enrolment import FleetError

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.fleet.conftest import Say
-from tests.fleet.vehicles import create
+from tests.fleet.folders import create
 from uavlinkd.authority.certificates import MemberRole
 from uavlinkd.authority.enrolment import fingerprint_of
 from uavlinkd.cli import main

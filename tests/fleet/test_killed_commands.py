@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from tests.fleet.vehicles import create
+from tests.fleet.folders import create
 from uavlinkd.authority.certificates import parse_certificate
 from uavlinkd.cli import main
 from uavlinkd.fleet.authority_key import load_key, paper_copy

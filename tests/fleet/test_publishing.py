@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.fleet.vehicles import create, loaded, unasked
+from tests.fleet.folders import create, loaded, unasked
 from uavlinkd.authority.certificates import parse_bulletin
 from uavlinkd.authority.enrolment import FleetError
 from uavlinkd.authority.trust import Trust

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.fleet.conftest import Say
-from tests.fleet.vehicles import create, loaded
+from tests.fleet.folders import create, loaded
 from uavlinkd.authority.trust import BulletinVerdict, Trust
 from uavlinkd.fleet.authority_key import load_key, paper_copy
 from uavlinkd.fleet.manifest import Fleet, read_manifest, toml_text

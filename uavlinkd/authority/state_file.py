@@ -6,17 +6,27 @@ checksum of the lines before.
 
 from __future__ import annotations
 
+import asyncio
 from base64 import b64decode, b64encode
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from stat import S_ISREG
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
+from uavlinkd.authority.constants import HAVE_INTERVAL_S
 from uavlinkd.authority.trust import BulletinVerdict, Trust
+from uavlinkd.protocol.constants import NEVER
 from uavlinkd.protocol.crypto import sha256
 from uavlinkd.protocol.drops import Drop
+from uavlinkd.system.clock import monotonic
 from uavlinkd.system.folders import replace_file
+from uavlinkd.system.guard import report
+from uavlinkd.system.tasks import Threads
 
+STOP_WAIT_S: Final = 2.0
+"""A disk that hangs delays the end of the daemon by this time at most."""
+_THREAD = Threads(1, "fleet state")
 _TITLE = b"uavlinkd fleet state 2"
 _MOST_BYTES = 65536  # of the file. The longest one has 260 members of 182 bytes.
 
@@ -73,3 +83,48 @@ def _parse(data: bytes) -> FleetState | None:
     except ValueError:
         return None
     return state if _encode(state) == data else None
+
+
+class FleetDisk:
+    """The file of one daemon, written in a thread: nothing waits for it.
+
+    ``state`` returns what it is to have, ``on_written`` is called with what it has.
+    """
+
+    def __init__(self, path: Path, state: Callable[[], FleetState], on_written: Callable[[FleetState], None]) -> None:
+        self._path = path
+        self._state = state
+        self._on_written = on_written
+        self._writing: asyncio.Task[None] | None = None
+        self.problem = ""
+        """Why the file could not be written; empty if it was."""
+        self.again_at = NEVER
+        """When it is to be written again: monotonic seconds."""
+
+    def write(self) -> None:
+        """Write the present state. A later change during that is written too."""
+        self.again_at = NEVER
+        if self._writing is None:
+            self._writing = asyncio.get_running_loop().create_task(self._write())
+
+    async def stop(self) -> None:
+        """Wait for a write that has begun, for at most :data:`STOP_WAIT_S`."""
+        if self._writing is not None:
+            await asyncio.wait([self._writing], timeout=STOP_WAIT_S)
+
+    async def _write(self) -> None:
+        state = None
+        try:
+            while state != self._state():
+                state = self._state()
+                await _THREAD.run(write, self._path, state)
+                self.problem = ""
+                self._on_written(state)
+        except Exception as error:
+            if not isinstance(error, OSError):
+                report(error)
+            reason = (isinstance(error, OSError) and error.strerror) or f"{type(error).__name__}, a fault inside"
+            self.problem = f"{self._path} cannot be written: {reason}"
+            self.again_at = monotonic() + HAVE_INTERVAL_S
+        finally:
+            self._writing = None

@@ -14,12 +14,11 @@ from uavlinkd.authority import state_file
 from uavlinkd.authority.certificates import Certificate, parse_certificate, role_bits
 from uavlinkd.authority.constants import CERTIFICATES, CONTACTS_FIRST_S
 from uavlinkd.authority.exchange import BulletinExchange, Reaction
-from uavlinkd.authority.state_file import FleetState
+from uavlinkd.authority.state_file import FleetDisk, FleetState
 from uavlinkd.authority.trust import BulletinVerdict, Trust, longest_down
 from uavlinkd.config.members import member_peer, most_members, relay_member, reserved
 from uavlinkd.config.model import Config, FleetConfig, PeerConfig
 from uavlinkd.daemon.features import Feature
-from uavlinkd.fleet.disk import FleetDisk
 from uavlinkd.fleet.member_questions import MemberQuestions
 from uavlinkd.protocol import constants as c
 from uavlinkd.protocol import outputs as o

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from tests.waiting import until
 from uavlinkd.authority import state_file
-from uavlinkd.authority.state_file import FleetState
-from uavlinkd.fleet.disk import FleetDisk
+from uavlinkd.authority.state_file import FleetDisk, FleetState
 from uavlinkd.system.clock import monotonic
 
 FIRST, SECOND = FleetState(b"first"), FleetState(b"second")
