@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from math import inf
-
 import pytest
 
 from tests.authority.signing import AUTHORITY, bulletin, published, signed, vehicle
 from uavlinkd.authority import constants as c
 from uavlinkd.authority.certificates import Bulletin, digest_of
 from uavlinkd.authority.exchange import ROLLED_BACK, BulletinExchange, Reaction
-from uavlinkd.authority.trust import BulletinVerdict, Trust
+from uavlinkd.authority.trust import Trust
 from uavlinkd.protocol.drops import Drop, DropReason
 from uavlinkd.protocol.relay_records import BulletinRecord, CertificateRecord, FleetRecord, Have, Who
 
@@ -72,17 +70,6 @@ class Daemon:
 
 MINE = Have(5, digest_of(OLD), 10, 20)
 """What the daemon states to the peer in the beginning."""
-
-
-def test_equal_ends() -> None:
-    """Each states once what it has. Then they are silent."""
-    daemon = Daemon()
-    assert daemon.exchange.next_at == inf
-    assert daemon.up() == [(PEER, MINE)]
-    assert daemon.receive(have(OLD)) == Reaction()
-    assert daemon.exchange.shown(PEER) == 5
-    assert daemon.exchange.shown(OTHER) is None
-    assert daemon.hour() == []
 
 
 def test_session_that_replaces_another_one() -> None:
@@ -152,16 +139,6 @@ def test_peer_with_a_newer_bulletin() -> None:
     assert daemon.hour(NOW + 2) == []
 
 
-def test_wait_follows_the_round_trip() -> None:
-    """A slow handshake does not slow the bulletin down."""
-    daemon = Daemon(NEW)
-    daemon.up()
-    daemon.wait_s = 4 * WAIT_S
-    daemon.receive(have(OLD), NOW + 1)
-    sent = [at for at, *_ in daemon.hour(NOW + 1)]
-    assert sent[1] - sent[0] == 4 * WAIT_S
-
-
 def test_disk_that_cannot_be_written() -> None:
     """The bulletin counts and is passed on. No *have* states it, and a bulletin that is repeated causes none."""
     daemon = Daemon()
@@ -178,54 +155,6 @@ def test_disk_that_cannot_be_written() -> None:
     assert daemon.trust.bulletin.number == 6
     daemon.exchange.note_persisted(6, digest_of(NEW))
     assert daemon.due(NOW + 4001) == [(PEER, Have(6, digest_of(NEW), 10, 20))]
-
-
-def test_bulletin_is_answered() -> None:
-    """Its sender may have missed what this end stated."""
-    daemon = Daemon(NEW)
-    daemon.up()
-    daemon.receive(have(NEW))
-    for data in (NEW, OLD):
-        assert daemon.receive(BulletinRecord(data), NOW + 0.01) == Reaction()
-        assert daemon.exchange.next_at == NOW + c.HAVE_LEAST_S
-    assert daemon.due(NOW + c.HAVE_LEAST_S) == [(PEER, MINE._replace(number=6, digest=digest_of(NEW)))]
-    assert daemon.hour(NOW + 1) == []
-
-
-def test_sender_of_a_bulletin_does_not_get_it_back() -> None:
-    """Though it stated an older one before."""
-    daemon = Daemon()
-    daemon.up()
-    daemon.receive(have(OLD))
-    daemon.receive(BulletinRecord(NEW))
-    assert daemon.exchange.shown(PEER) == 6
-    daemon.exchange.note_persisted(6, digest_of(NEW))
-    assert [record for _, _, record in daemon.hour(NOW + 1)] == [Have(6, digest_of(NEW), 10, 20)]
-
-
-def test_have_is_answered() -> None:
-    """But not if this end stated it a moment ago: two ends do not answer each other without end."""
-    daemon = Daemon()
-    daemon.up()
-    daemon.receive(have(OLD))
-    daemon.receive(have(OLD), NOW + 0.4)
-    assert daemon.hour(NOW + 0.4) == []
-    daemon.receive(have(OLD), NOW + WAIT_S)
-    assert daemon.due(NOW + WAIT_S) == [(PEER, MINE)]
-    daemon.receive(have(OLD), NOW + WAIT_S + 0.1)
-    assert daemon.hour(NOW + 1) == []
-
-
-def test_bulletin_from_the_operator() -> None:
-    """All peers that are up get it within the jitter; the same one again changes nothing."""
-    daemon, gone = Daemon(), bytes(32)
-    daemon.up(PEER, OTHER, gone)
-    daemon.exchange.on_down(gone)
-    daemon.receive(have(OLD))
-    daemon.receive(have(OLD, serial=3), key=OTHER)
-    assert daemon.exchange.publish(NEW, NOW) == (BulletinVerdict.NEWER, Reaction(persists=True))
-    assert daemon.due(NOW + 0.1) == [(PEER, BulletinRecord(NEW)), (OTHER, BulletinRecord(NEW))]
-    assert daemon.exchange.publish(NEW, NOW) == (BulletinVerdict.KNOWN, Reaction())
 
 
 def test_revoked_peer_ends() -> None:
@@ -272,14 +201,6 @@ def test_other_digest_of_the_same_number() -> None:
     assert daemon.receive(other).event == "bulletin_conflict"
     assert daemon.receive(other).event == ""
     assert daemon.hour() == []
-
-
-def test_other_digest_of_the_number_that_is_accepted() -> None:
-    """A peer had stated it before this end had a bulletin of that number."""
-    daemon = Daemon()
-    daemon.up(PEER, OTHER)
-    daemon.receive(have(bulletin(6, 3)))
-    assert daemon.receive(BulletinRecord(NEW), key=OTHER) == Reaction(persists=True, event="bulletin_conflict")
 
 
 def test_peer_whose_disk_was_restored() -> None:

@@ -50,12 +50,6 @@ def test_state_is_read_back(path: Path, state: FleetState) -> None:
     assert path.stat().st_size < state_file._MOST_BYTES
 
 
-def test_older_state(path: Path) -> None:
-    """The configuration counts where it is newer."""
-    state_file.write(path, FleetState(bulletin(0)))
-    assert start(path) == (CONFIGURED, "")
-
-
 def variants(data: bytes) -> Iterator[bytes]:
     """Files that are torn, have one other bit, or something behind."""
     yield from (data[:size] for size in range(len(data)))

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from tests.authority.signing import AUTHORITY, CERTIFICATE, FLEET, bulletin, published, signed, vehicle
 from uavlinkd.authority.certificates import (
     GENERATION,
-    MOST_REVOKED,
     Bulletin,
     Certificate,
     MemberRole,
@@ -58,14 +57,6 @@ def test_start_with_what_is_not_valid(certificate: bytes, first: bytes, cause: s
     """The message says which of the two it is."""
     with pytest.raises(ValueError, match=cause):
         Trust(AUTHORITY, OWN, certificate, first)
-
-
-def test_daemon_without_a_certificate() -> None:
-    """It still follows bulletins."""
-    known = Trust(AUTHORITY, OWN, b"", bulletin(1))
-    assert known.own is None
-    known.hold(KEY, signed(vehicle(1), KEY))
-    assert known.receive_bulletin(bulletin(2, 1)) == (BulletinVerdict.NEWER, [KEY])
 
 
 @pytest.mark.parametrize(
@@ -248,9 +239,3 @@ def test_any_history_of_certificates(history: list[tuple[int, int, int]]) -> Non
         assert all(other not in known.held for other in ended if other != key)
         names = [held.certificate.name for held in known.held.values()]
         assert len(names) == len(set(names))
-
-
-def test_largest_bulletin_is_accepted() -> None:
-    """With as many revoked serials as fit."""
-    known = trust()
-    assert known.receive_bulletin(bulletin(2, *range(2, 2 + MOST_REVOKED)))[0] is BulletinVerdict.NEWER

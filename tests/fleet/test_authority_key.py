@@ -95,13 +95,6 @@ def test_no_terminal_to_type_on(monkeypatch: pytest.MonkeyPatch) -> None:
         passphrase_from(None)("authority.pem")
 
 
-def test_key_without_a_passphrase_is_named(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """For tests and demonstrations."""
-    assert main([*INIT, "--no-passphrase"]) == 0
-    assert "has no passphrase: each copy of it can sign" in capsys.readouterr().err
-    assert main(["fleet", "paper"]) == 0
-
-
 @pytest.mark.long
 def test_passphrase_typed_twice_on_a_terminal(tmp_path: Path) -> None:
     """The terminal does not show it, also if it is typed before the prompt. Only there, the paper copy is printed."""

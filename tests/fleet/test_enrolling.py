@@ -11,7 +11,6 @@ import pytest
 
 from tests.fleet.conftest import Say
 from tests.fleet.folders import create
-from uavlinkd.authority.certificates import MemberRole
 from uavlinkd.authority.enrolment import fingerprint_of
 from uavlinkd.cli import main
 from uavlinkd.config.load import load_config
@@ -150,24 +149,6 @@ def test_former_key_that_cannot_be_deleted_is_an_error(
     assert "The former key, v7.key, was deleted." in say("enroll --finish", line)
     assert [path.name for path in place.glob("v7*.key")] == ["v7.2.key"]
     assert not list(place.glob(".*"))
-
-
-def test_url_of_an_existing_file_is_not_changed(place: Path, say: Say) -> None:
-    """Another one is refused, because it would have no effect."""
-    line = say("fleet sign", say("enroll v7"))
-    url = "udpin:127.0.0.1:14551"
-    say(f"enroll --finish --url {url}", line)
-    assert "write the url into its [[endpoint]]" in say("enroll --finish --url serial:/dev/ttyACM0:57600", line)
-    assert "is a member" in say(f"enroll --finish --url {url}", line)
-
-
-def test_revoked_member_returns_as_it_was(place: Path, say: Say) -> None:
-    """With a new key, and `--replace`."""
-    enrolled(say, "v7", "--role observer --id 70")
-    say("fleet remove v7")
-    enrolled(say, "v7", "--replace v7")
-    member = read_manifest(place / "fleet").member("v7")
-    assert (member.role, member.ids, member.certificate.serial) == (MemberRole.OBSERVER, "70", 3)
 
 
 def test_lines_that_cannot_be_used_are_refused(

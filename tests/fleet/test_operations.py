@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import threading
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,14 +11,13 @@ from pathlib import Path
 import pytest
 
 from tests.fleet.folders import create, join, loaded, renew, unasked
-from tests.waiting import PATIENCE_S
 from uavlinkd.authority.certificates import MemberRole
 from uavlinkd.authority.enrolment import FleetError, Request
 from uavlinkd.config import keys
 from uavlinkd.fleet import operations
 from uavlinkd.fleet.authority_key import AUTHORITY_FILE
 from uavlinkd.fleet.files import reply_for
-from uavlinkd.fleet.manifest import Fleet, parse_addresses, read_manifest, toml_text
+from uavlinkd.fleet.manifest import Fleet, parse_addresses, read_manifest
 from uavlinkd.fleet.operations import lock
 from uavlinkd.fleet.signing import Identity
 from uavlinkd.system import folders
@@ -241,40 +239,6 @@ def test_members_whose_contacts_changed_are_named(folder: Path) -> None:
     before = read_manifest(folder)
     join(folder, "v7")
     assert read_manifest(folder).with_other_contacts(before) == []
-
-
-def test_any_table_is_written_as_it_was_read() -> None:
-    """Keys that need quotes, control characters, empty lists, and tables in tables."""
-    table = {
-        "name": 'a "b"\\\n\x1f é',
-        "none": [],
-        "link": {"a key": {"b.c": [1, 2.5, True, {"d": "\t"}]}},
-        "empty": {},
-        "peer": [{"name": "one"}, {}],
-    }
-    assert tomllib.loads(toml_text(table)) == table
-
-
-def test_two_commands_create_one_fleet(tmp_path: Path) -> None:
-    """The second waits for the first, and neither deletes what the other one writes."""
-    started = threading.Barrier(2)
-    refusals: list[str] = []
-
-    def init() -> None:
-        started.wait(PATIENCE_S)
-        try:
-            create(tmp_path / "fleet")
-        except FleetError as error:
-            refusals.append(str(error))
-
-    threads = [threading.Thread(target=init) for _ in range(2)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert len(refusals) == 1
-    assert read_manifest(tmp_path / "fleet").members == ()
-    assert [path.name for path in tmp_path.iterdir()] == ["fleet"]
 
 
 def test_failed_write_changes_nothing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

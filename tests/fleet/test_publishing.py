@@ -90,19 +90,6 @@ async def test_bulletin_reaches_the_daemon(daemon: Daemon) -> None:
     assert len(daemon.certificates) == 41 + 40 + 40 + 39
 
 
-def test_removal_without_a_daemon_says_what_is_left_to_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The member is revoked in the folder already."""
-    create(tmp_path / "fleet", drones=1, relays=RELAYS)
-    assert (
-        main(["fleet", "remove", "drone1", "--out", str(tmp_path / "fleet"), "--socket", str(tmp_path / "no")]) == 1
-    )
-    said = capsys.readouterr()
-    assert "drone1 is revoked, by bulletin 2." in said.out
-    assert "the other members (1) have not heard of it" in said.err
-    assert f"when you run `uavlinkd fleet publish --socket {tmp_path / 'no'}`" in said.err
-    assert read_manifest(tmp_path / "fleet").bulletin.revoked == (2,)
-
-
 def test_removal_without_a_service_revokes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

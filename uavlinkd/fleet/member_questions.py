@@ -27,13 +27,11 @@ class _Asking:
     rounds: int = 0
     """That ended since one found a member."""
     tries: int = 0
-    """Of the last question."""
+    """Of the last question; 0 while all rounds have ended."""
     after: int = 0
     """The highest serial of this round: ask on from there."""
     received: int = 0
     """Certificates since the last question."""
-    is_resting: bool = False
-    """All rounds have ended."""
 
 
 class MemberQuestions:
@@ -69,10 +67,12 @@ class MemberQuestions:
                 elif asking.tries == WHO_TRIES:
                     asking.tries = asking.after = 0
                     asking.rounds += 1
+                    if asking.rounds > WHO_ROUNDS:
+                        asking.due_at = now + WHO_INTERVAL_S
+                        continue
                 yield relay, Who(roles, asking.after)
                 asking.tries, asking.received = asking.tries + 1, 0
-                asking.is_resting = asking.tries == WHO_TRIES and asking.rounds >= WHO_ROUNDS
-                asking.due_at = now + (WHO_INTERVAL_S if asking.is_resting else self._soon_s(relay))
+                asking.due_at = now + self._soon_s(relay)
 
     def note(self, relay: bytes, serial: int, now: float) -> None:
         """A relay sent the certificate with this serial. Ask for the others: at once if the answer was full.
@@ -80,7 +80,7 @@ class MemberQuestions:
         Without a question it is an introduction, which has no effect here.
         """
         asking = self._askings.get(relay)
-        if asking is None or asking.is_resting:
+        if asking is None or asking.tries == 0:
             return
         asking.received += 1
         asking.after = max(asking.after, serial)
