@@ -111,9 +111,7 @@ def test_peer_inherits_key_by_key(tmp_path: Path) -> None:
     ]
 
 
-@pytest.mark.parametrize(
-    "key", ["rekey_after_s", "reject_after_s", "retry_max_s", "keepalive_s", "lost_after_s", "probe_interval_s"]
-)
+@pytest.mark.parametrize("key", ["rekey_after_s", "reject_after_s", "retry_max_s", "keepalive_s", "lost_after_s"])
 def test_every_timer_reaches_the_core(tmp_path: Path, key: str) -> None:
     """A key changes the core's setting of the same name, and ``lost_after_s`` the times before it in proportion."""
     expected = {key: getattr(Timers(), key) * 1.125}

@@ -15,7 +15,7 @@ __all__ = ["stage"]
 
 async def test_the_link_is_described(stage: Stage) -> None:
     """State, path, suite, mode, tag and ages, as they are, in strict JSON: no NaN, no infinity."""
-    a, b = stage.pair(probe_interval_s=0.1)
+    a, b = stage.pair()
     into_a, into_b = a.add_endpoint("autopilot"), b.add_endpoint("autopilot")
     await stage.start(a, b)
     one, other = await stage.client(), await stage.client()

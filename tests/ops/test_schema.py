@@ -84,7 +84,7 @@ async def observed() -> dict[str, str]:
     """Every name with its types: of a daemon, then its peer, with a frame to each; with networks, and relays."""
     statuses: list[dict[str, Any]] = []
     async with Stage() as stage:
-        a, b = stage.pair(probe_interval_s=0.1)
+        a, b = stage.pair()
         a.config["peer"][0]["system_ids"] = [9]
         into_a, into_b = a.add_endpoint("autopilot"), b.add_endpoint("autopilot")
         await stage.start(a, linked=False)

@@ -8,7 +8,7 @@ from tests.processes.harness import Stage
 async def test_a_vehicle_says_that_it_has_no_client() -> None:
     """As a fault in the findings of the other end, whose own endpoints are no cause for it."""
     async with Stage() as stage:
-        vehicle, station = stage.pair(probe_interval_s=0.1)
+        vehicle, station = stage.pair()
         vehicle.add_endpoint("autopilot")
         await stage.start(vehicle, station)
         status = await station.until(lambda status: bool(status["peers"][vehicle.name]["problems_there"]))

@@ -187,7 +187,7 @@ def _peer(file: File, peer: Values) -> PeerConfig:
 def _link(keys: Values) -> Link:
     """The settings of one link. ``lost_after_s`` sets the pace of the questions before it."""
     tag_bytes, pace = keys.get("tag_bits") // 8, keys.get("lost_after_s") / c.LOST_AFTER_S
-    same = ("rekey_after_s", "retry_max_s", "keepalive_s", "lost_after_s", "probe_interval_s")
+    same = ("rekey_after_s", "retry_max_s", "keepalive_s", "lost_after_s")
     timers = {key: keys.get(key) for key in same}
     least_s = timers["rekey_after_s"] + _RETRIES_BEFORE_REJECT * timers["retry_max_s"]
     return Link(

@@ -156,6 +156,7 @@ _KNOWN: dict[str, str] = {
     **dict.fromkeys(("deny_in", "deny_out"), f"was removed: {INSTEAD_OF_DENIAL}"),
     "successor": "was removed: delete the line: nothing used it",
     "recording": "was removed: delete [recording]: ground stations record, and so does `mavproxy.py --daemon`",
+    "probe_interval_s": "was removed: delete the line: the round trip is measured every 5 s",
     "mac_key_bits": "was removed: delete the line: every HMAC key has 256 bits, and a longer one was no stronger",
     **dict.fromkeys(
         ("datagrams_s", "member_datagrams_s"),

@@ -172,7 +172,6 @@ LINK: Final[Keys] = {
     "retry_max_s": _seconds(c.RETRY_MAX_S, 0.05, 60),
     "rekey_after_s": _seconds(c.REKEY_AFTER_S, 1, 3600),
     "reject_after_s": _seconds(c.REJECT_AFTER_S, 1, 7200),
-    "probe_interval_s": _seconds(c.PROBE_INTERVAL_S, 0.1, 3600),
     "budget_bits_s": Key(_budget, _EGRESS.budget_bits_s),
     "coalesce_s": _seconds(_EGRESS.coalesce_s, 0, 0.5),
     "max_age_s": _seconds(_EGRESS.max_age_s, 0.1, 60),

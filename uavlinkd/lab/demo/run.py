@@ -42,7 +42,7 @@ ATTACKED_SHARE = 2 / 3
 RECOVERY_S = 2.0
 """Within this time after the last attack, frames must be delivered again."""
 ALL = "all"
-LINK: dict[str, object] = {"rekey_after_s": 4.0, "probe_interval_s": 1.0}
+LINK: dict[str, object] = {"rekey_after_s": 4.0}
 """A rekey in seconds instead of two minutes, so that the demo shows some."""
 ATTACKED_LINK: dict[str, object] = {
     "suites": ["ffdhe2048", "x25519"],
