@@ -15,7 +15,7 @@ from uavlinkd.config.model import ConfigError, Problem
 from uavlinkd.daemon import daemon
 from uavlinkd.daemon.journal import DaemonJournal
 from uavlinkd.observe.conditions import HOUR_S, QUIET_S, Conditions, Limit, OpenCondition, Phase
-from uavlinkd.observe.event_log import ENDED_PROBLEMS, ENDPOINT_DELAY_S, FINDING_DELAY_S, EventLog
+from uavlinkd.observe.event_log import ENDPOINT_DELAY_S, FINDING_DELAY_S, EventLog
 from uavlinkd.observe.finding import Finding, Severity, Subject
 from uavlinkd.ops import line_limits
 from uavlinkd.ops.line_limits import LINES_BURST, LINES_PER_S, LineLimits
@@ -212,19 +212,6 @@ def test_problems_of_the_log_have_their_ages(log: EventLog) -> None:
         {**attack.as_json(), "began_s": 16.0, "ended_s": 26.0 - 10.0 - FINDING_DELAY_S},
         {**wrong.as_json(), "began_s": 26.0 - 10.0 - FINDING_DELAY_S, "ended_s": None},
     ]
-
-
-def test_the_latest_problems_that_ended_are_kept(log: EventLog) -> None:
-    """Memory is bounded, whatever comes and goes. Those that last are there in any case."""
-    lasting = finding(Severity.SECURITY, "key_on_two_machines")
-    for number in range(ENDED_PROBLEMS + 50):
-        now = number * 100.0
-        log.write_findings([lasting, finding(Severity.SECURITY)._replace(name=f"peer{number}")], now)
-        log.write_findings([lasting], now + 50.0)
-        log.check(now + 50.0)
-    *ended, last = log.problems(1e6)
-    assert [one["name"] for one in ended] == [f"peer{number}" for number in range(50, ENDED_PROBLEMS + 50)]
-    assert (last["name"], last["ended_s"]) == ("b", None)
 
 
 def test_log_ends_with_the_state_of_a_link_that_flaps(log: EventLog) -> None:

@@ -259,19 +259,6 @@ def test_own_key_on_another_machine(daemon: Daemon) -> None:
     assert "own_key_elsewhere" not in daemon.findings(NOW + SECURITY_S + 1)
 
 
-def test_problems_of_the_daemon(daemon: Daemon) -> None:
-    """Bare MAVLink and a refused file."""
-    daemon.set_up(role="all", system_ids="all")
-    daemon.dropped(DropReason.RAW_MAVLINK, STRANGER)
-    daemon.parts.journal.refused_file = ["drone0.toml: link.tag_bits: must be 64, 96 or 128", "another"]
-    findings = daemon.findings()
-    assert set(findings) == {"configuration_refused", "raw_mavlink"}
-    assert {finding.severity for finding in findings.values()} == {Severity.WARNING}
-    assert "198.51.100.7:5790" in findings["raw_mavlink"].text
-    assert "tag_bits: must be 64, 96 or 128 and 1 more" in findings["configuration_refused"].text
-    assert set(daemon.findings(NOW + 31)) == {"configuration_refused"}
-
-
 def test_senders_without_a_member_here_have_their_own_addresses(daemon: Daemon) -> None:
     """At a relay, two keys from two places."""
     daemon.parts.relay = SimpleNamespace(members={})

@@ -100,15 +100,6 @@ def test_secret_is_not_printed(fmt: str) -> None:
         assert form not in said
 
 
-def test_a_terminal_shows_what_is_wrong_first() -> None:
-    """A line is folded there: its facts come after its sentences."""
-    file = io.StringIO()
-    set_up_logging("info", "console", file)
-    structlog.get_logger().info("problem_began", cause="no_answer", remedy="start it", text="it is off")
-    said = file.getvalue()
-    assert said.index("text=") < said.index("remedy=") < said.index("cause=")
-
-
 @pytest.mark.parametrize("fmt", ["json", "console"])
 def test_text_cannot_begin_a_new_line(fmt: str) -> None:
     """Line breaks in a field are escaped."""

@@ -23,11 +23,6 @@ def test_invisible_characters_are_escaped(text: str) -> None:
     shown.encode()
 
 
-def test_kept_characters_are_unchanged() -> None:
-    """A message of several lines keeps its line breaks."""
-    assert printable("drone1 é\nb\x1b[31m\udcff", keep="\n") == "drone1 é\nb\\x1b[31m\\udcff"
-
-
 @pytest.mark.parametrize(
     "arguments",
     [

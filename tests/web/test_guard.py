@@ -131,16 +131,6 @@ async def test_without_the_password_there_is_nothing(locked: Served, credentials
         assert reply.body in (b"this page has a password\n", b"this is not the password\n")
 
 
-@pytest.mark.parametrize("target", [f"/?password={PASSWORD}", f"/events?token={PASSWORD}", f"/peer/me:{PASSWORD}@x"])
-async def test_the_password_in_an_address_is_no_password(locked: Served, target: str) -> None:
-    """An address is in histories, logs and Referer headers. The page has no place for one, and names none."""
-    for absolute in ("", f"http://me:{PASSWORD}@{locked.address}"):
-        reply = await locked.ask(absolute + target)
-        assert reply.status == 401
-        assert PASSWORD.encode() not in reply.body + repr(reply.headers).encode()
-    assert (await locked.ask("/", Cookie=f"password={PASSWORD}")).status == 401
-
-
 async def test_wrong_passwords_have_a_limit_for_each_source(monkeypatch: pytest.MonkeyPatch) -> None:
     """The right password is accepted all the time: strangers must not lock its owner out."""
     now = [1000.0]

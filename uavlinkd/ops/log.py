@@ -24,7 +24,6 @@ PRIORITIES: Final = {"critical": 2, "error": 3, "warning": 4, "info": 6, "debug"
 _PIPE_BUF: Final = getattr(select, "PIPE_BUF", 512)  # POSIX's lower bound, where Python does not know the system's
 _FIRST: Final = ("event", "level")
 _LAST: Final = ("daemon", "timestamp")
-_SENTENCES: Final = ("text", "remedy")
 
 
 def shown(address: SocketAddress) -> str:
@@ -43,12 +42,6 @@ def order_fields(_: object, __: str, event: EventDict) -> EventDict:
     first = {field: event.pop(field) for field in _FIRST if field in event}
     last = {field: event.pop(field) for field in _LAST if field in event}
     return {**first, **event, **last}
-
-
-def order_for_terminal(_: object, __: str, event: EventDict) -> EventDict:
-    """Put ``text`` and ``remedy`` first, sort the others, and omit empty ones, as a processor of structlog."""
-    fields = [*(field for field in _SENTENCES if field in event), *sorted(event.keys() - set(_SENTENCES))]
-    return {field: event[field] for field in fields if event[field] != ""}
 
 
 def is_journal(stream: TextIO, environ: Mapping[str, str]) -> bool:
@@ -124,8 +117,7 @@ def set_up_logging(level: str, fmt: str, stream: TextIO = sys.stderr) -> None:
     ]
     render: list[Processor]
     if console:
-        renderer = structlog.dev.ConsoleRenderer(colors=stream.isatty(), pad_event_to=24, sort_keys=False)
-        render = [order_for_terminal, renderer]
+        render = [structlog.dev.ConsoleRenderer(colors=stream.isatty(), pad_event_to=24)]
     else:
         render = [structlog.processors.format_exc_info, order_fields, structlog.processors.JSONRenderer()]
     if in_journal:
