@@ -35,7 +35,7 @@ from uavlinkd.config import keys
 from uavlinkd.config.load import load_config
 from uavlinkd.config.model import ConfigError, NetworkConfig, PeerAddress
 from uavlinkd.io.url import SerialUrl
-from uavlinkd.mavlink.egress.budgeted import EgressSettings
+from uavlinkd.mavlink.egress.peer_egress import EgressSettings
 from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.protocol import constants as c
 from uavlinkd.protocol.settings import Link, Redundancy, Timers

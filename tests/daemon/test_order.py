@@ -15,7 +15,7 @@ import pytest
 from tests.daemon.two_radios import Network, Radio
 from tests.samples import raws
 from tests.signed_frames import Autopilot, Station
-from uavlinkd.mavlink.egress.budgeted import EgressSettings
+from uavlinkd.mavlink.egress.peer_egress import EgressSettings
 from uavlinkd.protocol.settings import Link, Redundancy, Timers
 
 EVERY_S = 0.02

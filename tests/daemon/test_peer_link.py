@@ -32,7 +32,7 @@ from uavlinkd.config.build import verify_interval_s
 from uavlinkd.config.model import PeerAddress
 from uavlinkd.config.model import PeerConfig as Peer
 from uavlinkd.daemon.peer_link import Carriage, PeerLink, Rates, radio_figures
-from uavlinkd.mavlink.egress.budgeted import EgressSettings
+from uavlinkd.mavlink.egress.peer_egress import EgressSettings
 from uavlinkd.mavlink.frames import Frame, SplitCounters, split_payload
 from uavlinkd.mavlink.own_frames import LinkFigures
 from uavlinkd.protocol import handshake
@@ -208,7 +208,7 @@ def test_reports_leave_room_for_frames(budget: int) -> None:
     link.report_refusals(1.0)
     assert len(of(sent, Transmit)) == (0 if budget else 1)
     if budget and link.output.egress is not None:
-        link.output.egress.queue.clear(2.0)
+        link.output.egress.clear()
         before = link.output.egress.demand(30.0)
         link.report_refusals(30.0)
         assert len(of(sent, Transmit)) == 1

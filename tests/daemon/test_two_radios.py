@@ -13,7 +13,7 @@ from tests.protocol import inside
 from tests.samples import attitude, blank, command, heartbeat, manual_control, read_by_name, value
 from uavlinkd.daemon.copies import BEGIN_LOSS
 from uavlinkd.daemon.peer_output import STICKS_COPIED_S, PeerOutput
-from uavlinkd.mavlink.egress.budgeted import EgressSettings
+from uavlinkd.mavlink.egress.peer_egress import EgressSettings
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.protocol.path_state import PathCondition, PathState
 
@@ -148,7 +148,7 @@ def test_peer_that_stops_waiting_lets_others_use_the_network(is_removed: bool) -
     other.send([attitude(2)], pair.now, 0.0)
     other.send_waiting(pair.now)
     assert other.egress is not None
-    assert other.egress.queue.queued_frames == 1
+    assert other.egress.count == 1
     if is_removed:
         pair.alpha.link.leave(pair.now)
     else:
@@ -156,4 +156,4 @@ def test_peer_that_stops_waiting_lets_others_use_the_network(is_removed: bool) -
         pair.alpha.link.change(config, pair.now)
     later = pair.now + 0.95
     assert budget.all.level(later) > 150
-    assert other.egress.queue.take(later) == [attitude(2)]
+    assert other.egress.take(later) == [attitude(2)]

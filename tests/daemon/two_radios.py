@@ -13,7 +13,7 @@ from tests.protocol.harness import KEY_A, KEY_B, seeded
 from uavlinkd.config.model import PeerConfig
 from uavlinkd.daemon.networks import NetworkBudget
 from uavlinkd.daemon.peer_link import Carriage, PeerLink
-from uavlinkd.mavlink.egress.budgeted import EgressSettings
+from uavlinkd.mavlink.egress.peer_egress import EgressSettings
 from uavlinkd.mavlink.frames import Frame, split_payload
 from uavlinkd.protocol.constants import NEVER
 from uavlinkd.protocol.crypto import KeyPair, Secret

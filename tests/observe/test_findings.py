@@ -23,9 +23,8 @@ from uavlinkd.config.model import EndpointConfig, PeerConfig
 from uavlinkd.daemon.evidence import EVIDENCE_S, REPORTED
 from uavlinkd.daemon.peer_link import PeerLink
 from uavlinkd.io.url import parse_url
-from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.mavlink.egress.lanes import EgressDrop
-from uavlinkd.mavlink.egress.peer_egress import PeerEgress
+from uavlinkd.mavlink.egress.peer_egress import EgressSettings, PeerEgress
 from uavlinkd.mavlink.frames import SplitCounters, split_payload
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import Refusal

@@ -26,7 +26,7 @@ from uavlinkd.config.model import (
 )
 from uavlinkd.config.schema import LINK, POLICY
 from uavlinkd.config.section import Values
-from uavlinkd.mavlink.egress.budgeted import EgressSettings
+from uavlinkd.mavlink.egress.peer_egress import EgressSettings
 from uavlinkd.mavlink.policy.settings import PolicyError, read_settings
 from uavlinkd.protocol import constants as c
 from uavlinkd.protocol import wire

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from uavlinkd.authority.certificates import MemberRole
 from uavlinkd.io.url import EndpointUrl, SerialUrl
-from uavlinkd.mavlink.egress.budgeted import EgressSettings
+from uavlinkd.mavlink.egress.peer_egress import EgressSettings
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.settings import read_settings
 from uavlinkd.protocol.crypto import AuthorityKey, Secret

@@ -18,7 +18,7 @@ from uavlinkd.config.keys import decode_key, is_canonical_public_key
 from uavlinkd.config.model import SERIAL, HttpsServer, PeerAddress
 from uavlinkd.config.section import Choice, Key, Keys, Kind, Number, anything, boolean, each, integer, text
 from uavlinkd.io.url import parse_line, parse_url
-from uavlinkd.mavlink.egress.budgeted import EgressSettings
+from uavlinkd.mavlink.egress.peer_egress import EgressSettings
 from uavlinkd.mavlink.policy.settings import KEYS as POLICY_KEYS
 from uavlinkd.protocol import constants as c
 from uavlinkd.protocol.crypto import AuthorityKey, is_usable_public_key

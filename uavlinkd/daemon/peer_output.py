@@ -15,8 +15,7 @@ from uavlinkd.daemon.copies import BEGIN_LOSS, Copies, Repair
 from uavlinkd.daemon.networks import COPIES_SHARE, NetworkBudget, carrier_bytes
 from uavlinkd.mavlink.dialect import IDS
 from uavlinkd.mavlink.egress.bucket import Bucket
-from uavlinkd.mavlink.egress.budgeted import EgressSettings, EnvelopeShape
-from uavlinkd.mavlink.egress.peer_egress import PeerEgress
+from uavlinkd.mavlink.egress.peer_egress import EgressSettings, EnvelopeShape, PeerEgress
 from uavlinkd.mavlink.flows import FlowKey, flow_key
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.mavlink.payloads import VALUE_KIND, ParameterAnswers
@@ -76,7 +75,7 @@ class PeerOutput:
         Returns whether :meth:`send_waiting` has something to do.
         """
         if self.egress is not None:
-            self.egress.queue.put(frames, now - waited_s)
+            self.egress.put(frames, now - waited_s)
             return True
         self._send_runs(frames, now)
         return bool(self.copies.waiting)
@@ -86,7 +85,7 @@ class PeerOutput:
         peer = self._peer
         if self.egress is not None:
             self.charge(now)
-            while batch := self.egress.queue.take(now):
+            while batch := self.egress.take(now):
                 self._send_runs(batch, now)
                 self.charge(now)
         if self.copies.waiting:
@@ -103,12 +102,12 @@ class PeerOutput:
 
     def next_deadline(self, now: float) -> float:
         """When :meth:`send_waiting` is due."""
-        at = NEVER if self.egress is None else self.egress.queue.next_deadline()
+        at = NEVER if self.egress is None else self.egress.next_deadline()
         return min(at, self.copies.next_deadline(now)) if self.copies.waiting else at
 
     def has_room(self, payload_bytes: int, now: float) -> bool:
         """Whether an envelope with this payload may go out now."""
-        return self.egress is None or self.egress.queue.has_room(payload_bytes, now)
+        return self.egress is None or self.egress.has_room(payload_bytes, now)
 
     def charge(self, now: float) -> None:
         """Charge the peer's own budget for all datagrams to it, handshakes and echoes too."""
@@ -127,7 +126,7 @@ class PeerOutput:
     def change(self, settings: EgressSettings, now: float) -> None:
         """Another budget or delay. What waits is dropped. What was sent before is not charged."""
         if self.egress is not None:
-            self.egress.queue.clear(now)  # and leave the lines of other peers
+            self.egress.clear()  # and leave the lines of other peers
         self._settings = settings
         self.egress = PeerEgress(settings, now) if settings.is_needed else None
         self._networks = []
@@ -165,7 +164,7 @@ class PeerOutput:
             self.egress = PeerEgress(self._settings, now)
             self._note_plain()
         if self.egress is not None:
-            self.egress.set_networks(networks, now)
+            self.egress.set_networks(networks)
 
     def measure(self, now: float) -> None:
         """Note the rate of the stream, which copies may use too, and the loss of paths. Call it once a second."""
@@ -185,7 +184,7 @@ class PeerOutput:
         self.repair.end()
         self._note_plain()
         if self.egress is not None:
-            self.egress.queue.clear(now)
+            self.egress.clear()
 
     # Envelopes.
 

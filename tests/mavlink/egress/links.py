@@ -9,8 +9,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from tests.samples import attitude, battery, command, frame, heartbeat, parameter, raws, read
 from uavlinkd.mavlink.dialect import name_of
 from uavlinkd.mavlink.egress.bucket import Bucket
-from uavlinkd.mavlink.egress.budgeted import EgressSettings, EnvelopeShape
-from uavlinkd.mavlink.egress.peer_egress import PeerEgress
+from uavlinkd.mavlink.egress.peer_egress import EgressSettings, EnvelopeShape, PeerEgress
 from uavlinkd.mavlink.flows import FlowKey, flow_key
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.protocol.settings import Class
@@ -29,7 +28,7 @@ class Link:
         self.shape = shape
         self.networks = networks
         if networks:
-            self.egress.set_networks(networks, 0.0)
+            self.egress.set_networks(networks)
         self.sent: list[tuple[float, bytes]] = []
         self.envelopes: list[tuple[float, list[bytes]]] = []
         self.wire: list[tuple[float, int]] = []
@@ -40,11 +39,11 @@ class Link:
         for raw in raws(frames):
             assert raw not in self.offered, "frames of a test differ in their bytes"
             self.offered[raw] = now
-        self.egress.queue.put(frames, now)
+        self.egress.put(frames, now)
         self.flush(now)
 
     def flush(self, now: float) -> None:
-        while batch := self.egress.queue.take(now):
+        while batch := self.egress.take(now):
             sent = raws(batch)
             self.envelopes.append((now, sent))
             self.sent += [(now, raw) for raw in sent]
@@ -66,7 +65,7 @@ class Link:
     def run(self, until: float) -> None:
         """Let time pass: the egress is called at its deadlines and never else."""
         for _ in range(1_000_000):
-            deadline = self.egress.queue.next_deadline()
+            deadline = self.egress.next_deadline()
             if deadline > until:
                 return
             self.flush(deadline)

@@ -17,8 +17,8 @@ from tests.mavlink.egress.links import MAKERS, SLOW, Link, every, flow_of, id_of
 from tests.samples import ID, attitude, battery, command, frame, heartbeat, parameter, raws, read
 from uavlinkd.mavlink.dialect import Lane, name_of
 from uavlinkd.mavlink.egress.bucket import BURST_S
-from uavlinkd.mavlink.egress.budgeted import MAX_FLOWS, MIN_LANE_BYTES, Egress, EgressSettings, EnvelopeShape
 from uavlinkd.mavlink.egress.lanes import EgressDrop
+from uavlinkd.mavlink.egress.peer_egress import MAX_FLOWS, MIN_LANE_BYTES, EgressSettings, EnvelopeShape
 from uavlinkd.mavlink.flows import FlowKey
 
 # Without a budget: coalescing.
@@ -31,11 +31,11 @@ def test_frames_share_an_envelope_after_the_delay() -> None:
     for n, waiting in enumerate(frames):
         link.put(waiting, now=n * 0.01)
     assert not link.sent
-    assert link.egress.queue.next_deadline() == 0.05
-    assert link.egress.queue.take(0.0499) == []
+    assert link.egress.next_deadline() == 0.05
+    assert link.egress.take(0.0499) == []
     link.flush(0.05)
     assert link.envelopes == [(0.05, raws(frames))]
-    assert link.egress.queue.next_deadline() == inf
+    assert link.egress.next_deadline() == inf
 
 
 def test_full_envelope_does_not_wait() -> None:
@@ -45,7 +45,7 @@ def test_full_envelope_does_not_wait() -> None:
     for waiting in frames:
         link.put(waiting, now=0.1)
     assert link.envelopes == [(0.1, raws(frames[:7]))]
-    assert link.egress.queue.next_deadline() == pytest.approx(0.6)
+    assert link.egress.next_deadline() == pytest.approx(0.6)
     link.run(1.0)
     assert [raw for _, raw in link.sent] == raws(frames)
 
@@ -70,7 +70,7 @@ def test_core_traffic_counts() -> None:
     assert not link.sent
     # 331 bytes are in the bucket (one largest frame in an envelope); 628 went; 72 are needed at 500 bytes a second.
     due = (628 - 331 + 72) / 500
-    assert link.egress.queue.next_deadline() == pytest.approx(due)
+    assert link.egress.next_deadline() == pytest.approx(due)
     link.run(due - 0.01)
     assert not link.sent
     link.run(due + 0.01)
@@ -83,7 +83,7 @@ def test_debt_after_an_outage_is_bounded() -> None:
     for n in range(200):
         link.transmit(1400, now=n * 1.5)
     link.put(heartbeat(1), now=300.0)
-    assert link.egress.queue.next_deadline() - 300.0 <= (500 + 1428 + 72) / 500
+    assert link.egress.next_deadline() - 300.0 <= (500 + 1428 + 72) / 500
 
 
 def test_newest_state_replaces_the_older() -> None:
@@ -91,7 +91,7 @@ def test_newest_state_replaces_the_older() -> None:
     link = Link(SLOW)
     link.fill(0.0)
     link.put(*(attitude(n) for n in range(5)), *(attitude(n, system=2) for n in range(5)), now=0.0)
-    assert link.egress.queue.queued_frames == 2
+    assert link.egress.count == 2
     assert link.egress.totals == {EgressDrop.THINNED: 8}
     link.run(1.0)
     assert {raw for _, raw in link.sent} == {attitude(4).raw, attitude(4, system=2).raw}
@@ -146,13 +146,6 @@ def test_invented_flows_do_not_displace_the_known() -> None:
 # Bounds in age, in bytes and in memory.
 
 
-def egress_of(link: Link) -> Egress:
-    """The queue of a link with a budget."""
-    queue = link.egress.queue
-    assert isinstance(queue, Egress)
-    return queue
-
-
 @pytest.mark.parametrize("settings", [EgressSettings(coalesce_s=0.5), EgressSettings(4000, coalesce_s=0.5)])
 @pytest.mark.parametrize(("taken_at", "sent"), [(1.0, 1), (1.001, 0)])
 def test_frame_at_the_age_limit_goes_and_a_later_one_does_not(
@@ -174,9 +167,9 @@ def test_fresh_frames_beside_stale_ones_and_what_waits_for_a_lost_peer(settings:
     link.put(heartbeat(2), now=1.5)
     assert [raw for _, raw in link.sent] == [heartbeat(2).raw]
     link.put(attitude(3), parameter(1), now=1.6)
-    link.egress.queue.clear(1.65)
+    link.egress.clear()
     assert link.egress.totals == {EgressDrop.STALE: 1, EgressDrop.CLOSED: 2}
-    assert (link.egress.queue.queued_frames, link.egress.queue.next_deadline()) == (0, inf)
+    assert (link.egress.count, link.egress.next_deadline()) == (0, inf)
 
 
 def test_lanes_are_bounded_and_drop_the_oldest() -> None:
@@ -185,17 +178,17 @@ def test_lanes_are_bounded_and_drop_the_oldest() -> None:
     link.transmit(4000, 0.0)
     frames = [parameter(n) for n in range(500)]
     link.put(*frames, now=0.0)
-    egress = egress_of(link)
+    egress = link.egress
     assert MIN_LANE_BYTES / 2 - 50 <= egress.lanes.size <= MIN_LANE_BYTES / 2
-    kept = egress.queued_frames
+    kept = egress.count
     assert link.egress.totals == {EgressDrop.OVERFLOW: 500 - kept}
     link.put(heartbeat(1), now=0.0)
-    assert raws(waiting for waiting, _ in egress.pop_all()) == raws([*frames[-kept:], heartbeat(1)])
+    assert raws(waiting.frame for waiting in egress.lanes.pop_all()) == raws([*frames[-kept:], heartbeat(1)])
     for n in range(60):
         pings = [frame(mavlink.MAVLink_ping_message(n, k, 1, 1), 1 + k) for k in range(8)]
         link.put(*pings, now=n * 0.001)
     assert MIN_LANE_BYTES - 50 <= egress.lanes.size <= MIN_LANE_BYTES
-    assert link.egress.totals == {EgressDrop.OVERFLOW: 500 - kept + 480 - egress.queued_frames}
+    assert link.egress.totals == {EgressDrop.OVERFLOW: 500 - kept + 480 - egress.count}
 
 
 @pytest.mark.long
@@ -204,7 +197,7 @@ def test_memory_is_bounded_under_a_flood_of_replaceable_frames() -> None:
     link = Link(SLOW)
     link.transmit(4000, 0.0)
     link.put(*(attitude(n) for n in range(5000)), now=0.0)
-    lanes = egress_of(link).lanes
+    lanes = link.egress.lanes
     assert len(lanes.queues[Lane.STATES].arrivals) <= 100
     for start in range(0, 3 * MAX_FLOWS, 1024):
         names = (f"{n}".encode() for n in range(start, start + 1024))
@@ -237,7 +230,7 @@ def test_whatever_happens_the_rules_hold(seed: int, budget: int, coalesce: float
             core += 100 + shape.carrier_bytes
             link.transmit(100, now)
     link.run(now + 5)
-    assert len(link.offered) == len(link.sent) + egress.totals.total() + egress.queue.queued_frames
+    assert len(link.offered) == len(link.sent) + egress.totals.total() + egress.count
     assert len({raw for _, raw in link.sent}) == len(link.sent)
     assert all(raw in link.offered and at - link.offered[raw] <= 1.0 for at, raw in link.sent)
     assert all(sum(map(len, batch)) <= limit for _, batch in link.envelopes)
@@ -257,8 +250,8 @@ def test_whatever_happens_the_rules_hold(seed: int, budget: int, coalesce: float
             level = max(0.0, level - (at - before) * budget / 8) + size
             before = at
             assert level <= burst + core + 1
-    assert egress.queue.queued_frames == 0
-    assert egress.queue.next_deadline() == inf
+    assert egress.count == 0
+    assert egress.next_deadline() == inf
 
 
 def test_demand_says_how_much_is_sent_and_dropped() -> None:

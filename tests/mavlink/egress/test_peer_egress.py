@@ -13,8 +13,8 @@ from pymavlink.dialects.v20 import all as mavlink
 from tests.mavlink.egress.links import SHAPE, Link
 from tests.samples import attitude, battery, command, frame, heartbeat, log_data, parameter, raws
 from uavlinkd.mavlink.egress.bucket import Bucket
-from uavlinkd.mavlink.egress.budgeted import EgressSettings
 from uavlinkd.mavlink.egress.lanes import EgressDrop
+from uavlinkd.mavlink.egress.peer_egress import EgressSettings
 from uavlinkd.mavlink.frames import Frame
 
 NO_BUDGET = EgressSettings()
@@ -143,17 +143,17 @@ def test_change_of_paths_keeps_what_waits_with_its_age() -> None:
     radio = Radio(NO_BUDGET, best)
     best.spend(1000, 0.0)
     radio.put(parameter(1), attitude(1), now=0.0)
-    radio.egress.set_networks([best, best], 0.2)
+    radio.egress.set_networks([best, best])
     radio.put(parameter(2), attitude(2), now=0.3)
-    radio.egress.set_networks([best], 0.3)
+    radio.egress.set_networks([best])
     radio.put(parameter(3), now=0.4)
-    assert radio.egress.queue.queued_frames == 4
+    assert radio.egress.count == 4
     assert radio.egress.totals == {EgressDrop.THINNED: 1}
     radio.run(1.0)
     sent = [raw for _, raw in radio.sent]
     assert [raw for raw in sent if raw != attitude(2).raw] == raws([parameter(1), parameter(2), parameter(3)])
     radio.run(10.0)
-    assert radio.egress.queue.queued_frames == 0
+    assert radio.egress.count == 0
 
 
 def test_waiting_frames_of_a_lost_peer_are_dropped() -> None:
@@ -162,18 +162,18 @@ def test_waiting_frames_of_a_lost_peer_are_dropped() -> None:
     radio = Radio(NO_BUDGET, network)
     network.spend(1000, 0.0)
     radio.put(attitude(1), command(1), log_data(1), now=0.0)
-    radio.egress.queue.clear(0.1)
+    radio.egress.clear()
     assert radio.egress.totals == {EgressDrop.CLOSED: 3}
-    assert radio.egress.queue.queued_frames == 0
+    assert radio.egress.count == 0
 
 
 def test_report_needs_room_and_no_waiting_frames() -> None:
     """As with one path."""
     network = Bucket(SLOW_BITS_S, 0.0)
     radio = Radio(NO_BUDGET, network)
-    assert radio.egress.queue.has_room(50, 0.0)
+    assert radio.egress.has_room(50, 0.0)
     network.spend(1000, 0.0)
-    assert not radio.egress.queue.has_room(50, 0.0)
+    assert not radio.egress.has_room(50, 0.0)
 
 
 MAKERS = (attitude, command, parameter, log_data, heartbeat, status_text)

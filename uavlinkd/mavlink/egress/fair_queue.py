@@ -20,8 +20,6 @@ Within a flow the order is never reversed. Sans-IO: `now` is monotonic seconds.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from heapq import heappop, heappush, heapreplace
 from typing import Final
 
 from uavlinkd.mavlink.dialect import Lane
@@ -41,26 +39,15 @@ MOST_AHEAD: Final = MAX_FRAME_BYTES
 """A source, or a class of frames, is ahead of others by so many bytes at most. What exceeds that is forgiven."""
 
 
-@dataclass(slots=True, eq=False)
-class _Place:
-    """The frames of one class of one source."""
-
-    frames: _SourceFrames
-    next_frame: Callable[[], Waiting | None]  # the source's next frame of this class
-    is_in_line: bool = False
-
-
 class _SourceFrames:
     """What waits of one source."""
 
-    __slots__ = ("lanes", "rest", "sent", "source", "urgent")
+    __slots__ = ("lanes", "sent", "source")
 
     def __init__(self, source: Source, on_drop: OnDrop) -> None:
         self.source = source
         self.sent = 0  # bytes, on the clock of the queue
         self.lanes = Lanes(LANE_BYTES, MAX_FLOWS, _is_superseded, on_drop)
-        self.urgent = _Place(self, self.lanes.next_urgent)
-        self.rest = _Place(self, self.lanes.next_of_the_rest)
 
 
 _Next = tuple[_SourceFrames, Waiting] | None
@@ -69,37 +56,6 @@ _Next = tuple[_SourceFrames, Waiting] | None
 
 def _is_superseded(waiting: Waiting, newer: Frame, now: float) -> bool:
     return now - waiting.put_at > SUPERSEDED_S
-
-
-class _Line:
-    """The sources with frames of one class, the one that was sent the fewest bytes first."""
-
-    __slots__ = ("_heap", "_number")
-
-    def __init__(self) -> None:
-        self._heap: list[tuple[int, int, _Place]] = []
-        self._number = 0
-
-    def join(self, place: _Place) -> None:
-        """A frame of this source waits."""
-        if not place.is_in_line:
-            place.is_in_line = True
-            self._number += 1
-            heappush(self._heap, (place.frames.sent, -self._number, place))  # before others that were sent as much
-
-    def next(self) -> _Next:
-        """The frame whose turn it is."""
-        while self._heap:
-            sent, _, place = self._heap[0]
-            if (waiting := place.next_frame()) is None:
-                heappop(self._heap)
-                place.is_in_line = False
-            elif sent == place.frames.sent:
-                return place.frames, waiting
-            else:
-                self._number += 1
-                heapreplace(self._heap, (place.frames.sent, self._number, place))
-        return None
 
 
 class FairQueue:
@@ -114,8 +70,6 @@ class FairQueue:
         self._report = on_drop
         self._sources: dict[Source, _SourceFrames] = {}
         self._sources_limit = MAX_SOURCES
-        self._urgent = _Line()
-        self._rest = _Line()
         self._clock = 0  # what the source that was sent the fewest bytes had been sent, at the last turn
         self._lead = 0  # bytes of urgent frames beyond those of others, while both wait
 
@@ -129,10 +83,7 @@ class FairQueue:
         for frame in frames:
             self.count += 1
             self.size += len(frame.raw)
-            if lanes.put(frame, now) is Lane.URGENT:
-                self._urgent.join(waiting.urgent)
-            else:
-                self._rest.join(waiting.rest)
+            lanes.put(frame, now)
             while self.size > QUEUE_BYTES:
                 max(self._sources.values(), key=lambda frames: frames.lanes.size).lanes.drop_from_largest()
 
@@ -178,13 +129,18 @@ class FairQueue:
     def _turn(self, now: float) -> tuple[_Next, _Next, _Next]:
         """The frame that goes next, which is not stale; and the next urgent one, and the next of the others."""
         while True:
-            urgent, rest = self._urgent.next(), self._rest.next()
+            urgent, rest = self._next(Lanes.next_urgent), self._next(Lanes.next_of_the_rest)
             turn = urgent or rest
             if urgent and rest and self._lead >= 0 and rest[0].sent < urgent[0].sent:
                 turn = rest
             if turn is None or now - turn[1].put_at <= MAX_AGE_S:
                 return turn, urgent, rest
             turn[0].lanes.drop_stale(now, MAX_AGE_S)
+
+    def _next(self, next_of: Callable[[Lanes], Waiting | None]) -> _Next:
+        """The next frame of one class: that of the source that was sent the fewest bytes."""
+        waiters = [(frames, waiting) for frames in self._sources.values() if (waiting := next_of(frames.lanes))]
+        return min(waiters, key=lambda waiter: waiter[0].sent, default=None)
 
     def _add(self, source: Source) -> _SourceFrames:
         if len(self._sources) >= self._sources_limit:

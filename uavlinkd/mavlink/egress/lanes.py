@@ -124,6 +124,13 @@ class Queue:
 IsSuperseded = Callable[[Waiting, Frame, float], bool]
 """Whether a newer frame of the same state replaces the one that waits: (waiting, newer, now)."""
 by_number: Final = attrgetter("number")  # for sorting in the order of arrival
+
+
+def is_urgent(frame: Frame) -> bool:
+    """Whether a frame goes before others on a slow link."""
+    return frame.header.kind.lane is Lane.URGENT
+
+
 OnDrop = Callable[[Waiting, EgressDrop], None]
 
 
@@ -132,8 +139,7 @@ class Lanes:
 
     def __init__(self, lane_bytes: float, max_flows: int, is_superseded: IsSuperseded, on_drop: OnDrop) -> None:
         self.queues = (Queue(), Queue(), Queue())  # by lane
-        self._lane_bytes = lane_bytes
-        self._flow_bytes = lane_bytes / FLOWS_PER_LANE
+        self.lane_bytes = lane_bytes
         self._max_flows = max_flows
         self._is_superseded = is_superseded
         self._on_drop = on_drop
@@ -163,18 +169,13 @@ class Lanes:
                 self.drop(flow.frames[0], EgressDrop.THINNED)
         self._number += 1
         queue.add(Waiting(frame, flow, now, self._number))
-        if flow.size > self._flow_bytes:
+        if flow.size > self.lane_bytes / FLOWS_PER_LANE:
             self.drop(flow.frames[0], EgressDrop.OVERFLOW)
-        elif queue.size > self._lane_bytes:
+        elif queue.size > self.lane_bytes:
             oldest = queue.oldest()
             assert oldest is not None
             self.drop(oldest, EgressDrop.OVERFLOW)
         return flow.lane
-
-    def first(self) -> Waiting | None:
-        """The oldest frame: there is room for all."""
-        heads = [oldest for queue in self.queues if (oldest := queue.oldest())]
-        return min(heads, key=by_number) if heads else None
 
     def next(self) -> Waiting | None:
         return self.next_urgent() or self.next_of_the_rest()
@@ -214,13 +215,28 @@ class Lanes:
         assert oldest is not None
         self.drop(oldest, EgressDrop.OVERFLOW)
 
+    def pop(self, room: float, now: float, *, only_urgent: bool) -> list[Frame]:
+        """Take out the frames of one envelope: the first, and others while there is room. There must be one."""
+        batch: list[Waiting] = []
+        waiting = self.next()
+        while waiting is not None and ((room := room - len(waiting.frame.raw)) >= 0 or not batch):
+            self.serve(waiting, now)
+            batch.append(waiting)
+            waiting = self.next_urgent() if only_urgent else self.next()
+        # The turns decide which frames go. Within the envelope they are in the order of arrival.
+        return [popped.frame for popped in sorted(batch, key=by_number)]
+
     def pop_all(self) -> list[Waiting]:
         """Take out all frames that wait, in the order of arrival."""
-        popped: list[Waiting] = []
-        while (first := self.first()) is not None:
-            self.queues[first.flow.lane].remove(first)
-            popped.append(first)
+        arrivals = (waiting for queue in self.queues for waiting in queue.arrivals if waiting.is_waiting)
+        popped = sorted(arrivals, key=by_number)
+        for waiting in popped:
+            self.queues[waiting.flow.lane].remove(waiting)
         return popped
+
+    def oldest_at(self, otherwise: float) -> float:
+        """Since when the oldest frame waits."""
+        return min((oldest.put_at for queue in self.queues if (oldest := queue.oldest())), default=otherwise)
 
     def clear(self) -> None:
         for waiting in self.pop_all():
