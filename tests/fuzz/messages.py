@@ -22,7 +22,7 @@ LOOP: Final = asyncio.new_event_loop()
 atexit.register(LOOP.close)
 BINARY: Final = 2
 REASONS: Final = {
-    *("closed", "fragment", "long_header", "long_message", "not_websocket", "page", "pings", "protocol", "text"),
+    *("closed", "fragment", "long_header", "long_message", "not_websocket", "pings", "protocol", "text"),
     "wrong_path",
 }
 WORDS: Final = (b"GET / HTTP/1.1\r\n", b"HTTP/1.1 404 ", b"\r\n\r\n", b"Upgrade: h2\r\n", b"Content-Length: 9\r\n")

@@ -135,11 +135,10 @@ async def test_member_talks_in_messages_of_a_websocket(stage: Stage) -> None:
     assert relay.events("sends_failed") == []
 
 
-async def test_strangers_get_a_page_and_no_more(stage: Stage) -> None:
+async def test_strangers_get_nothing(stage: Stage) -> None:
     """Without messages of a member, a connection ends after 5 s."""
     relay, _, port = _relay(stage)
     await stage.start(relay)
-    assert (await _ask(port, "GET / HTTP/1.1")).startswith(b"HTTP/1.1 200 OK\r\n")
     assert (await _ask(port, "GET /admin HTTP/1.1")).startswith(b"HTTP/1.1 404 Not Found\r\n")
     watch = Stopwatch()
     async with _websocket(port) as socket:
@@ -147,5 +146,5 @@ async def test_strangers_get_a_page_and_no_more(stage: Stage) -> None:
         await socket.wait_closed()
     assert watch.calm_s < STRANGER_S + 2
     status = await relay.status()
-    assert _https(status)["refused"] == {"page": 1, "wrong_path": 1, "unproven": 1}
+    assert _https(status)["refused"] == {"wrong_path": 1, "unproven": 1}
     assert _https(status)["connections"] == 0

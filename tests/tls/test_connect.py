@@ -15,7 +15,6 @@ from tests.waiting import until
 from uavlinkd.io import sockets
 from uavlinkd.io.resolver import Resolved
 from uavlinkd.system.addresses import Address
-from uavlinkd.system.tasks import Threads
 from uavlinkd.tls import connect as web_connect
 from uavlinkd.tls.channel import client_tls
 from uavlinkd.tls.connect import Connector, WebConnectError
@@ -178,7 +177,7 @@ async def test_addresses_are_tried_in_turn(secure: Loopback, monkeypatch: pytest
             filler.setblocking(False)
             filler.connect_ex(full.getsockname())
 
-        async def resolved(address: Address, threads: Threads | None) -> Resolved:
+        async def resolved(address: Address) -> Resolved:
             return [(socket.AF_INET, place) for place in places]
 
         monkeypatch.setattr(web_connect, "resolve", resolved)
@@ -195,7 +194,7 @@ async def test_no_address_answers(secure: Loopback, monkeypatch: pytest.MonkeyPa
         with pytest.raises(ConnectionRefusedError):
             await Connector("127.0.0.1", closed.getsockname()[1], "wss://127.0.0.1/", secure.stall).open()
 
-    async def resolved(address: Address, threads: Threads | None) -> Resolved:
+    async def resolved(address: Address) -> Resolved:
         return []
 
     monkeypatch.setattr(web_connect, "resolve", resolved)
@@ -225,7 +224,7 @@ async def test_name_server_that_is_silent(secure: Loopback, monkeypatch: pytest.
     """As during an outage: the last addresses of the name are used, and one query waits for its answer."""
     queries: list[asyncio.Future[Resolved]] = []
 
-    async def resolved(address: Address, threads: Threads | None) -> Resolved:
+    async def resolved(address: Address) -> Resolved:
         queries.append(asyncio.get_running_loop().create_future())
         if len(queries) == 1:
             return [(socket.AF_INET, secure.listener.getsockname())]

@@ -24,7 +24,7 @@ from uavlinkd.system.clock import monotonic
 from uavlinkd.tls import channel as tls_channel
 from uavlinkd.tls import stream as web_stream
 from uavlinkd.tls.channel import TlsChannel, server_context
-from uavlinkd.tls.stream import GATHER_BYTES, MAX_MESSAGE, PAGE, QUEUE_BYTES
+from uavlinkd.tls.stream import GATHER_BYTES, MAX_MESSAGE, QUEUE_BYTES
 
 DATAGRAM = bytes(range(200))
 TURNS = 300
@@ -248,7 +248,6 @@ async def test_tls_that_cannot_write_ends_the_connection(secure: Loopback) -> No
 @pytest.mark.parametrize(
     ("data", "reason", "answer"),
     [
-        (b"GET / HTTP/1.1\r\n\r\n", "page", PAGE.encode()),
         (b"GET /other HTTP/1.1\r\n\r\n", "wrong_path", b"404"),
         (b"GET /uavlink HTTP/1.1\r\n\r\n", "not_websocket", b"426"),
         (b"POST /uavlink HTTP/1.1\r\n\r\n", "not_websocket", b""),

@@ -20,7 +20,6 @@ from uavlinkd.io.resolver import Query, Resolved, resolve
 from uavlinkd.io.sockets import connect_tcp
 from uavlinkd.system.addresses import Address
 from uavlinkd.system.stall import StallWatch
-from uavlinkd.system.tasks import Threads
 from uavlinkd.tls.channel import client_tls
 from uavlinkd.tls.stream import WebStream, client_protocol
 
@@ -36,14 +35,13 @@ class WebConnectError(OSError):
 
 
 class Connector:
-    """Connects to a relay at ``host``, or to a proxy that connects to it. ``threads``: of the resolver."""
+    """Connects to a relay at ``host``, or to a proxy that connects to it."""
 
-    def __init__(self, host: str, port: int, url: str, stall: StallWatch, threads: Threads | None = None) -> None:
+    def __init__(self, host: str, port: int, url: str, stall: StallWatch) -> None:
         self._address = Address(host, port)
         self._url = url
         self._uri = parse_uri(url)
         self._stall = stall
-        self._threads = threads
         self._known: Resolved = []
         self._query: Query | None = None
 
@@ -79,7 +77,7 @@ class Connector:
     async def _resolve(self, address: Address) -> Resolved:
         """The addresses of a name; those of before while no name server answers."""
         if self._query is None:
-            self._query = asyncio.ensure_future(resolve(address, self._threads))
+            self._query = asyncio.ensure_future(resolve(address))
             self._query.add_done_callback(self._on_resolved)
         await asyncio.wait((self._query,), timeout=NAME_S if self._known else None)
         return self._known

@@ -32,7 +32,6 @@ from uavlinkd.system.stall import STALE, StallWatch
 from uavlinkd.tls.channel import TlsChannel, TlsFactory
 
 PATH: Final = "/uavlink"  # of the relay's WebSocket
-PAGE: Final = "This is a uavlinkd relay.\n"  # the answer to `GET /`
 MAX_MESSAGE: Final = 2048  # the longest datagram in a message: more than the longest handshake message
 GATHER_BYTES: Final = 1250  # datagrams of one turn of the loop share a record up to this size
 QUEUE_S: Final = 0.25  # a datagram that waited for longer is dropped
@@ -80,7 +79,7 @@ class WebStream:
     """One connection, of a member or a relay.
 
     Reasons of its end: ``closed`` (by the other end), ``tls``, ``not_websocket``, ``http_404`` (a status of the other
-    end), ``page``, ``wrong_path``, ``long_header``, ``slow_handshake``, ``text``, ``fragment``, ``long_message``,
+    end), ``wrong_path``, ``long_header``, ``slow_handshake``, ``text``, ``fragment``, ``long_message``,
     ``protocol``, ``pings`` (too many, or too many other frames that carry nothing), ``no_pong``, ``not_reading``, or
     the kernel's error, such as ``ECONNRESET``.
     """
@@ -317,9 +316,7 @@ class WebStream:
         assert isinstance(protocol, ServerProtocol), "a member receives no request"
         if fault := self._fault_of_protocol():
             return fault  # of bytes behind the request: the library cannot respond any more
-        if request.path == "/":
-            response, fault = protocol.reject(200, PAGE), "page"
-        elif request.path != PATH:
+        if request.path != PATH:
             response, fault = protocol.reject(404, "There is no such page.\n"), "wrong_path"
         else:
             response = protocol.accept(request)
