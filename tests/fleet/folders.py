@@ -43,7 +43,7 @@ def join(
     place = MemberFiles(folder / name / f"{name}.toml")
     line, _ = enrolling.request(name, place)
     _, fleet = operations.sign(folder, parse_request(line), identity, unasked, replaces=replaces)
-    enrolling.finish(operations.line_of(fleet, name), place.config, None, url, (), socket)
+    enrolling.finish(operations.line_of(fleet, name), place.config, None, url, socket)
 
 
 def renew(folder: Path, *names: str) -> None:
@@ -51,7 +51,7 @@ def renew(folder: Path, *names: str) -> None:
     fleet = read_manifest(folder)
     for name in names:
         config = folder / name / f"{name}.toml"
-        enrolling.finish(operations.line_of(fleet, name), config, None, None, (), None)
+        enrolling.finish(operations.line_of(fleet, name), config, None, None, None)
 
 
 def create(

@@ -55,10 +55,11 @@ def test_one_line_goes_each_way(place: Path, say: Say) -> None:
 
 
 def test_address_in_the_line_is_listened_on(place: Path, say: Say) -> None:
-    """A ground station with an address needs nothing more; `--listen` overrides it."""
+    """A ground station with an address needs nothing more; `listen` in its file stays as it is."""
     enrolled(say, "station", "--role operator --address 198.51.100.7:6000")
     assert list(map(str, load_config(place / "station.toml", {}).listen)) == ["0.0.0.0:6000"]
-    enrolled(say, "other", "--role operator --address 198.51.100.8:6000", "--listen 127.0.0.1:6000")
+    (place / "other.toml").write_text('name = "other"\nprivate_key_file = "other.key"\nlisten = ["127.0.0.1:6000"]\n')
+    enrolled(say, "other", "--role operator --address 198.51.100.8:6000")
     assert list(map(str, load_config(place / "other.toml", {}).listen)) == ["127.0.0.1:6000"]
 
 

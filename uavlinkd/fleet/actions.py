@@ -163,16 +163,15 @@ def _enroll(options: argparse.Namespace) -> None:
     if options.finish is None:
         if options.name is None:
             raise FleetError("name the new member: `uavlinkd enroll NAME`")
-        if options.url or options.listen or options.control_socket:
-            raise FleetError("--url, --listen and --control-socket are options of `uavlinkd enroll --finish`")
+        if options.url or options.control_socket:
+            raise FleetError("--url and --control-socket are options of `uavlinkd enroll --finish`")
         place = enrolling.MemberFiles(options.config or Path(f"{options.name}.toml"), options.keys)
         line, key = enrolling.request(options.name, place)
         _note(f"the private key is {key}. `fleet sign` reads this line, and `enroll --finish` what that prints")
         print(line)
         return
     finish = options.finish or _line("uavlinkd fleet sign")
-    values = options.config, options.keys, options.url, options.listen, options.control_socket
-    for text in enrolling.finish(finish, *values):
+    for text in enrolling.finish(finish, options.config, options.keys, options.url, options.control_socket):
         _say(text)
 
 

@@ -81,7 +81,6 @@ def add_enroll(enroll: argparse.ArgumentParser) -> None:
     enroll.add_argument("--keys", metavar="DIR", type=Path, help="for a service: the folder of its keys")
     enroll.add_argument("--url", metavar="URL", help="endpoint of a new configuration")
     enroll.add_argument("--control-socket", metavar="FILE", help="of a new configuration (default: NAME.sock)")
-    _add_list(enroll, "--listen", "IP:PORT", "where members reach it (default: as signed)")
 
 
 def _act(options: argparse.Namespace) -> int:

@@ -80,9 +80,7 @@ def _numbered(file: str, step: int) -> str:
     return f"{first}.{number + step}.key" if number + step > 1 else f"{first}.key"
 
 
-def finish(
-    line: str, config: Path | None, folder: Path | None, url: str | None, listen: Sequence[str], socket: str | None
-) -> list[str]:
+def finish(line: str, config: Path | None, folder: Path | None, url: str | None, socket: str | None) -> list[str]:
     """Write what the line of `uavlinkd fleet sign` says into the configuration, which is created if it is missing.
 
     Nothing is written unless every signature verifies and a daemon would accept the file. The former key is deleted.
@@ -96,13 +94,13 @@ def finish(
     _check_present(table.get("fleet"), reply, certificate, place.config)
     own = str(table.get("private_key_file", f"{name}.key"))
     key = _certified_key(reply, place, (_numbered(own, 1), own))
-    listen = listen or ([] if "listen" in table else listen_on(reply))
+    listen = listen_on(reply)
     former = own if own != key else _numbered(key, -1)
     is_replaced = "fleet" in table and former != key and place.key(former).exists()
     if table:
-        if url is not None and url not in _urls(table):
+        if url is not None and repr(url) not in str(table.get("endpoint")):
             raise FleetError(f"{place.config} exists: write the url into its [[endpoint]], and leave --url out")
-        table |= {"private_key_file": key, **({"listen": list(listen)} if listen else {})}
+        table = {**({"listen": listen} if listen else {}), **table, "private_key_file": key}
     else:
         socket = socket or (f"{name}.sock" if folder is None else f"/run/uavlinkd/{name}/control.sock")
         table = new_table(reply, key, socket, url, listen)
@@ -139,11 +137,6 @@ def _write(place: MemberFiles, text: str) -> None:
             ) from None
         finally:
             new.unlink(missing_ok=True)
-
-
-def _urls(table: dict[str, Any]) -> list[Any]:
-    endpoints = table.get("endpoint")
-    return [each.get("url") for each in endpoints if isinstance(each, dict)] if isinstance(endpoints, list) else []
 
 
 def _check_present(fleet: Any, reply: Reply, certificate: Certificate, config: Path) -> None:
