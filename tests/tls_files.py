@@ -17,14 +17,12 @@ def write_tls_files(
     certificate: str = CERTIFICATE,
     key: str = TLS_KEY,
     passphrase: bytes = b"",
-    *,
-    is_valid: bool = False,
 ) -> None:
-    """A certificate and its key. It has expired unless ``is_valid``: web servers may refuse that, members do not."""
+    """A certificate and its key. It has expired: members do not mind."""
     private = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "relay")])
     then = datetime.now(UTC) - timedelta(days=9)
-    until = datetime.now(UTC) + timedelta(days=1) if is_valid else then + timedelta(days=1)
+    until = then + timedelta(days=1)
     signed = (
         x509.CertificateBuilder(name, name, private.public_key(), x509.random_serial_number())
         .not_valid_before(then)
