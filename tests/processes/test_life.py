@@ -6,14 +6,14 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
-import socket
 import subprocess
 import sys
 from pathlib import Path
 
+from tests.faults.manager import ServiceManager
 from tests.processes.harness import Stage
 from tests.processes.process import DaemonProcess
-from tests.waiting import PATIENCE_S, until
+from tests.waiting import PATIENCE_S
 
 
 def run(daemon: DaemonProcess, *command: str) -> subprocess.CompletedProcess[str]:
@@ -99,33 +99,11 @@ async def test_it_runs_without_control_socket_and_recording(stage: Stage) -> Non
 # A daemon and its service manager, played by a socket. ``tests/compose`` has a real systemd.
 
 
-class Manager(asyncio.DatagramProtocol):
-    """What a service manager receives, in order."""
-
-    def __init__(self) -> None:
-        self.received: list[str] = []
-
-    def datagram_received(self, data: bytes, addr: object) -> None:
-        self.received.append(data.decode())
-
-    async def until_received(self, message: str, times: int = 1) -> None:
-        """Wait until the daemon has sent a message so often."""
-        await until(lambda: self.received.count(message) >= times)
-
-
-async def supervised(daemon: DaemonProcess) -> tuple[Manager, asyncio.BaseTransport]:
-    """Start a daemon under a manager of its own, with a watchdog."""
-    sock = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-    sock.bind(str(daemon.folder / "notify"))
-    transport, manager = await asyncio.get_running_loop().create_datagram_endpoint(Manager, sock=sock)
-    await daemon.start({"NOTIFY_SOCKET": str(daemon.folder / "notify"), "WATCHDOG_USEC": "2000000"})
-    return manager, transport
-
-
 async def test_manager_is_notified_from_the_start_to_the_end(stage: Stage) -> None:
     """Ready when the daemon answers, peers up, a reload, a refused file, a peer that goes, the end."""
     a, b = stage.pair()
-    manager, transport = await supervised(a)
+    manager = ServiceManager(a.folder / "notify", a, watchdog_s=2.0)
+    await a.start(manager.environ)
     await manager.until_received("READY=1")
     await a.status()
     assert manager.received[0] == "READY=1"
@@ -145,5 +123,5 @@ async def test_manager_is_notified_from_the_start_to_the_end(stage: Stage) -> No
     await b.stop()
     await manager.until_received("STATUS=0 of 1 peers up")
     await a.stop()
-    assert manager.received[-1] == "STOPPING=1"
-    transport.close()
+    assert manager.read()[-1] == "STOPPING=1"
+    manager.close()

@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from tests.mavlink.egress.links import MAKERS, SLOW, Link, every, flow_of, id_of, play
 from tests.samples import ID, attitude, battery, command, frame, heartbeat, parameter, raws, read
-from uavlinkd.mavlink.dialect import Lane, name_of
+from uavlinkd.mavlink.dialect import Lane
 from uavlinkd.mavlink.egress.bucket import BURST_S
 from uavlinkd.mavlink.egress.lanes import EgressDrop
 from uavlinkd.mavlink.egress.peer_egress import MAX_FLOWS, MIN_LANE_BYTES, EgressSettings, EnvelopeShape
@@ -84,40 +84,6 @@ def test_debt_after_an_outage_is_bounded() -> None:
         link.transmit(1400, now=n * 1.5)
     link.put(heartbeat(1), now=300.0)
     assert link.egress.next_deadline() - 300.0 <= (500 + 1428 + 72) / 500
-
-
-def test_newest_state_replaces_the_older() -> None:
-    """While the budget is short, of one state of one sender only the newest waits."""
-    link = Link(SLOW)
-    link.fill(0.0)
-    link.put(*(attitude(n) for n in range(5)), *(attitude(n, system=2) for n in range(5)), now=0.0)
-    assert link.egress.count == 2
-    assert link.egress.totals == {EgressDrop.THINNED: 8}
-    link.run(1.0)
-    assert {raw for _, raw in link.sent} == {attitude(4).raw, attitude(4, system=2).raw}
-
-
-def test_flood_of_commands_leaves_room_for_heartbeats() -> None:
-    """A client that floods commands delays another's heartbeat by a turn, no more."""
-    link = Link(SLOW)
-    offers = [*every(0.005, command, 10.0), *every(1.0, heartbeat, 10.0, start=0.5)]
-    play(link, offers, until=11.0)
-    sent_at = {raw: now for now, raw in link.sent}
-    assert max(sent_at[heartbeat(n).raw] - (0.5 + n) for n in range(9)) <= 0.6
-    assert link.egress.totals.keys() <= {EgressDrop.STALE, EgressDrop.OVERFLOW}
-
-
-def test_parameters_and_telemetry_share_the_budget() -> None:
-    """While both wait, parameters and telemetry get about the same number of bytes."""
-    link = Link(SLOW)
-    offers = every(0.01, parameter, 30.0, start=0.003)
-    for system in range(1, 13):
-        offers += every(0.05, lambda n, system=system: attitude(n, system), 30.0)  # type: ignore[misc]
-    play(link, offers, until=30.0)
-    sizes: Counter[str] = Counter()
-    for _, raw in link.sent:
-        sizes[name_of(id_of(raw))] += len(raw)
-    assert sizes["ATTITUDE"] == pytest.approx(sizes["PARAM_VALUE"], rel=0.1)
 
 
 def test_all_states_are_thinned_alike() -> None:

@@ -156,17 +156,6 @@ def test_change_of_paths_keeps_what_waits_with_its_age() -> None:
     assert radio.egress.count == 0
 
 
-def test_waiting_frames_of_a_lost_peer_are_dropped() -> None:
-    """Of all classes."""
-    network = Bucket(SLOW_BITS_S, 0.0)
-    radio = Radio(NO_BUDGET, network)
-    network.spend(1000, 0.0)
-    radio.put(attitude(1), command(1), log_data(1), now=0.0)
-    radio.egress.clear()
-    assert radio.egress.totals == {EgressDrop.CLOSED: 3}
-    assert radio.egress.count == 0
-
-
 def test_report_needs_room_and_no_waiting_frames() -> None:
     """As with one path."""
     network = Bucket(SLOW_BITS_S, 0.0)

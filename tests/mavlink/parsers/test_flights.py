@@ -21,8 +21,6 @@ from uavlinkd.mavlink.policy.delivery import DeliveredStream, Source
 TELEMETRY = (
     *("ATTITUDE", "ATTITUDE_QUATERNION", "GLOBAL_POSITION_INT", "LOCAL_POSITION_NED", "HOME_POSITION", "VFR_HUD"),
 )
-_SHORTEST, _LONGEST = 12, 60
-_FRAMES = 40
 
 
 class Noise(NamedTuple):
