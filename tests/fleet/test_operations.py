@@ -211,9 +211,14 @@ def test_addresses_that_a_person_added_to_a_contact_are_kept(folder: Path) -> No
     contact = tomllib.loads(path.read_text())["contact"][0]
     assert contact["addresses"] == [place, url]
     assert [str(one) for one in read_manifest(folder).member("relay").addresses] == ["relay.example.org:5790"]
+    texts = ["relay.example.org:5790", "wss://relay.example.org:8443/other"]
+    join(folder, "relay", Identity(None, None, parse_addresses("--address", texts)), replaces=True)
+    renew(folder, "drone1")
+    contact = tomllib.loads(path.read_text())["contact"][0]
+    assert contact["addresses"] == [texts[1], place]
     path.write_text(path.read_text().replace(contact["certificate"], "AQAB"))
     renew(folder, "drone1")
-    assert tomllib.loads(path.read_text())["contact"][0]["addresses"] == ["relay.example.org:5790"]
+    assert tomllib.loads(path.read_text())["contact"][0]["addresses"] == texts
 
 
 def test_url_of_a_relay_reaches_the_members(tmp_path: Path) -> None:

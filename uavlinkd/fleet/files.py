@@ -125,11 +125,14 @@ def _endpoints(table: Table, reply: Reply) -> Any:
 
 
 def _addresses(contact: Table, table: Table) -> list[Any]:
-    """The signed addresses. If a person wrote a network or a URL beside them, they stay as they are."""
-    name = certificate_in(contact).name
-    for present in table.get("contact", ()):
+    """The signed addresses, and what a person wrote beside them: those of one network, and URLs if none is signed."""
+    name, signed, contacts = certificate_in(contact).name, contact["addresses"], table.get("contact")
+    for present in contacts if isinstance(contacts, list) else ():
         with suppress(LookupError, TypeError, ValueError, Drop):
-            is_same = certificate_in(present).name == name
-            if is_same and any(isinstance(one, dict) or "://" in one for one in present["addresses"]):
-                return list(present["addresses"])
-    return list(contact["addresses"])
+            if certificate_in(present).name == name:
+                is_url_kept = not any("://" in text for text in signed)
+                of_network = [one for one in present["addresses"] if isinstance(one, dict)]
+                urls = [one for one in present["addresses"] if is_url_kept and isinstance(one, str) and "://" in one]
+                replaced = [one["address"] for one in of_network]
+                return [*(text for text in signed if text not in replaced), *of_network, *urls]
+    return list(signed)
