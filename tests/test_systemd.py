@@ -106,7 +106,15 @@ def test_relay_is_restarted_and_isolated_as_a_daemon_is() -> None:
     one, relay = settings("uavlinkd.service"), settings("uavlinkd-relay.service")
     differing = {key for key in one.keys() | relay.keys() if one[key] != relay[key]}
     assert differing == {
-        *("Description", "ExecStart", "LoadCredential", "RuntimeDirectory", "StateDirectory", "MemoryMax"),
+        *(
+            "Description",
+            "ExecStart",
+            "LoadCredential",
+            "RuntimeDirectory",
+            "StateDirectory",
+            "MemoryMax",
+            "LimitNOFILE",
+        ),
         *("CPUWeight", "Wants", "After", "SupplementaryGroups", "DevicePolicy", "DeviceAllow", "PrivateDevices"),
     }
     assert relay["PrivateDevices"] == ["yes"]

@@ -78,9 +78,10 @@ path or the session changes.
 In: ``DatagramReceiver.receive`` finds the session by its index, verifies the tag, and only then changes anything.
 Whatever it refuses is a ``Drop`` with a reason, caught and counted in one place.
 
-A frame whose path is lost while it waits: before it is sealed it has no path. It waits in the shell and takes the
-route of the moment when it is sealed. A sealed copy waits in the shell too, for its own path, at most 0.5 s: another
-path carried the same bytes. A critical frame while the last relayed path is gone is sealed and kept for 2 s
+A frame whose path is lost while it waits: before it is sealed it has no path. It waits in the shell, at most
+``max_age_s`` and until the peer is lost, and takes the route of the moment when it is sealed: that of the last best
+path if all have failed; without a route it is dropped as ``no_session``. A sealed copy waits in the shell too, for its
+own path, at most 0.5 s: another path carried the same bytes. A repeat leaves out paths that are down. A critical frame while the last relayed path is gone is sealed and kept for 2 s
 (``Peer.recent``): the next relayed path carries it (``send.resend``). A received frame that is held is tied to its
 session, not to its path. When the session ends, it is dropped as ``doubtful``.
 
@@ -88,9 +89,10 @@ Where to add
 ------------
 * A kind of record: its class and its branch of ``wire.parse_control``; a branch of ``receive._receive_control`` that
   says what an old one does; a feature bit if a peer may not know it; section 12. A record between a member and its
-  relay is in :mod:`.relay_records`, and arrives in the shell as ``RecordReceived``.
+  relay, or another member, is in :mod:`.relay_records`, and arrives in the shell as ``RecordReceived``.
 * A rule about which path carries what: ``PathSet._set_routes``.
-* A rule about when a frame leaves: the shell, because a frame leaves as soon as the shell calls ``send``.
+* A rule about when a frame leaves: the shell, because a frame leaves as soon as the shell calls ``send``:
+  ``PeerOutput`` and ``PeerEgress``, see the README of :mod:`uavlinkd.daemon`.
 * A rule about when this end asks or tries: the handler of its timer, with its pace in ``PathSet.interval_s`` or
   ``Initiator.begin_try``.
 * A reason to drop something: the table in :mod:`.drops`, and section 13.
