@@ -80,10 +80,11 @@ Whatever it refuses is a ``Drop`` with a reason, caught and counted in one place
 
 A frame whose path is lost while it waits: before it is sealed it has no path. It waits in the shell, at most
 ``max_age_s`` and until the peer is lost, and takes the route of the moment when it is sealed: that of the last best
-path if all have failed; without a route it is dropped as ``no_session``. A sealed copy waits in the shell too, for its
-own path, at most 0.5 s: another path carried the same bytes. A repeat leaves out paths that are down. A critical frame while the last relayed path is gone is sealed and kept for 2 s
-(``Peer.recent``): the next relayed path carries it (``send.resend``). A received frame that is held is tied to its
-session, not to its path. When the session ends, it is dropped as ``doubtful``.
+path if all have failed; without a route it is dropped as ``no_session``. A sealed copy waits in the shell too, for
+its own path, at most 0.5 s: another path carried the same bytes. A repeat leaves out paths that are down. A critical
+frame while the last relayed path is gone is sealed and kept for 2 s (``Peer.recent``): the next relayed path carries
+it (``send.resend``). A received frame that is held is tied to its session, not to its path. When the session ends, it
+is dropped as ``doubtful``.
 
 Where to add
 ------------
