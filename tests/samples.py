@@ -156,16 +156,6 @@ def number_of(control: Frame) -> int:
     return int.from_bytes(payload[:2], "little") + 1000 * int.from_bytes(payload[2:4], "little")
 
 
-def value(name: bytes, index: int = 65535, system: int = 1) -> Frame:
-    """A parameter of a vehicle."""
-    return frame(mavlink.MAVLink_param_value_message(name, 1.5, 9, 999, index), system)
-
-
-def read_by_name(name: bytes, system: int = 1) -> Frame:
-    """A ground station's request for a parameter."""
-    return frame(mavlink.MAVLink_param_request_read_message(system, 1, name, -1), 255)
-
-
 def read_by_index(index: int, system: int = 1) -> Frame:
-    """The same, for a parameter that was missing in a list."""
+    """A ground station's request for a parameter that was missing in a list."""
     return frame(mavlink.MAVLink_param_request_read_message(system, 1, b"", index), 255)

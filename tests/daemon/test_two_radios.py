@@ -10,7 +10,7 @@ import pytest
 
 from tests.daemon.two_radios import End, Network, Radio
 from tests.protocol import inside
-from tests.samples import attitude, blank, command, heartbeat, manual_control, read_by_name, value
+from tests.samples import attitude, blank, command, heartbeat, manual_control
 from uavlinkd.daemon.copies import BEGIN_LOSS
 from uavlinkd.daemon.peer_output import STICKS_COPIED_S, PeerOutput
 from uavlinkd.mavlink.egress.peer_egress import EgressSettings
@@ -32,17 +32,6 @@ def network(*radios: Radio) -> Network:
 def radios_of(end: End, *frames: Frame) -> dict[bytes, Counter[int]]:
     """How many datagrams with each of these frames an end sent on each radio. Frames are readable in an envelope."""
     return {frame.raw: Counter(sent.radio for sent in end.sent if frame.raw in sent.datagram) for frame in frames}
-
-
-def test_answer_to_a_parameter_request_is_critical_and_a_list_is_not() -> None:
-    """The station asked for one parameter. The vehicle sends this one, and others of a list."""
-    pair = network(FAST, SLOW)
-    pair.alpha.send(read_by_name(b"RTL_ALT"))
-    pair.run(pair.now + 0.5)
-    pair.bravo.sent.clear()
-    answer, other = value(b"RTL_ALT", 7), value(b"WP_RADIUS", 8)
-    pair.bravo.send(answer, other)
-    assert radios_of(pair.bravo, answer, other) == {answer.raw: {0: 1, 1: 1}, other.raw: {0: 1}}
 
 
 STICKS_PER_S = 50

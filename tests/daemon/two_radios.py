@@ -91,9 +91,7 @@ class End:
             elif isinstance(output, Deliver):
                 frames = split_payload(output.payload, self.link.counters)
                 if output.order:
-                    frames = self.link.pick_newest(frames, output.order, now)
-                elif self.link.output.repair.is_on:
-                    self.link.note_requests(frames, now)
+                    frames = self.link.pick_newest(frames, output.order)
                 self.delivered += frames
                 self.delivered_at += [now] * len(frames)
                 if self.on_frame is not None:

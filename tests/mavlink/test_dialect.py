@@ -114,7 +114,7 @@ def test_every_message_of_these_groups_is_critical(group: str) -> None:
 
 
 def test_files_and_logs_are_bulk_and_no_other_message_is() -> None:
-    """A PARAM_VALUE becomes bulk by what came before, not by the table."""
+    """By the table."""
     assert {name_of(msgid) for msgid, kind in KINDS.items() if kind.cls is Class.BULK} == set(GROUPS["files"])
 
 

@@ -141,12 +141,10 @@ class Line:
                     if self.is_turn:
                         self.cost += cost_of(payload, len(frames))
                     if order:  # the peer has several paths
-                        came, frames = len(frames), link.pick_newest(frames, order, self.read_at)
+                        came, frames = len(frames), link.pick_newest(frames, order)
                         if count := came - len(frames):
                             reason = ShellReason.SUPERSEDED
                             self._drops.add("frames_dropped", reason, link.name, count, monotonic())
-                    elif link.output.repair.is_on:
-                        link.note_requests(frames, self.read_at)
                     if len(outputs) == 1 and not self.is_turn:
                         self.forward(link, frames, self.read_at, self.epoch)
                     elif link in self._frames:

@@ -12,7 +12,6 @@ from uavlinkd.daemon.peer_output import PeerOutput
 from uavlinkd.mavlink.flows import NewestStates
 from uavlinkd.mavlink.frames import Frame, SplitCounters
 from uavlinkd.mavlink.own_frames import LinkFigures, worst
-from uavlinkd.mavlink.payloads import REQUESTS
 from uavlinkd.mavlink.policy.delivery import Source
 from uavlinkd.protocol.constants import CONFIGURED_PATHS, LOSS_WINDOW_S, NEVER
 from uavlinkd.protocol.drops import LinkProblem
@@ -204,21 +203,14 @@ class PeerLink:
             self._perform(self._node.report_problems(self.peer, codes, now))
             self.output.charge(now)
 
-    def pick_newest(self, frames: list[Frame], order: int, now: float) -> list[Frame]:
+    def pick_newest(self, frames: list[Frame], order: int) -> list[Frame]:
         """The frames of an envelope without the states that are superseded. Call it if the peer has several paths.
 
         ``order``: that of the envelope.
         """
         picked = self._newest.pick(frames, order)
         self.frames_superseded += len(frames) - len(picked)
-        self.note_requests(picked, now)
         return picked
-
-    def note_requests(self, frames: Sequence[Frame], now: float) -> None:
-        """Note requests of the peer, whose answers are critical. Call it while frames are classified."""
-        for frame in frames:
-            if frame.header.msgid in REQUESTS:
-                self.output.answers.note(frame, now)
 
     def _set_deadline(self, now: float) -> None:
         self.timers.next_at = self.output.next_deadline(now)

@@ -18,7 +18,6 @@ from uavlinkd.mavlink.egress.bucket import Bucket
 from uavlinkd.mavlink.egress.peer_egress import EgressSettings, EnvelopeShape, PeerEgress
 from uavlinkd.mavlink.flows import FlowKey, flow_key
 from uavlinkd.mavlink.frames import Frame
-from uavlinkd.mavlink.payloads import VALUE_KIND, ParameterAnswers
 from uavlinkd.protocol.constants import CRITICAL_ENVELOPE_LIMIT, NEVER
 from uavlinkd.protocol.node import Node
 from uavlinkd.protocol.outputs import Output, Transmit
@@ -52,8 +51,6 @@ class PeerOutput:
         self._peer = peer
         self._node = node
         self._budgets = budgets
-        self.answers = ParameterAnswers()
-        """Requests of the peer, whose answers are critical."""
         self._perform = perform
         self.egress = PeerEgress(settings, now) if settings.is_needed else None
         """Frames that wait; None if frames never wait."""
@@ -198,7 +195,7 @@ class PeerOutput:
         runs: list[tuple[bool | Route, set[Class], list[Frame]]] = []
         for frame in frames:
             kind = frame.header.kind
-            cls = kind.cls if kind is not VALUE_KIND else self.answers.class_of(frame, now)
+            cls = kind.cls
             # Newer states replace repeats of older ones, which must not contain events then.
             run: bool | Route = (repeats and kind.is_state) if is_apart and cls is Class.CRITICAL else routes[cls]
             if not runs or run != runs[-1][0]:

@@ -11,8 +11,7 @@ telemetry to a ground station, and an obstacle to an autopilot. Such a message i
 
 The facts about a message are its class, whether it may be old, how it waits, and its instances.
 
-*Class*: a `critical` frame must arrive, a `stream` frame is followed by another, a `bulk` frame can wait. One message
-has a class that depends on what came before: a PARAM_VALUE (:mod:`.payloads`).
+*Class*: a `critical` frame must arrive, a `stream` frame is followed by another, a `bulk` frame can wait.
 
 *Age*: after a silence, or without an answer from the peer, a frame may be old (specification, section 11). Only a
 report may be delivered then: a message that asks its receiver for nothing. Positions of other vehicles are reports.
