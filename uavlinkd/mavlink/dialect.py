@@ -1,7 +1,8 @@
 """Messages and commands of MAVLink, groups of messages, and the facts about each message.
 
 `dialect.json` has the numbers of each message and command: `tests.mavlink.dialect_generate` writes it. `groups.json`
-has the groups, each with what it is about.
+has the groups, each with what it is about, and with the facts about all its messages: they are *critical*, *bulk*,
+*reports* or *states* as below, or a report among them *steers* an autopilot all the same, such as DISTANCE_SENSOR.
 
 A *group* is a tuple of message names that a policy can allow by one word. Groups may share messages.
 Each message of the dialect is in at least one group, and in ``all``.
@@ -36,7 +37,7 @@ the flow (:mod:`.flows`).
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from enum import IntEnum
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -86,16 +87,16 @@ SYSTEM_ID: Final = "MAV_SYSID (ArduPilot; before 4.7 SYSID_THISMAV) or MAV_SYS_I
 """The parameter of an autopilot that has its system id."""
 
 
-def _names(text: str) -> tuple[str, ...]:
-    return tuple(text.split())
+def _names(group: Mapping[str, list[str]]) -> tuple[str, ...]:
+    return tuple(" ".join(group["messages"]).split())
 
 
-_groups = json.loads(Path(__file__).with_name("groups.json").read_bytes())
-GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
-    name: _names(" ".join(group["messages"])) for name, group in _groups.items()
-}
+_text = json.loads(Path(__file__).with_name("groups.json").read_bytes())
+GROUPS: Final[Mapping[str, tuple[str, ...]]] = {name: _names(group) for name, group in _text["groups"].items()}
 """The names of the messages of each group."""
-del _groups
+_FACTS: Final[Mapping[str, str]] = {name: group.get("facts", "") for name, group in _text["groups"].items()}
+_MORE: Final[Mapping[str, tuple[str, ...]]] = {fact: _names(group) for fact, group in _text["more"].items()}
+del _text
 
 
 class Lane(IntEnum):
@@ -118,45 +119,19 @@ class MessageKind(NamedTuple):
     instance_bytes: int = 0  # the length of that place; 0: the message reports one thing only
 
 
-def _names_in(groups: Iterable[str]) -> frozenset[str]:
-    return frozenset(name for group in groups for name in GROUPS[group])
-
-
-_CRITICAL_GROUPS: Final = ("urgent", "commands", "mission", "parameters", "manual", "setpoints")
-_MORE_CRITICAL: Final = _names(
-    # Texts of the autopilot, and requests with answers that are commands in another form.
-    "STATUSTEXT CHANGE_OPERATOR_CONTROL CHANGE_OPERATOR_CONTROL_ACK SECURE_COMMAND SECURE_COMMAND_REPLY "
-    "DIGICAM_CONFIGURE DIGICAM_CONTROL MOUNT_CONFIGURE"
-)
-_BULK_GROUPS: Final = ("files",)
-_REPORT_GROUPS: Final = ("heartbeat", "telemetry", "position", "identification", "payload-reports")
-_STEERING_GROUPS: Final = (
-    *("commands", "parameters", "manual", "setpoints", "sensors", "traffic", "rtk", "simulation", "time", "files"),
-    *("shell", "firmware", "control-access", "signing"),
-)
-"""A report in one of these groups steers an autopilot all the same, such as DISTANCE_SENSOR."""
-
-# All messages of these groups are states ...
-_STATE_GROUPS: Final = ("telemetry", "position", "traffic", "setpoints", "manual", "sensors")
-_MORE_STATES: Final = _names(
-    "RADIO RADIO_STATUS MLRS_RADIO_LINK_STATS GIMBAL_DEVICE_ATTITUDE_STATUS GIMBAL_MANAGER_STATUS GIMBAL_REPORT "
-    "AUTOPILOT_STATE_FOR_GIMBAL_DEVICE CAMERA_FOV_STATUS CELLULAR_STATUS LINK_NODE_STATUS"
-)
-# ... but for what is said once, in parts, or in answer to a question about one of many.
-_EVENTS_AMONG_THEM: Final = _names(
-    "STATUSTEXT AUTOPILOT_VERSION MISSION_ITEM_REACHED MESSAGE_INTERVAL DATA_STREAM MAG_CAL_REPORT BUTTON_CHANGE "
-    "MEMORY_VECT AVAILABLE_MODES UAVCAN_NODE_INFO SMART_BATTERY_INFO FLIGHT_INFORMATION OBSTACLE_DISTANCE_3D "
-    "PROTOCOL_VERSION COMPONENT_INFORMATION COMPONENT_INFORMATION_BASIC COMPONENT_METADATA EVENT"
-)
+def _names_with(fact: str) -> frozenset[str]:
+    """The messages of the groups with a fact, and those that `groups.json` adds to them."""
+    groups = (GROUPS[name] for name, facts in _FACTS.items() if fact in facts.split())
+    return frozenset(_MORE.get(fact, ())).union(*groups)
 
 
 def _table() -> dict[int, MessageKind]:
-    may_be_old = _names_in(_REPORT_GROUPS) - _names_in(_STEERING_GROUPS)
-    urgent = _names_in(["urgent"])
+    may_be_old = _names_with("reports") - _names_with("steers")
+    urgent = frozenset(GROUPS["urgent"])
     # A report about a mission, such as MISSION_CURRENT, is telemetry: the next one makes up for it.
-    critical = (_names_in(_CRITICAL_GROUPS) - (may_be_old - urgent)).union(_MORE_CRITICAL)
-    bulk = _names_in(_BULK_GROUPS)
-    states = _names_in(_STATE_GROUPS).union(_MORE_STATES).difference(_EVENTS_AMONG_THEM)
+    critical = (_names_with("critical") - (may_be_old - urgent)).union(_MORE["critical"])
+    bulk = _names_with("bulk")
+    states = _names_with("states").difference(_MORE["said_once"])
     return {
         msgid: MessageKind(
             Class.CRITICAL if name in critical else Class.BULK if name in bulk else Class.STREAM,
@@ -173,5 +148,5 @@ KINDS: Final = _table()
 """By message id. The header of a frame has its row: :attr:`.headers.Header.kind`."""
 UNKNOWN: Final = MessageKind(Class.STREAM, may_be_old=False, lane=Lane.EVENTS, is_state=False)
 """Of a message that the dialect does not have, or has in another form."""
-SAID_ONCE: Final = frozenset(IDS[name] for name in _EVENTS_AMONG_THEM)
+SAID_ONCE: Final = frozenset(IDS[name] for name in _MORE["said_once"])
 """Message ids in groups of states that no later frame replaces, such as a line of STATUSTEXT."""
