@@ -11,27 +11,21 @@ from math import inf
 from operator import itemgetter, sub
 from typing import Final
 
-from uavlinkd.daemon.copies import BEGIN_LOSS, Copies, Repair
+from uavlinkd.daemon.copies import Copies, Repair
 from uavlinkd.daemon.networks import COPIES_SHARE, NetworkBudget, carrier_bytes
 from uavlinkd.mavlink.dialect import IDS
 from uavlinkd.mavlink.egress.bucket import Bucket
 from uavlinkd.mavlink.egress.peer_egress import EgressSettings, EnvelopeShape, PeerEgress
-from uavlinkd.mavlink.flows import FlowKey, flow_key
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.protocol.constants import CRITICAL_ENVELOPE_LIMIT, NEVER
 from uavlinkd.protocol.node import Node
 from uavlinkd.protocol.outputs import Output, Transmit
-from uavlinkd.protocol.path_state import PathCondition
 from uavlinkd.protocol.paths import Route
 from uavlinkd.protocol.peer import Peer
 from uavlinkd.protocol.settings import Class, Redundancy
 
 RAW = itemgetter(0)
 """The bytes of a frame."""
-STICKS_COPIED_S = 0.05
-"""Between copies of MANUAL_CONTROL or RC_CHANNELS_OVERRIDE, at least, while the best path is healthy. At 50/s every
-third one is copied, so a path that dies costs at most two in a row."""
-
 _STICKS: Final = frozenset(IDS[name] for name in ("MANUAL_CONTROL", "RC_CHANNELS_OVERRIDE"))
 
 
@@ -64,7 +58,6 @@ class PeerOutput:
         self._critical_limit = CRITICAL_ENVELOPE_LIMIT  # of the payload; set for each session
         self._stream_bytes = 0
         self._measured_at = now
-        self._copied_at: dict[FlowKey, float] = {}  # of flows of stick positions
 
     def send(self, frames: Sequence[Frame], now: float, waited_s: float) -> bool:
         """Send frames that arrived together: at once, or when budgets and the coalescing delay allow it.
@@ -221,8 +214,8 @@ class PeerOutput:
 
     def _send_part(self, frames: Sequence[Frame], cls: Class, now: float) -> None:
         raws = list(map(RAW, frames))
-        if cls is Class.CRITICAL and self._peer.paths.is_multiple and self._is_spared(frames, now):
-            cls = Class.STREAM
+        if self._peer.paths.best is None and all(frame.header.msgid in _STICKS for frame in frames):
+            cls = Class.STREAM  # the core keeps critical frames for the next path, and these would be old then
         outputs = self._node.send(self._peer, raws, now, cls)
         if cls is not Class.CRITICAL:
             self._stream_bytes += sum(map(len, raws))
@@ -233,21 +226,6 @@ class PeerOutput:
                 paths = [transmit.path for transmit in sent]
                 self.copies.repeat(datagram, paths, frames, self.repair.transmissions, now)
         self._perform(outputs)
-
-    def _is_spared(self, frames: Sequence[Frame], now: float) -> bool:
-        """Whether these frames go along the best path alone: stick positions, which newer ones replace soon."""
-        if self.repair.is_on or not all(frame.header.msgid in _STICKS for frame in frames):
-            return False
-        best = self._peer.paths.best
-        if best is None:  # the core keeps critical frames for the next path, and these would be old then
-            return True
-        is_healthy = best.condition is PathCondition.USABLE and best.loss_out < BEGIN_LOSS
-        flows = set(map(flow_key, frames))
-        self._copied_at = {flow: at for flow, at in self._copied_at.items() if now < at + STICKS_COPIED_S}
-        if is_healthy and flows <= self._copied_at.keys():
-            return True
-        self._copied_at |= dict.fromkeys(flows, now)
-        return False
 
     def _pick_copies(self, outputs: Sequence[Output], frames: Sequence[Frame] | None, now: float) -> list[Output]:
         """The outputs without the datagrams that have to wait or are dropped."""
