@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+import tempfile
 from collections.abc import AsyncIterator, Generator, Iterator
 from pathlib import Path
 
@@ -181,3 +182,10 @@ def shared_data() -> Path:
     if folder is None:
         pytest.skip("no recorded flights: set UAVLINKD_SHARED to a folder that has data/*.tlog")
     return folder / "data"
+
+
+@pytest.fixture
+def short_folder() -> Iterator[Path]:
+    """An empty folder whose path is short: that of a Unix socket in it has at most 107 bytes."""
+    with tempfile.TemporaryDirectory(prefix="demo-") as folder:
+        yield Path(folder)

@@ -17,7 +17,6 @@ from tests.bench.measure import DISTURBED_MOST, EVEN_S, NO_LOSS
 from tests.bench.run import QUICK, Plan, Run, laboratory
 from tests.bench.traffic import TrafficError
 from tests.namespaces import NamespaceError, why_not
-from uavlinkd.lab.child_processes import interrupted_by_signals
 from uavlinkd.lab.evaluation.frame import ReportSection, Table, to_markdown
 from uavlinkd.lab.evaluation.records import EvaluationError, Record, RecordWriter, Value, machine_facts, read_records
 
@@ -123,7 +122,7 @@ def _run(plan: Plan, out: Path, contenders: Sequence[Contender], command: str) -
     frames = load_frames()
     facts = {**machine_facts(), **_facts(plan, frames, contenders), "command": command}
     try:
-        with interrupted_by_signals(), laboratory(frames) as bench, RecordWriter(out, RECORDS, facts) as writer:
+        with laboratory(frames) as bench, RecordWriter(out, RECORDS, facts) as writer:
             Run(plan, bench, writer, lambda line: print(line, flush=True)).all(contenders)
     except KeyboardInterrupt:
         print(f"interrupted: what was measured until then is in {out}", file=sys.stderr)

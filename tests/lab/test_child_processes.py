@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import json
 import os
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -27,26 +26,6 @@ with private_folder("keys-") as folder:
     child.stdout.readline()
     print(json.dumps([child.pid, str(folder)]), flush=True)
     time.sleep(600)
-"""
-INTERRUPTED = """
-import asyncio, signal, sys, time
-from uavlinkd.lab.child_processes import interrupted_by_signals
-signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the tests may run under nohup
-async def wait():
-    try:
-        print("waiting", flush=True)
-        await asyncio.sleep(600)
-    finally:
-        print("cleaned up")
-with interrupted_by_signals():
-    if sys.argv[1] == "loop":
-        asyncio.run(wait())
-    else:
-        try:
-            print("waiting", flush=True)
-            time.sleep(600)
-        finally:
-            print("cleaned up")
 """
 
 
@@ -91,21 +70,6 @@ def test_folder_is_private_and_removed_at_the_end() -> None:
     with pytest.raises(ZeroDivisionError):
         fail()
     assert not folders[0].exists()
-
-
-@pytest.mark.parametrize("where", ["loop", "no loop"])
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-@pytest.mark.parametrize("interrupts", ["handled", "ignored"])
-def test_a_signal_lets_a_command_clean_up(number: signal.Signals, where: str, interrupts: str) -> None:
-    """Then the command ends by that signal. A shell starts commands in the background with SIGINT ignored."""
-    ignored = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n" if interrupts == "ignored" else ""
-    command = [sys.executable, "-c", ignored + INTERRUPTED, where]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "waiting\n"
-        process.send_signal(number)
-        out, _ = process.communicate()
-    assert (out, process.returncode) == ("cleaned up\n", -number)
 
 
 def test_every_process_of_the_laboratory_ends_with_its_parent() -> None:

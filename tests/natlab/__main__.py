@@ -15,7 +15,6 @@ from tests.natlab import daemons
 from tests.natlab.kinds import KINDS, PAIRED
 from tests.natlab.laboratory import Laboratory
 from tests.natlab.pairs import make_ipv6_pairs, make_pairs
-from uavlinkd.lab.child_processes import interrupted_by_signals
 
 
 def main() -> int:
@@ -33,8 +32,7 @@ def main() -> int:
     if reason is not None:
         print(f"needs {reason}", file=sys.stderr)
         return 1
-    with interrupted_by_signals():
-        _connect(options)
+    _connect(options)
     return 0
 
 

@@ -24,9 +24,8 @@ ENDED_S = 300.0
 
 
 def _handle_signals() -> None:
-    """A shell ignores SIGINT for commands in the background, nohup ignores SIGHUP, and children inherit that."""
-    for number in (signal.SIGINT, signal.SIGHUP):
-        signal.signal(number, signal.SIG_DFL)
+    """A shell ignores SIGINT for commands in the background, and children inherit that."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 @asynccontextmanager

@@ -11,7 +11,6 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import FrameType
 
 _BOUND = """\
 import ctypes, os, signal, sys
@@ -89,33 +88,3 @@ def private_folder(prefix: str) -> Iterator[Path]:
             remover.stdin.close()
             remover.wait()
             remover.stdout.close()
-
-
-@contextmanager
-def interrupted_by_signals() -> Iterator[None]:
-    """Handle SIGTERM and SIGHUP as Ctrl-C inside, so that ``finally`` clauses run. Then end by that signal."""
-    ended_by: signal.Signals | None = None
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        nonlocal ended_by
-        if ended_by is not None:
-            return  # it is already cleaning up
-        ended_by = signal.Signals(number)
-        handler = signal.getsignal(signal.SIGINT)
-        if not callable(handler):  # ignored, for a command in the background of a shell
-            raise KeyboardInterrupt
-        handler(signal.SIGINT, frame)
-
-    numbers = [n for n in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(n) is not signal.SIG_IGN]
-    before = {number: signal.signal(number, interrupt) for number in numbers}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-        if ended_by is not None:
-            for stream in (sys.stdout, sys.stderr):
-                with suppress(OSError):  # the terminal was closed
-                    stream.flush()
-            signal.signal(ended_by, signal.SIG_DFL)
-            signal.raise_signal(ended_by)

@@ -48,7 +48,8 @@ def _add_demo(demo: argparse.ArgumentParser) -> None:
 
 
 def _sim(options: argparse.Namespace) -> int:
-    from uavlinkd.lab.sim.flight import SimOptions, run_sim  # noqa: PLC0415
+    from uavlinkd.lab.sim.autopilot import AutopilotSettings  # noqa: PLC0415
+    from uavlinkd.lab.sim.flight import run_sim  # noqa: PLC0415
     from uavlinkd.lab.sim.links import LinkError  # noqa: PLC0415
 
     _check_seconds(options)
@@ -63,10 +64,10 @@ def _sim(options: argparse.Namespace) -> int:
     def write(line: str) -> None:
         print(printable(line), flush=True)
 
-    settings = SimOptions(url, options.system_id, options.rate, options.seconds, options.seed)
     try:
+        settings = AutopilotSettings(system_id=options.system_id, attitude_rate_hz=options.rate, seed=options.seed)
         with suppress(KeyboardInterrupt):  # it runs until then
-            asyncio.run(run_sim(settings, write))
+            asyncio.run(run_sim(url, settings, options.seconds, write))
     except (LinkError, OSError) as error:
         raise CommandError(error) from None
     except ValueError as error:  # a setting out of range
@@ -75,7 +76,6 @@ def _sim(options: argparse.Namespace) -> int:
 
 
 def _demo(options: argparse.Namespace) -> int:
-    from uavlinkd.lab.child_processes import interrupted_by_signals  # noqa: PLC0415
     from uavlinkd.lab.demo.run import DEMO_ERRORS, run_demo  # noqa: PLC0415
     from uavlinkd.lab.mitm.attack import AttackError  # noqa: PLC0415
 
@@ -85,10 +85,7 @@ def _demo(options: argparse.Namespace) -> int:
             from uavlinkd.lab.demo import web  # noqa: PLC0415
     serve = web.serving if options.web else None
     try:
-        with interrupted_by_signals():
-            summary = asyncio.run(
-                run_demo(options.seconds, show=not options.json, attack=options.attack, serve=serve)
-            )
+        summary = asyncio.run(run_demo(options.seconds, show=not options.json, attack=options.attack, serve=serve))
     except KeyboardInterrupt:
         return OK if options.web else FAILED  # with a page, it runs until then
     except AttackError as error:

@@ -19,9 +19,9 @@ from uavlinkd.web.watch import Watcher
 
 
 @pytest.mark.long
-async def test_page_of_a_demo_under_attack(tmp_path: Path) -> None:
+async def test_page_of_a_demo_under_attack(short_folder: Path) -> None:
     """It stays after the attacks. Ctrl-C ends the demo, and nothing is left."""
-    async with demo("--web", "--attack", "forge-data", "--seconds", "2", folder=tmp_path) as process:
+    async with demo("--web", "--attack", "forge-data", "--seconds", "2", folder=short_folder) as process:
         assert process.stdout is not None
         line = (await asyncio.wait_for(process.stdout.readline(), ENDED_S)).decode()
         url = line.removeprefix("the page is at ").removesuffix(" until Ctrl-C\n")
@@ -33,7 +33,7 @@ async def test_page_of_a_demo_under_attack(tmp_path: Path) -> None:
         out, err = await asyncio.wait_for(process.communicate(), ENDED_S)
         assert (err, process.returncode) == (b"", 0)
         assert b"their keys are deleted" in out
-        assert list(tmp_path.iterdir()) == []
+        assert list(short_folder.iterdir()) == []
 
 
 def test_without_the_extra_the_remedy_is_named() -> None:

@@ -5,23 +5,23 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
-from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from tests.lab.sim.recorded import Collector
 from tests.waiting import until
 from uavlinkd.io.url import EndpointKind, NetworkUrl
-from uavlinkd.lab.sim.flight import SimOptions, run_sim
+from uavlinkd.lab.sim.autopilot import AutopilotSettings
+from uavlinkd.lab.sim.flight import run_sim
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.system.addresses import Address
 
 
 @asynccontextmanager
-async def sim(url: NetworkUrl, **options: Any) -> AsyncIterator[list[str]]:
+async def sim(url: NetworkUrl, system_id: int) -> AsyncIterator[list[str]]:
     """The lines of a running simulator. It is interrupted at the end, as by Ctrl-C."""
     lines: list[str] = []
-    running = asyncio.create_task(run_sim(SimOptions(url, **options), lines.append))
+    running = asyncio.create_task(run_sim(url, AutopilotSettings(system_id=system_id), None, lines.append))
     try:
         yield lines
     finally:

@@ -67,12 +67,9 @@ def settings_of(evaluation: Evaluation[Any, Any], options: argparse.Namespace) -
 
 
 def _evaluate(options: argparse.Namespace) -> int:
-    from uavlinkd.lab.child_processes import interrupted_by_signals  # noqa: PLC0415
-
     evaluation = evaluation_of(options.evaluation)
     try:
-        with interrupted_by_signals():
-            asyncio.run(evaluation.measure(options.out, settings_of(evaluation, options), _show))
+        asyncio.run(evaluation.measure(options.out, settings_of(evaluation, options), _show))
         print(evaluation.write(options.out))
         findings = evaluation.read(options.out)
     except _errors() as error:

@@ -106,34 +106,21 @@ class Flight:
 Write = Callable[[str], None]
 
 
-@dataclass(frozen=True, slots=True)
-class SimOptions:
-    """The command line."""
-
-    url: NetworkUrl
-    system_id: int = 1
-    rate_hz: float = 10.0
-    seconds: float | None = None
-    seed: int = 0
-
-
-async def run_sim(options: SimOptions, write: Write) -> None:
+async def run_sim(url: NetworkUrl, settings: AutopilotSettings, seconds: float | None, write: Write) -> None:
     """Fly until the end, or until cancelled, then write the counters.
 
     Raises:
         LinkError: the connection cannot be opened.
-        ValueError: a setting is out of range.
     """
-    settings = AutopilotSettings(system_id=options.system_id, attitude_rate_hz=options.rate_hz, seed=options.seed)
 
     def on_event(name: str, fields: dict[str, object]) -> None:
         write(" ".join([name.replace("_", " ") + ":" * bool(fields), *(f"{k} {v}" for k, v in fields.items())]))
 
-    async with Flight(options.url, settings, on_event=on_event) as flight:
-        write(f"copter with system ID {options.system_id}, {_where(flight.link.url)}; Ctrl-C ends it")
+    async with Flight(url, settings, on_event=on_event) as flight:
+        write(f"copter with system ID {settings.system_id}, {_where(flight.link.url)}; Ctrl-C ends it")
         watching = asyncio.create_task(_watch(flight.link, lambda: flight.report.frames_received > 0, write))
         try:
-            await flight.run(options.seconds)
+            await flight.run(seconds)
         finally:
             watching.cancel()
             write(str(flight.report))
