@@ -128,7 +128,7 @@ class Copies:
         waiting: list[Transmit] = []
         for transmit in outputs:
             is_next = not picked or not any(one.is_copy and transmit.path in one.paths for one in self.waiting)
-            has_room = is_next and self._has_room(transmit, now, self._rate if picked else None)
+            has_room = is_next and self._has_room(transmit.path, now, self._rate if picked else None)
             (picked if has_room else waiting).append(transmit)
         if waiting and not picked:
             # No network has room, although one had when the envelope was sealed: the best path pays with debt.
@@ -158,15 +158,12 @@ class Copies:
             if not one.is_copy:
                 one.paths = [path for path in one.paths if path in usable]
         released: list[tuple[Transmit, int]] = []
-        blocked: set[Path] = set()  # copies wait for these
         due = [one for one in self.waiting if one.due_at <= now]
         for one in sorted(due, key=lambda one: (not one.is_copy, one.rank, one.number)):
             number, rate = one.number, self._rate if one.is_copy else self._average
             for path in one.paths:
                 transmit = Transmit(one.datagram, path, is_copy=True)
-                if path in blocked or not self._has_room(transmit, now, rate):
-                    if one.is_copy:
-                        blocked.add(path)
+                if not self._has_room(path, now, rate):
                     continue
                 self._charge(transmit, now, rate)
                 if number > 1:
@@ -180,21 +177,11 @@ class Copies:
 
     def next_deadline(self, now: float) -> float:
         """When :meth:`release` has something to do; infinity while nothing waits."""
-        copies_at: dict[Path, float] = {}
+        at = inf
         for one in self.waiting:
-            if one.is_copy:
-                (path,) = one.paths
-                at = min(one.put_at + MAX_WAIT_S, now + self._wait_s(path, now, self._rate))
-                copies_at[path] = min(at, copies_at.get(path, inf))
-        at = min(copies_at.values(), default=inf)
-        for one in self.waiting:
-            if one.due_at > now:
-                at = min(at, one.due_at)
-            elif not one.is_copy:
-                rooms = [
-                    max(now + self._wait_s(path, now, self._average), copies_at.get(path, now)) for path in one.paths
-                ]
-                at = min(at, one.put_at + MAX_WAIT_S, *rooms)
+            rate = self._rate if one.is_copy else self._average
+            room_at = now + min(self._wait_s(path, now, rate) for path in one.paths)
+            at = min(at, max(one.due_at, room_at), one.put_at + MAX_WAIT_S)
         return at
 
     def clear(self) -> None:
@@ -204,26 +191,20 @@ class Copies:
 
     # Room.
 
-    def _wait_s(self, path: Path, now: float, rate: Bucket) -> float:
-        """How long until there may be room along a path."""
-        wait_s = rate.wait_s(0.0, now)
-        if (budget := self._budgets.get(path.socket)) is not None:
-            wait_s = max(wait_s, budget.copies.wait_s(0.0, now), budget.all.wait_s(-DEBT_S * budget.all.rate, now))
-        return wait_s
+    def _wait_s(self, path: Path, now: float, rate: Bucket | None, slack: float = 0.0) -> float:
+        """How long until a datagram may be sent along a path, if nothing else is sent meanwhile.
 
-    def _has_room(self, transmit: Transmit, now: float, rate: Bucket | None) -> bool:
-        """Whether a datagram may be sent now. ``rate``: the limit of copies or repeats; None for a first datagram."""
-        if rate is not None and rate.level(now) < -_SLACK_BYTES:
-            return False
-        budget = self._budgets.get(transmit.path.socket)
-        if budget is None:
-            return True
-        if rate is not None and budget.copies.level(now) < -_SLACK_BYTES:
-            return False
-        level = budget.all.level(now)
-        return (
-            level >= wire_bytes(transmit.datagram, transmit.path) or level >= -DEBT_S * budget.all.rate - _SLACK_BYTES
-        )
+        ``rate``: the limit of copies or repeats; None for a first datagram. ``slack``: bytes that may be missing.
+        """
+        waits = [] if rate is None else [rate.wait_s(-slack, now)]
+        if (budget := self._budgets.get(path.socket)) is not None:
+            waits.append(budget.all.wait_s(-DEBT_S * budget.all.rate - slack, now))
+            if rate is not None:
+                waits.append(budget.copies.wait_s(-slack, now))
+        return max(waits, default=0.0)
+
+    def _has_room(self, path: Path, now: float, rate: Bucket | None) -> bool:
+        return self._wait_s(path, now, rate, _SLACK_BYTES) == 0.0
 
     def _charge(self, transmit: Transmit, now: float, rate: Bucket) -> None:
         size = wire_bytes(transmit.datagram, transmit.path)
