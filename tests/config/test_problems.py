@@ -49,6 +49,7 @@ _PEER_ROWS = [
     ("suites = [2048]", "suites[0]", 'must be "x25519", "ffdhe2048"'),
     ('tag_bits = "128"', "tag_bits", "must be 64, 96 or 128"),
     ("mac_key_bits = 512", "mac_key_bits", "was removed: delete the line"),
+    ('deny_in = ["PING"]', "deny_in", "was removed: to stop a message, write it into rate_in"),
     ('confidential = "yes"', "confidential", "write confidential = true"),
     ('keepalive_s = "10"', "keepalive_s", "write keepalive_s = 10"),
     ("keepalive_s = inf", "keepalive_s", "must be from 0.1 to 3600"),

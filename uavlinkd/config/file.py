@@ -16,7 +16,6 @@ from uavlinkd.authority.certificates import MemberRole
 from uavlinkd.config.model import ConfigError, PeerAddress, Problem
 from uavlinkd.config.schema import POLICY, SECTIONS, SINGLE, TITLES, TOP
 from uavlinkd.config.section import Keys, Values, read
-from uavlinkd.mavlink.policy.settings import INSTEAD_OF_DENIAL
 
 if TYPE_CHECKING:
     from uavlinkd.authority.trust import HeldCertificate
@@ -153,7 +152,12 @@ _KNOWN: dict[str, str] = {
         "was removed: to change a key, write the new public key into the other ends' files, restart the daemon whose"
         " key it is, and reload the others at the same time; in a fleet, `uavlinkd enroll NAME` there makes one",
     ),
-    **dict.fromkeys(("deny_in", "deny_out"), f"was removed: {INSTEAD_OF_DENIAL}"),
+    **dict.fromkeys(
+        ("deny_in", "deny_out"),
+        "was removed: to stop a message, write it into rate_in or rate_out with a rate of 0; to keep out a command,"
+        " write no role, and in allow_in and allow_out only what is needed: most commands have others with the same"
+        " effect",
+    ),
     "successor": "was removed: delete the line: nothing used it",
     "recording": "was removed: delete [recording]: ground stations record, and so does `mavproxy.py --daemon`",
     "probe_interval_s": "was removed: delete the line: the round trip is measured every 5 s",

@@ -42,7 +42,6 @@ from uavlinkd.protocol.drops import Reason
 MAVLINK1: Final = 0xFE
 MAVLINK2: Final = 0xFD
 MAX_FRAME_BYTES: Final = 10 + 255 + 2 + 13
-MIN_FRAME_BYTES: Final = 6 + 2
 SIGNATURE_BYTES: Final = 13
 MAX_FALSE_STARTS: Final = 64
 """After so many false starts in a row the rest of a datagram is not searched: each costs a checksum."""

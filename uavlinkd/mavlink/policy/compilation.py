@@ -27,8 +27,8 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from uavlinkd.mavlink import dialect
-from uavlinkd.mavlink.policy.gate import REQUEST_MESSAGE, Gate, Refusal
-from uavlinkd.mavlink.policy.settings import Direction, Rules, Settings, read_settings
+from uavlinkd.mavlink.policy.gate import Gate, Refusal
+from uavlinkd.mavlink.policy.settings import Rules, Settings, read_settings
 
 
 class PolicyRow(NamedTuple):
@@ -53,7 +53,7 @@ class Policy:
         self.incoming, self.outgoing = Gate(settings, "in"), Gate(settings, "out")
         self.incoming.opposite, self.outgoing.opposite = self.outgoing, self.incoming
         # Sentences for the operator, the most severe first.
-        self.warnings = tuple(_warnings(settings, {"in": self.incoming, "out": self.outgoing}))
+        self.warnings = tuple(_warnings(settings))
 
     def describe(self) -> list[PolicyRow]:
         """The policy as a table: each group of messages, and the other rules."""
@@ -75,7 +75,7 @@ class Policy:
         ]
 
 
-def _warnings(settings: Settings, gates: Mapping[Direction, Gate]) -> list[str]:
+def _warnings(settings: Settings) -> list[str]:
     if settings.is_empty:
         return ["no policy: it may send as any system, and any message but SETUP_SIGNING"]
     warnings = []
@@ -83,13 +83,6 @@ def _warnings(settings: Settings, gates: Mapping[Direction, Gate]) -> list[str]:
         warnings.append('role = "all": it may send every message and command')
     if settings.systems is None:
         warnings.append('system_ids is "all": it may send as any system, including the ground station')
-    for direction, gate in gates.items():
-        rules = settings.rules[direction]
-        if REQUEST_MESSAGE in rules.allowed_commands and gate.opposite.passes_nothing:
-            warnings.append(
-                f"allow_{direction} has MAV_CMD_REQUEST_MESSAGE, but the other direction passes no message: every"
-                " request is refused; allow the answers there"
-            )
     return warnings
 
 

@@ -17,12 +17,6 @@ MAX_MSGID: Final = 0xFFFFFF
 MAX_COMMAND: Final = 0xFFFF
 MAX_SYSTEM: Final = 255
 
-INSTEAD_OF_DENIAL: Final = (
-    "to stop a message, write it into rate_in or rate_out with a rate of 0; to keep out a command, write no role, and"
-    " in allow_in and allow_out only what is needed: most commands have others with the same effect"
-)
-"""What replaces the former keys ``deny_in`` and ``deny_out``."""
-
 KEYS: Final = ("role", "system_ids", "allow_in", "allow_out", "rate_in", "rate_out", "mavlink1", "ground_station")
 
 FILE_TRANSFER: Final = IDS["FILE_TRANSFER_PROTOCOL"]
@@ -115,9 +109,7 @@ def read_settings(data: Mapping[str, object], *, is_local: bool) -> Settings:
         problems.append(PolicyProblem(key, problem, remedy))
 
     for key in data:
-        if key in ("deny_in", "deny_out"):
-            report(key, "was removed", INSTEAD_OF_DENIAL)
-        elif key not in KEYS:
+        if key not in KEYS:
             report(str(key), "no such key", _did_you_mean(str(key), KEYS, f"the keys are {', '.join(KEYS)}"))
     role_name = data.get("role")
     role = ROLES.get(role_name) if isinstance(role_name, str) else None
