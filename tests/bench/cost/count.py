@@ -15,6 +15,8 @@ from typing import Final
 from tests.bench.cost.pair import SIDES
 
 FRAMES: Final = 15
+SLOWER: Final = 20
+"""So much slower is the clock while frames are counted: callgrind is slow, and no timer expires because of that."""
 SOURCE: Final = Path(__file__).with_name("counting.c")
 ROOT: Final = Path(__file__).parents[3]
 VALGRIND: Final = (
@@ -42,28 +44,33 @@ def missing_tools() -> list[str]:
 def count(folder: Path, *, python: str = sys.executable, idle_s: float = 0.0) -> dict[str, Cost]:
     """Count what frames cost, by the side, and ``idle``: what a second costs one of both without frames.
 
-    ``idle_s``: for so many seconds of the daemons' clock, which is slow. The folder gets callgrind's files. Raises
-    RuntimeError: the daemons failed.
+    ``idle_s``: for so many seconds. The folder gets callgrind's files. Raises RuntimeError: the daemons failed.
     """
-    library, out = folder / "counting.so", folder / "out"
-    subprocess.run(["gcc", "-O2", "-shared", "-fPIC", "-o", library, SOURCE, "-ldl"], check=True)
-    command = [*VALGRIND, f"--callgrind-out-file={out}", python, "-m", "tests.bench.cost.pair"]
-    environment = {**os.environ, "LD_PRELOAD": str(library), "PYTHONPATH": str(ROOT)}
-    arguments = [str(library), str(FRAMES), str(idle_s)]
-    done = subprocess.run(
-        [*command, *arguments], env=environment, cwd=folder, capture_output=True, text=True, check=False
-    )
-    if done.returncode:
-        raise RuntimeError(done.stderr)
-    dumps = [_read(folder / f"out.{number}") for number in range(1, 2 * FRAMES + 1)]
+    subprocess.run(["gcc", "-O2", "-shared", "-fPIC", "-o", folder / "counting.so", SOURCE, "-ldl"], check=True)
+    dumps = _dumps(folder, python, FRAMES, 0.0, slower=SLOWER)
     costs = {
         side: Cost(*(round(median(values)) for values in zip(*dumps[at * FRAMES : (at + 1) * FRAMES], strict=True)))
         for at, side in enumerate(SIDES)
     }
     if idle_s:
-        totals = _read(folder / f"out.{2 * FRAMES + 1}")
+        (totals,) = _dumps(folder, python, 0, idle_s, slower=1)
         costs["idle"] = Cost(*(round(total / (2 * idle_s)) for total in totals))
     return costs
+
+
+def _dumps(folder: Path, python: str, frames: int, idle_s: float, *, slower: int) -> list[tuple[int, int]]:
+    """What one run of :mod:`.pair` counted, in its order."""
+    library, out = folder / "counting.so", folder / "out"
+    command = [*VALGRIND, f"--callgrind-out-file={out}", python, "-m", "tests.bench.cost.pair"]
+    environment = {**os.environ, "LD_PRELOAD": str(library), "PYTHONPATH": str(ROOT), "COUNTING_SLOWER": str(slower)}
+    arguments = [str(library), str(frames), str(idle_s)]
+    done = subprocess.run(
+        [*command, *arguments], env=environment, cwd=folder, capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        raise RuntimeError(done.stderr)
+    count = len(SIDES) * frames + bool(idle_s)
+    return [_read(folder / f"out.{number}") for number in range(1, count + 1)]
 
 
 def _read(file: Path) -> tuple[int, int]:
