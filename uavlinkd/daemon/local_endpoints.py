@@ -253,7 +253,7 @@ class PilotNotes:
     def _observe(self, seen: _Seen, now: float) -> None:
         link = seen.link
         name, peer = link.name, link.peer
-        seen.system = _vehicle(self._addresses(link)) or seen.system or _only_system(link)
+        seen.system = _vehicle(self._addresses(link)) or seen.system
         if seen.is_up != peer.is_up:
             seen.is_up = peer.is_up
             if not peer.is_up:
@@ -321,9 +321,3 @@ def _vehicle(addresses: list[SystemComponent]) -> int | None:
     """The first autopilot's system, else the first system."""
     autopilots = [system for system, component in addresses if component == _AUTOPILOT]
     return next(iter(autopilots or (system for system, _ in addresses)), None)
-
-
-def _only_system(link: PeerLink) -> int | None:
-    """The system of a peer that may send as one only."""
-    systems = [system for system in range(1, 256) if link.policy.incoming.may_speak_as(system)]
-    return systems[0] if len(systems) == 1 else None

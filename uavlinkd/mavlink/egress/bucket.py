@@ -108,14 +108,12 @@ class Supply:
     without a budget, which always has room.
     """
 
-    __slots__ = ("is_limited", "keeps_order", "networks", "own", "rate")
+    __slots__ = ("keeps_order", "networks", "own", "rate")
 
     def __init__(self, own: Bucket | None = None, networks: Sequence[Bucket | None] = (None,)) -> None:
         self.own = own
         limited = [network for network in networks if network is not None]
         self.networks = tuple(limited) if len(limited) == len(networks) else ()
-        self.is_limited = own is not None or bool(self.networks)
-        """Whether frames may have to wait for a budget."""
         self.keeps_order = own is None and all(network.keeps_order for network in self.networks)
         self.rate = min(
             inf if own is None else own.rate, max((network.rate for network in self.networks), default=inf)
