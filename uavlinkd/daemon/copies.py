@@ -158,12 +158,15 @@ class Copies:
             if not one.is_copy:
                 one.paths = [path for path in one.paths if path in usable]
         released: list[tuple[Transmit, int]] = []
+        blocked: set[Path] = set()  # copies wait for these, and go before repeats
         due = [one for one in self.waiting if one.due_at <= now]
         for one in sorted(due, key=lambda one: (not one.is_copy, one.rank, one.number)):
             number, rate = one.number, self._rate if one.is_copy else self._average
             for path in one.paths:
                 transmit = Transmit(one.datagram, path, is_copy=True)
-                if not self._has_room(path, now, rate):
+                if path in blocked or not self._has_room(path, now, rate):
+                    if one.is_copy:
+                        blocked.add(path)
                     continue
                 self._charge(transmit, now, rate)
                 if number > 1:
@@ -178,9 +181,10 @@ class Copies:
     def next_deadline(self, now: float) -> float:
         """When :meth:`release` has something to do; infinity while nothing waits."""
         at = inf
+        of_copies = {path for one in self.waiting if one.is_copy for path in one.paths}
         for one in self.waiting:
-            rate = self._rate if one.is_copy else self._average
-            room_at = now + min(self._wait_s(path, now, rate) for path in one.paths)
+            rates = ((path, self._rate if path in of_copies else self._average) for path in one.paths)
+            room_at = now + min(self._wait_s(path, now, rate) for path, rate in rates)
             at = min(at, max(one.due_at, room_at), one.put_at + MAX_WAIT_S)
         return at
 
