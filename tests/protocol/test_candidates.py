@@ -70,6 +70,19 @@ def test_each_candidate_gets_one_question_and_no_slot(pair: Pair) -> None:
     assert ask(Pair(LINK, LINK), 0.0, DIRECT) == []
 
 
+def test_questions_to_candidates_are_in_the_totals_of_the_peer(pair: Pair) -> None:
+    """Its budget pays for them, also when another address takes a candidate's place, or it becomes a path."""
+    paths = pair.a.peer.paths
+    before = paths.totals
+    sent = ask_everywhere(pair, 1.0, DIRECT, at(1))
+    sent += ask_everywhere(pair, 2.0, DIRECT, at(2))
+    size = sum(len(transmit.datagram) for transmit in sent)
+    assert len(sent) >= 3
+    assert paths.totals[:2] == (before.datagrams_sent + len(sent), before.bytes_sent + size)
+    paths.learn(DIRECT, 3.0)
+    assert paths.totals[:2] == (before.datagrams_sent + len(sent), before.bytes_sent + size)
+
+
 def test_answered_candidate_becomes_the_best_path(pair: Pair) -> None:
     """At both ends: bravo learns it by the question, and asks in its answer. Its probes ask it from then on."""
     answer = answered(pair)

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.protocol.harness import Pair, quiet
+from tests.protocol.harness import Pair, datagrams, exchange, quiet
 from uavlinkd.protocol import constants as c
 from uavlinkd.protocol.crypto import AeadKey, MacKey
 from uavlinkd.protocol.initiator import Pending
@@ -71,3 +71,15 @@ def test_nothing_is_left_of_a_peer_that_is_removed() -> None:
     pair.b.node.remove_peer(pair.b.peer, c.REKEY_AFTER_S)
     assert census.count(*KEEPERS) == 0
     assert peer() is None
+
+
+def test_nothing_is_left_of_a_session_that_was_closed() -> None:
+    """Of the current one, which carried a frame of a stream a moment ago, neither: no later frame has to come."""
+    census = Census()
+    pair = Pair(link_a=quiet(), link_b=quiet()).establish(0.0)
+    exchange(pair.b, pair.a, pair.a.send(0.1), 0.1)
+    for datagram in datagrams(pair.b.node.close(1.0)):
+        pair.a.receive(datagram, 1.0)
+    pair.a.timeout(3000.0)
+    assert pair.a.peer.sessions.current is None
+    assert census.count(Session, MacKey) == 0

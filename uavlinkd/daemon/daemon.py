@@ -35,9 +35,9 @@ if TYPE_CHECKING:
 
 
 HOUSEKEEPING_S = INTERVAL_S
+"""How often links are measured, and idle clients forgotten."""
 LOOKS_EVERY = 2
 """So many of these intervals are between two looks for findings, which cost as much as all else that is done then."""
-"""How often links are measured, and idle clients forgotten."""
 
 
 class Daemon:

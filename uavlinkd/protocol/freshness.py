@@ -118,6 +118,8 @@ def handle_timeout(peer: Peer, now: float) -> list[Output]:
 def end(peer: Peer, sessions: list[Session]) -> list[Output]:
     """What ends with sessions: frames that were held, requests about them, and the count of missing envelopes."""
     out: list[Output] = []
+    if sessions:
+        peer.paths.outlet = None  # it has a session with its keys
     for session in sessions:
         out += _drop_held(peer, session)
         peer.echo_requests.forget(session)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
+from operator import add
 from typing import NamedTuple
 
 from uavlinkd.protocol import constants as c
@@ -13,7 +14,7 @@ from uavlinkd.protocol.session import Session
 
 
 class Totals(NamedTuple):
-    """The datagrams along all paths to one peer: envelopes, and the handshake messages that this end sent."""
+    """The datagrams along all paths to one peer: envelopes, copies too, and handshake messages."""
 
     datagrams_sent: int
     bytes_sent: int
@@ -63,8 +64,8 @@ class PathSlots:
 
     @property
     def totals(self) -> Totals:
-        """What went along these paths, and along those that there were before. It only grows."""
-        rows = [(state.datagrams_sent, state.bytes_sent, state.bytes_received) for state in self.by_path.values()]
+        """What went along these paths, to candidates, and along the paths that there were before. It only grows."""
+        rows = [_totals_of(state) for state in (*self.by_path.values(), *self._asked.values())]
         return Totals(*map(sum, zip(self._departed, *rows, strict=True)))
 
     @property
@@ -124,17 +125,27 @@ class PathSlots:
     def set_candidates(self, paths: Iterable[Path]) -> None:
         """The peer may be there too. The first :data:`c.CANDIDATES` count."""
         self.candidates = tuple(dict.fromkeys(paths))[: c.CANDIDATES]
-        self._asked = {path: state for path, state in self._asked.items() if path in self.candidates}
+        for path in self._asked.keys() - set(self.candidates):
+            self._forget_asked(path)
 
     def to_ask(self, now: float) -> list[PathState]:
         """The candidates without a slot. They need not have sent anything, so questions are limited elsewhere."""
         for path in self.candidates:
             if path in self.by_path:
-                self._asked.pop(path, None)
+                self._forget_asked(path)
             elif path not in self._asked:
                 state = self._asked[path] = PathState(path, 0, now, is_configured=False, is_metered=False)
                 state.is_proven = True
         return list(self._asked.values())
+
+    def _forget_asked(self, path: Path) -> PathState | None:
+        state = self._asked.pop(path, None)
+        if state is not None:
+            self._note_departed(state)
+        return state
+
+    def _note_departed(self, state: PathState) -> None:
+        self._departed = Totals(*map(add, self._departed, _totals_of(state)))
 
     def learn(self, path: Path, now: float) -> PathState:
         """A slot for an address from which an authentic envelope came first, or which made the session."""
@@ -142,7 +153,7 @@ class PathSlots:
         if len(learned) >= c.LEARNED_PATHS:
             self.remove(min((state for state in learned if state is not self.best), key=_usefulness))
         state = self._new(path, now, is_configured=False, others=self.by_path)
-        if (asked := self._asked.pop(path, None)) is not None:
+        if (asked := self._forget_asked(path)) is not None:
             state.take_questions(asked)
         self.by_path[path] = state
         self.outlet, self.inlet = None, (None, None)
@@ -168,8 +179,7 @@ class PathSlots:
         return PathState(path, number, now, is_configured=is_configured, is_metered=is_metered, is_stream=is_stream)
 
     def _drop(self, state: PathState) -> None:
-        sent, size, received = self._departed
-        self._departed = Totals(sent + state.datagrams_sent, size + state.bytes_sent, received + state.bytes_received)
+        self._note_departed(state)
         self.unproven += not (state.is_validated or state.is_configured)
         if not state.is_known:
             return
@@ -194,6 +204,10 @@ class PathSlots:
         if not state.is_known:
             state.is_known = True
             self._known[state.path.place] += 1
+
+
+def _totals_of(state: PathState) -> Totals:
+    return Totals(state.datagrams_sent, state.bytes_sent, state.bytes_received)
 
 
 def _usefulness(state: PathState) -> tuple[bool, float, float]:
