@@ -16,7 +16,9 @@ from uavlinkd.protocol.constants import NEVER
 from uavlinkd.protocol.outputs import PathChanged
 from uavlinkd.protocol.path import Path, SocketFacts
 from uavlinkd.protocol.path_measures import (
+    FIRST_WAITS_S,
     NO_REPEATS,
+    REGULAR_AFTER_S,
     WAITS_S,
     EnvelopeLimit,
     MissingEnvelopes,
@@ -272,31 +274,39 @@ def test_losses_make_a_path_acknowledge_its_limit_again() -> None:
 
 # Missing envelopes.
 
+OLD_S = REGULAR_AFTER_S
+
 
 @pytest.mark.parametrize(
     "steps",
     [
         pytest.param(["count 0 0 0", "count 1 3 3", "count 2 3 3", "count 3 7 7"], id="one path, no reports"),
         pytest.param(
-            ["ask 0 0", "count 1 5 0", "ask 2 2", "count 3 5 2", "count 4 6 2"], id="a later report explains"
+            ["ask 0 0 old", "count 1 5 0", "ask 2 2 old", "count 3 5 2", "count 4 6 2"], id="a later report explains"
         ),
-        pytest.param(["ask 0 9", "count 1 0 0", "count 2 4 4", "ask 22 0", "count 22 5 4"], id="lost along one path"),
-        pytest.param(["ask 0 5", "count 1 2 2", "count 2 5 5", "count 3 6 5"], id="several gaps"),
-        pytest.param(["answer 0 0", "count 1 3 3"], id="answers alone"),
-        pytest.param(["ask 0 0", "count 20 3 0", "count 20.1 4 4", "count 20.2 5 5"], id="reports end"),
         pytest.param(
-            ["ask 0 0", "count 20.1 3 3", "ask 21 0", "count 23 8 3", "ask 26 2", "count 27 8 5"],
+            ["ask 0 9 old", "count 1 0 0", "count 2 4 4", "ask 22 0 old", "count 22 5 4"], id="lost along one path"
+        ),
+        pytest.param(["ask 0 5 old", "count 1 2 2", "count 2 5 5", "count 3 6 5"], id="several gaps"),
+        pytest.param(["answer 0 0 old", "count 1 3 3"], id="answers alone"),
+        pytest.param(["ask 0 0 old", "count 20 3 0", "count 20.1 4 4", "count 20.2 5 5"], id="reports end"),
+        pytest.param(
+            ["ask 0 0 0.1", "count 2 1 0", "ask 4 0 0.1", "count 8 4 0", "count 8.1 5 4"], id="first question"
+        ),
+        pytest.param(
+            ["ask 0 0 old", "count 20.1 3 3", "ask 21 0 0", "count 23 8 3", "ask 26 2 old", "count 27 8 5"],
             id="a question once none waits",
         ),
     ],
 )
 def test_gaps_that_are_losses(steps: list[str]) -> None:
-    """``ask`` or ``answer``: a report, when, and its losses. ``count``: when, all gaps, losses."""
-    assert WAITS_S == 20.0
+    """``ask`` or ``answer``: a report, when, its losses, the session's age. ``count``: when, all gaps, losses."""
+    assert (WAITS_S, FIRST_WAITS_S) == (20.0, 8.0)
     losses = MissingEnvelopes()
     for step in steps:
-        kind, now, number, *last = step.split()
+        kind, now, number, last = step.split()
         if kind == "count":
-            assert losses.count(int(number), float(now)) == int(last[0]), step
+            assert losses.count(int(number), float(now)) == int(last), step
         else:
-            losses.note_report(int(number), float(now), asks=kind == "ask")
+            age_s = OLD_S if last == "old" else float(last)
+            losses.note_report(int(number), float(now), age_s, asks=kind == "ask")

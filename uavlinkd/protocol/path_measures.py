@@ -170,6 +170,10 @@ class EnvelopeLimit:
 
 WAITS_S = 20.0
 """A gap waits so long for the report that explains it: longer than the interval between probes of an idle path."""
+FIRST_WAITS_S = 8.0
+"""The same before the peer has shown whether it asks regularly: it probes its only usable path each 5 s."""
+REGULAR_AFTER_S = 4.0
+"""A question is one of many if its session is so old: a peer with one path may ask along it when a session begins."""
 
 _Counts = list[tuple[float, int]]
 
@@ -181,20 +185,25 @@ class MissingEnvelopes:
     Such a peer reports how many datagrams it sent along each path. Its gaps count only as far as these lost some too.
     """
 
-    __slots__ = ("_asked_at", "_gaps", "_lost", "_seen", "total")
+    __slots__ = ("_asked_at", "_gaps", "_lost", "_seen", "_until", "total")
 
     def __init__(self) -> None:
         self.total = 0
         self._seen = 0
-        self._asked_at = -c.NEVER  # gaps wait for reports until WAITS_S later
+        self._until = -c.NEVER  # gaps wait for reports until then
+        self._asked_at = -c.NEVER
         self._gaps: _Counts = []
         self._lost: _Counts = []
 
-    def note_report(self, lost: int, now: float, *, asks: bool) -> None:
+    def note_report(self, lost: int, now: float, session_age_s: float, *, asks: bool) -> None:
         """The peer reported; ``lost``: how many datagrams a path that works lost since its last report.
 
         ``asks``: with a question. A peer with one path answers, and asks at most when a session begins.
         """
+        if asks and session_age_s >= REGULAR_AFTER_S:
+            self._until = now + WAITS_S
+        elif asks and now > self._until:
+            self._until = now + FIRST_WAITS_S
         if asks:
             self._asked_at = now
         _add(self._lost, lost, now)
@@ -203,16 +212,21 @@ class MissingEnvelopes:
         """The losses so far. ``gaps``: all that were ever found. Call it about once a second."""
         _add(self._gaps, gaps - self._seen, now)
         self._seen = gaps
-        if now > self._asked_at + WAITS_S:
+        if now > self._until:
             # The last report knew those before it. A gap is found so long after its envelope was lost.
             known_until = self._asked_at + c.LATE_AFTER_S + c.LATE_STEP_S
             self.total += sum(number for at, number in self._gaps if at > known_until)
             self._gaps.clear()
             self._lost.clear()
-        both = min(sum(number for _, number in counts) for counts in (self._gaps, self._lost))
-        self.total += both
-        _remove(self._gaps, both)
-        _remove(self._lost, both)
+        while self._gaps and self._lost:
+            gap_at, gap = self._gaps.pop(0)
+            lost_at, lost = self._lost.pop(0)
+            both = min(gap, lost)
+            self.total += both
+            if gap > both:
+                self._gaps.insert(0, (gap_at, gap - both))
+            if lost > both:
+                self._lost.insert(0, (lost_at, lost - both))
         return self.total
 
 
@@ -221,12 +235,3 @@ def _add(counts: _Counts, number: int, now: float) -> None:
         counts.pop(0)
     if number > 0:
         counts.append((now, number))
-
-
-def _remove(counts: _Counts, number: int) -> None:
-    """Take so many away, the oldest first."""
-    while number:
-        at, count = counts.pop(0)
-        if count > number:
-            counts.insert(0, (at, count - number))
-        number -= min(count, number)

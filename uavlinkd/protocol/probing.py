@@ -111,7 +111,8 @@ def receive_probe(
     out: list[Output] = []
     counts = session is peer.sessions.current and not is_copy
     if counts:
-        peer.losses.note_report(state.receive_report(probe, now), now, asks=probe.question != 0)
+        lost, age_s = state.receive_report(probe, now), now - session.created_at
+        peer.losses.note_report(lost, now, age_s, asks=probe.question != 0)
     if probe.answer:
         is_first = not state.is_validated
         round_trip_s = state.receive_answer(probe.answer, probe.received if counts else None, now)
