@@ -143,8 +143,7 @@ def member_attacks(stage: FleetStage) -> list[KeyAttack]:
             "certificates",
             "floods with altered ones, for itself, for the drone and for others",
             valid,
-            "bad_certificate",
-            "record_over_limit",
+            "unexpected_record",
             records=_certificates(stage, captured.public, valid),
         ),
     ]
