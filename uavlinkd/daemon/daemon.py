@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 HOUSEKEEPING_S = INTERVAL_S
 """How often links are measured, and idle clients forgotten."""
 LOOKS_EVERY = 2
-"""So many of these intervals are between two looks for findings, which cost as much as all else that is done then."""
+"""Intervals from one look for findings to the next: a look costs as much as all else that is done in one."""
 
 
 class Daemon:

@@ -70,7 +70,7 @@ class Initiator:
         self._received_cookies: dict[Path, tuple[bytes, float]] = {}  # the peer's, and until when; the oldest first
 
     def take(self, paths: Sequence[Path], shown: bytes, now: float) -> tuple[list[Path], float]:
-        """Of these paths those along which to initiate now, and when the next try is due if none of them is free.
+        """The paths, of these, along which to initiate now, and when the next try is due if none of them is free.
 
         Tries along a network with a budget are :data:`c.TRY_AIRTIMES` airtimes apart, those along a metered one are
         the rarer the longer the peer does not answer, whatever other networks do. ``shown``: the certificate in this

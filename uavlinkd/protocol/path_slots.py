@@ -97,7 +97,8 @@ class PathSlots:
             hosts[path.socket, path.host] += 1
             if hosts[path.socket, path.host] <= c.PATHS_PER_HOST and len(wanted) < c.CONFIGURED_PATHS:
                 wanted.append(path)
-        before, self.outlet, self.inlet = self.by_path, None, (None, None)
+        before = self.by_path
+        self._forget_ready()
         if any(path.is_relayed and path not in before for path in wanted):  # the peer may have another address
             for state in before.values():
                 least_s = c.PROBE_INTERVAL_S if state.is_metered and state is not self.best else c.PROBE_FAST_S
@@ -144,6 +145,10 @@ class PathSlots:
             self._note_departed(state)
         return state
 
+    def _forget_ready(self) -> None:
+        """Forget what stands ready for the next frame and the next envelope: a slot has changed."""
+        self.outlet, self.inlet = None, (None, None)
+
     def _note_departed(self, state: PathState) -> None:
         self._departed = Totals(*map(add, self._departed, _totals_of(state)))
 
@@ -156,13 +161,13 @@ class PathSlots:
         if (asked := self._forget_asked(path)) is not None:
             state.take_questions(asked)
         self.by_path[path] = state
-        self.outlet, self.inlet = None, (None, None)
+        self._forget_ready()
         return state
 
     def remove(self, state: PathState) -> None:
         """Free a slot."""
         del self.by_path[state.path]
-        self.outlet, self.inlet = None, (None, None)
+        self._forget_ready()
         self._drop(state)
         if state is self.best:
             self.best = None

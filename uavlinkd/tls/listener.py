@@ -55,7 +55,7 @@ LOOK_AGAIN_S: Final = 0.1
 SENDER: Final = "members by TLS"
 """The name of their stale datagrams."""
 _BACKLOG: Final = 1024
-"""So many wait in the kernel, for 0.2 s at most. In a shorter queue, a burst would cost a member a second."""
+"""Connections that wait in the kernel, 0.2 s at most. In a shorter queue, a burst would cost a member a second."""
 _EXHAUSTED: Final = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
 
 
