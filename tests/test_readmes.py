@@ -14,9 +14,9 @@ from uavlinkd.protocol.drops import DropReason
 ROOT = Path(__file__).parents[1]
 PAGES = [
     *ROOT.glob("*.md"),
-    *(page for folder in ("configs", "systemd", "tests", "uavlinkd") for page in (ROOT / folder).rglob("*.md")),
+    *(page for folder in (".github", "configs", "systemd", "tests", "uavlinkd") for page in (ROOT / folder).rglob("*.md")),
 ]
-MAX_LINES = 220
+MAX_WORDS = 1300
 _LINK = re.compile(r"(?<!!)\[[^\]]*(?:\[\[[^\]]*\]\])?[^\]]*\]\(([^)\s]+)\)")
 _FENCE = re.compile(r"^```.*?^```", re.DOTALL | re.MULTILINE)
 _NAME = re.compile(r"`([a-z][a-z0-9]*(?:_[a-z0-9]+)+)`")
@@ -39,7 +39,7 @@ def names_in_table(page: Path, heading: str) -> set[str]:
 
 def test_readme_is_short() -> None:
     """Details belong beside what they describe."""
-    assert len((ROOT / "README.md").read_text().splitlines()) <= MAX_LINES
+    assert len((ROOT / "README.md").read_text().split()) <= MAX_WORDS
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
@@ -59,9 +59,8 @@ def test_links_lead_somewhere(page: Path) -> None:
 @pytest.mark.parametrize(
     ("page", "heading"),
     [
-        ("README.md", "When a link is down"),
         ("uavlinkd/ops/README.md", "Logs"),
-        ("uavlinkd/ops/README.md", "More symptoms"),
+        ("uavlinkd/ops/README.md", "Symptoms"),
     ],
 )
 def test_events_and_reasons_exist(page: str, heading: str) -> None:

@@ -18,7 +18,7 @@ from uavlinkd.mavlink.policy.roles import ROLES
 EXAMPLES = Path(__file__).parents[2] / "configs"
 STATION = (EXAMPLES / "ground-station.toml").read_text()
 _OTHERS = {"mitm"}  # configurations of other commands, with tests of their own
-_PAGES = ("README.md", "uavlinkd/config/README.md")
+_PAGES = ("uavlinkd/config/README.md",)
 _BLOCKS = [
     re.findall(r"^```toml\n(.*?)^```", (EXAMPLES.parent / page).read_text(), re.DOTALL | re.MULTILINE)
     for page in _PAGES
