@@ -14,7 +14,11 @@ from uavlinkd.protocol.drops import DropReason
 ROOT = Path(__file__).parents[1]
 PAGES = [
     *ROOT.glob("*.md"),
-    *(page for folder in (".github", "configs", "systemd", "tests", "uavlinkd") for page in (ROOT / folder).rglob("*.md")),
+    *(
+        page
+        for folder in (".github", "configs", "systemd", "tests", "uavlinkd")
+        for page in (ROOT / folder).rglob("*.md")
+    ),
 ]
 MAX_WORDS = 1300
 _LINK = re.compile(r"(?<!!)\[[^\]]*(?:\[\[[^\]]*\]\])?[^\]]*\]\(([^)\s]+)\)")

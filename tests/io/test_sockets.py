@@ -77,3 +77,19 @@ def test_an_address_in_use_goes_to_no_other_socket() -> None:
             pytest.raises(BindError, match=rf"^cannot listen on {address}: Address already in use: "),
         ):
             udp_socket(address, may_come_later=True)
+
+
+@pytest.mark.parametrize(
+    ("host", "level", "option"),
+    [("127.0.0.1", socket.IPPROTO_IP, socket.IP_RECVTOS), ("::1", socket.IPPROTO_IPV6, socket.IPV6_RECVTCLASS)],
+)
+def test_datagrams_go_before_video(host: str, level: int, option: int) -> None:
+    """The class CS4 on the wire, and the highest priority in the queues that needs no capability."""
+    with udp_socket(Address(host, 0)) as sender, udp_socket(Address(host, 0)) as receiver:
+        receiver.setsockopt(level, option, 1)
+        sender.sendto(b"frame", receiver.getsockname())
+        receiver.setblocking(True)
+        receiver.settimeout(PATIENCE_S)
+        _, [(_, _, data)], _, _ = receiver.recvmsg(16, 64)
+        assert data[0] == 32 << 2
+        assert sender.getsockopt(socket.SOL_SOCKET, socket.SO_PRIORITY) == 6
