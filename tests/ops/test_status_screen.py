@@ -162,6 +162,18 @@ def test_what_is_wrong_is_in_plain_words(facts: dict[str, Any], of_peer: dict[st
     assert shown in words(render_status(status_of({"drone1": peer("up", **of_peer)}, **facts)), 160)
 
 
+def test_what_is_normal_is_no_drop() -> None:
+    """Frames that a policy withholds, frames while the link was down, and copies. A hidden frame is a drop."""
+    normal = {
+        "refused": {"out": {"VFR_HUD": {"message_not_allowed": 65}}},
+        "drops": {"no_session": 7, "duplicate": 9},
+    }
+    assert "dropped" not in words(render_status(status_of({"drone1": peer("up", **normal)})))
+    hidden = {"refused": {"out": {"VFR_HUD": {"message_not_allowed": 65, "hidden_frame": 1}}}}
+    text = words(render_status(status_of({"drone1": peer("up", **hidden)})))
+    assert "withheld: 65 frames, by its role or lists drone1 dropped: 1 that hide a forbidden frame" in text
+
+
 def test_problems_come_first_with_cause_and_remedy() -> None:
     """Security is above the faults, in capitals and red; then the tables. A problem of fifty peers is one line."""
     findings = [finding("zulu", Severity.SECURITY), finding("autopilot", subject=Subject.ENDPOINT)]

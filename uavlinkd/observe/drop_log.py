@@ -12,7 +12,7 @@ from uavlinkd.config.keys import encode_key
 from uavlinkd.daemon.journal import DaemonJournal, Fact, Key
 from uavlinkd.mavlink.dialect import name_of
 from uavlinkd.mavlink.headers import Header
-from uavlinkd.mavlink.policy.gate import Refusal
+from uavlinkd.mavlink.policy.gate import WITHHELD
 from uavlinkd.observe.conditions import Conditions, Limit, OpenCondition, Phase
 from uavlinkd.ops.line_limits import LineLimits
 from uavlinkd.ops.log import shown
@@ -30,7 +30,7 @@ EVERYDAY_ERRORS: Final = ("EAGAIN", "ENOBUFS", "ECONNREFUSED")
 
 def attention(event: str, reason: str) -> Attention:
     """When drops of this kind are logged."""
-    if event == "frames_withheld" and reason != Refusal.HIDDEN_FRAME:
+    if event == "frames_withheld" and reason in WITHHELD:
         return Attention.DESIGN
     if isinstance(reason, Reason):
         return reason.attention

@@ -108,15 +108,16 @@ def _figures(part: Status) -> Iterator[Text]:
 
 
 def _problems(status: Status) -> Iterator[str]:
-    """The session of each peer, and what was dropped or repeated."""
+    """The session of each peer, and what was withheld, dropped or repeated."""
     for name, peer in _by_state(status):
         if session := peer.get("session"):
             yield f"{name} keys: {session['suite']}, {session['mode']}, {_age(peer['handshake_s'])} old"
         if (repair := peer.get("repair", {"is_on": False}))["is_on"]:
             yield f"{name} repair: on for {_age(repair['on_s'])}, {words.repair_line(repair)}"
         if "drops" in peer:
-            yield from (f"{name} dropped: {text}" for text in [words.listed(words.peer_drops(peer))] if text)
-            yield from (f"{name} overtaken: {text}" for text in [words.overtaken(peer)] if text)
+            dropped = words.listed(words.peer_drops(peer))
+            counts = {"withheld": words.withheld(peer), "dropped": dropped, "overtaken": words.overtaken(peer)}
+            yield from (f"{name} {what}: {text}" for what, text in counts.items() if text)
 
 
 def _by_state(status: Status) -> list[tuple[str, Status]]:

@@ -11,9 +11,9 @@ from typing import Any, Final, NamedTuple
 
 from uavlinkd.mavlink.egress.lanes import EgressDrop
 from uavlinkd.mavlink.frames import FrameFault
-from uavlinkd.mavlink.policy.gate import Refusal
+from uavlinkd.mavlink.policy.gate import WITHHELD, Refusal
 from uavlinkd.ops.log import titled
-from uavlinkd.protocol.drops import DropReason, LinkProblem, Reason
+from uavlinkd.protocol.drops import Attention, DropReason, LinkProblem, Reason
 from uavlinkd.relay.forwarding import RelayReason
 from uavlinkd.system.error_meanings import meaning_of
 
@@ -40,8 +40,8 @@ ENDPOINT_FAILURES: Final[Mapping[str, str]] = {
 """Errors of an endpoint that the daemon names itself; the others are names of the kernel."""
 _NOT_USABLE: Final = {"unanswered": "no answer", "loss": "loss", "network": "no network"}
 """Why a path is not usable, in plain words."""
-_COPIES: Final = frozenset[str]({DropReason.DUPLICATE, DropReason.LATE_COPY})
-"""What several paths cause all the time."""
+_EXPLAINED: Final = frozenset[str](reason for reason in DropReason if reason.attention is Attention.EXPLAINED)
+"""What the log never has a line about: copies, and frames while the link was down, which a finding explains."""
 _SHOWN_REASONS: Final = 3
 _SHOWN_NAMES: Final = 8
 
@@ -233,12 +233,19 @@ def peer_drops(peer: Status) -> list[Count]:
         *_dropped(peer),
         *by_count(peer["malformed"], FrameFault),
         *by_count(peer["waiting_dropped"], EgressDrop),
-        *by_count(_refused(peer), Refusal),
+        *_refused(peer),
     ]
 
 
 def _dropped(part: Status) -> list[Count]:
-    return by_count({reason: count for reason, count in part["drops"].items() if reason not in _COPIES}, DropReason)
+    drops = part["drops"].items()
+    return by_count({reason: count for reason, count in drops if reason not in _EXPLAINED}, DropReason)
+
+
+def withheld(part: Status) -> str:
+    """How many frames the policy of a peer or endpoint withholds from it, which is no problem; empty if none."""
+    count = sum(count for reason, count in _by_reason(part, "out").items() if reason in WITHHELD)
+    return f"{count:,} frames, by its role or lists" if count else ""
 
 
 def overtaken(peer: Status) -> str:
@@ -250,18 +257,20 @@ def overtaken(peer: Status) -> str:
 
 def endpoint_drops(endpoint: Status) -> list[Count]:
     """All reasons of a local endpoint."""
-    return (
-        by_count(endpoint["faults"], FrameFault)
-        + by_count(endpoint["failures"])
-        + by_count(_refused(endpoint), Refusal)
-    )
+    return by_count(endpoint["faults"], FrameFault) + by_count(endpoint["failures"]) + _refused(endpoint)
 
 
-def _refused(part: Status) -> dict[str, int]:
+def _refused(part: Status) -> list[Count]:
+    """What the policy refused: all that came from there, and what hides a forbidden frame."""
+    sums = _by_reason(part, "out")
+    hidden = Counter({reason: count for reason, count in sums.items() if reason not in WITHHELD})
+    return by_count(_by_reason(part, "in") + hidden, Refusal)
+
+
+def _by_reason(part: Status, direction: str) -> Counter[str]:
     sums = Counter[str]()
-    for messages in part["refused"].values():
-        for reasons in messages.values():
-            sums.update(reasons)
+    for reasons in part["refused"].get(direction, {}).values():
+        sums.update(reasons)
     return sums
 
 

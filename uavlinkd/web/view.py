@@ -111,6 +111,7 @@ def card(name: str, peer: Status, word: str) -> dict[str, Any]:
             ["mode", session.get("mode", "-")],
             ["public key", peer["public_key"]],
             *([["repair", words.repair_line(peer["repair"])]] if peer["repair"]["is_on"] else []),
+            *([["withheld", text]] if (text := words.withheld(peer)) else []),
             *([["overtaken", text]] if (text := words.overtaken(peer)) else []),
         ],
         "refused": sorted(_refused(peer), key=lambda item: -item[3])[:_SHOWN_REFUSALS],

@@ -101,6 +101,8 @@ class Refusal(Reason):
     )
 
 
+WITHHELD: Final = frozenset[str](Refusal) - {Refusal.HIDDEN_FRAME}
+"""Why frames to a peer or client are withheld as the file says. A healthy link has such frames all the time."""
 CODES: Final[Mapping[Refusal, int]] = {refusal: code for code, refusal in enumerate(Refusal, 1)}
 """Of refusal reports (``protocol/README.md``, section 12), a part of the protocol: a code never changes its meaning.
 New reasons follow the others."""
