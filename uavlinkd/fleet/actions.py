@@ -9,6 +9,7 @@ import argparse
 import json
 import sys
 from collections.abc import Callable, Iterable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,16 @@ from uavlinkd.fleet.authority_key import (
     passphrase_from,
     read_paper,
 )
-from uavlinkd.fleet.manifest import FILE_NAME, Fleet, Member, parse_addresses, read_manifest, toml_text
+from uavlinkd.fleet.machines import Machine, name_of
+from uavlinkd.fleet.manifest import (
+    FILE_NAME,
+    Fleet,
+    FleetFileError,
+    Member,
+    parse_addresses,
+    read_manifest,
+    toml_text,
+)
 from uavlinkd.fleet.recovery import read_source
 from uavlinkd.fleet.signing import Identity
 from uavlinkd.ops.commands import control_socket, control_sockets
@@ -63,13 +73,17 @@ def _sign(options: argparse.Namespace) -> None:
     ask = passphrase_from(options.passphrase_file)
     before, fleet = operations.sign(options.out, request, _identity(options), ask, replaces=replaces)
     print(operations.line_of(fleet, request.name))
-    member = fleet.member(request.name)
+    _note_signed(before, fleet, request.name, replaces=replaces)
+
+
+def _note_signed(before: Fleet, fleet: Fleet, name: str, *, replaces: bool) -> None:
+    member = fleet.member(name)
     role, serial = member.role.name.lower(), member.certificate.serial
-    _note(f"signed {member.name}: {role}, system id {member.ids}, serial {serial}")
-    _note(f"fleet {fingerprint_of(fleet.authority.public)}: `enroll --finish` prints the same on {member.name}")
-    former = [each.certificate.serial for each in fleet.members if each.name == member.name][:-1]
+    _note(f"signed {name}: {role}, system id {member.ids}, serial {serial}")
+    _note(f"fleet {fingerprint_of(fleet.authority.public)}: `enroll --finish` prints the same on {name}")
+    former = [each.certificate.serial for each in fleet.members if each.name == name][:-1]
     if replaces and former:
-        after = f"`enroll --finish`, then `uavlinkd fleet publish`, then restart {member.name}"
+        after = f"`enroll --finish`, then `uavlinkd fleet publish`, then restart {name}"
         _note(f"serial {former[-1]} is revoked: {after}")
     _note_contacts(before, fleet)
 
@@ -160,6 +174,54 @@ def _restore(options: argparse.Namespace) -> None:
 
 
 def _enroll(options: argparse.Namespace) -> None:
+    """Enroll each machine. Those that fail stop no other one; a second run does what is left."""
+    if options.name is not None and len(options.target) > 1:
+        raise FleetError("--name is of one machine: leave it out, or enroll each one by itself")
+    ask = cache(passphrase_from(options.passphrase_file))
+    identity, problems = _identity(options), list[str]()
+    for number, target in enumerate(options.target):
+        try:
+            name = options.name or (target if options.here else name_of(target))
+            _enroll_machine(options, name, None if options.here else target, identity.following(number), ask)
+        except CommandError as error:
+            problems.append(f"{target}: {error}")
+            if isinstance(error, FleetFileError):  # the folder or the passphrase: it is the same for all
+                break
+    if problems:
+        raise CommandError("\n".join(problems))
+
+
+def _enroll_machine(
+    options: argparse.Namespace, name: str, target: str | None, identity: Identity, ask: Passphrase
+) -> None:
+    """Enroll a machine: its key, then its certificate in the fleet's folder, then its configuration.
+
+    Wherever this was interrupted, it can run again: a member that the folder has keeps its key.
+    """
+    fleet = read_manifest(options.out)
+    known = next((member for member in fleet.current if member.name == name), None)
+    role = identity.role or (known.role if known else None)
+    instance = "relay" if role is MemberRole.RELAY else name
+    machine = Machine(name, target, instance if options.service else None)
+    if known is None or options.replace:
+        request = machine.request()
+        before, fleet = operations.sign(options.out, request, identity, ask, replaces=options.replace)
+        _note_signed(before, fleet, name, replaces=options.replace)
+    elif not identity.is_of(known):
+        raise FleetError(f"{name} is {known.role.name.lower()}, system id {known.ids}: --replace changes that")
+    else:
+        _say(f"{name} is a member already: it keeps its key, and gets the present bulletin and contacts")
+    said = machine.finish(operations.line_of(fleet, name), options.url)
+    _say(said.rstrip())
+    if fingerprint_of(fleet.authority.public) not in said:
+        raise FleetError("its fleet is another one than this: install the same version of uavlinkd there")
+    if options.service:
+        machine.start_service()
+        if fleet.calls(fleet.member(name).role):
+            _say(f"{name} has a link with {', '.join(machine.wait_for_link())}")
+
+
+def _exchange(options: argparse.Namespace) -> None:
     if options.finish is None:
         if options.name is None:
             raise FleetError("name the new member: `uavlinkd enroll NAME`")
@@ -244,4 +306,5 @@ ACTIONS: dict[str, Callable[[argparse.Namespace], None]] = {
     "restore": _restore,
     "members": _members,
     "enroll": _enroll,
+    "exchange": _exchange,
 }

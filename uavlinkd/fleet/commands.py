@@ -37,17 +37,20 @@ def add_fleet(fleet: argparse.ArgumentParser) -> None:
     init.add_argument("--swarm", action="store_true", help="vehicles connect to each other too")
     init.add_argument("--suite", default="x25519", metavar="NAME", help="key exchange (default: %(default)s)")
 
+    enroll = add("enroll", "make machines members, by ssh: enroll there, sign here, finish there")
+    enroll.add_argument("target", nargs="+", metavar="[USER@]HOST", help="as for ssh; with --here, a member's name")
+    enroll.add_argument("--here", action="store_true", help="enroll this machine, without ssh")
+    enroll.add_argument("--name", metavar="NAME", help="the member's name (default: HOST up to its first dot)")
+    enroll.add_argument("--replace", action="store_true", help="a new key for each, and revoke the old one")
+    _add_identity(enroll)
+    enroll.add_argument("--url", metavar="URL", help="endpoint of a new configuration")
+    enroll.add_argument("--service", action="store_true", help="files, start and link of the service uavlinkd@NAME")
     sign = add("sign", "read the line of `uavlinkd enroll NAME`, and print the one for `uavlinkd enroll --finish`")
     sign.add_argument("name", nargs="?", metavar="NAME", help="print the line of this member once more")
     sign.add_argument(
         "--replace", metavar="NAME", help="the line is of this member: replace its key, and revoke the old one"
     )
-    sign.add_argument("--role", choices=_ROLES, help="(default: vehicle)")
-    ids = sign.add_mutually_exclusive_group()
-    ids.add_argument("--id", type=int, metavar="N", help="MAVLink system id (default: the next free one)")
-    ids.add_argument("--ids", metavar="A-B", help="a range of them")
-    text = "where members reach it from the start; a relay's wss:// URL, behind its HOST:PORT, is one more"
-    _add_list(sign, "--address", "HOST:PORT", text)
+    _add_identity(sign)
     remove = add("remove", "revoke a member, and publish the bulletin")
     remove.add_argument("name", metavar="NAME")
     publish = add("publish", "hand the bulletin and the members to a running daemon, which passes the bulletin on")
@@ -65,8 +68,15 @@ def add_fleet(fleet: argparse.ArgumentParser) -> None:
     restore.add_argument("--member", action="append", default=[], metavar="FILE", type=Path, help=text)
 
 
-def _add_list(parser: argparse.ArgumentParser, name: str, metavar: str, text: str) -> None:
-    parser.add_argument(name, action="append", default=[], metavar=metavar, help=text)
+def _add_identity(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--role", choices=_ROLES, help="(default: vehicle)")
+    ids = parser.add_mutually_exclusive_group()
+    ids.add_argument(
+        "--id", type=int, metavar="N", help="MAVLink system id (default: the next free one); the first of several"
+    )
+    ids.add_argument("--ids", metavar="A-B", help="a range of them")
+    text = "where members reach it from the start; a relay's wss:// URL, behind its HOST:PORT, is one more"
+    parser.add_argument("--address", action="append", default=[], metavar="HOST:PORT", help=text)
 
 
 def add_enroll(enroll: argparse.ArgumentParser) -> None:
@@ -74,7 +84,7 @@ def add_enroll(enroll: argparse.ArgumentParser) -> None:
         "Make this machine a member of a fleet: `enroll NAME` makes the private key, which stays, and prints a"
         " line for `uavlinkd fleet sign`. `enroll --finish` reads the line that this prints."
     )
-    enroll.set_defaults(command=_act, action="enroll")
+    enroll.set_defaults(command=_act, action="exchange")
     enroll.add_argument("name", nargs="?", metavar="NAME")
     enroll.add_argument("--finish", nargs="?", const="", metavar="LINE", help="(default: from standard input)")
     enroll.add_argument("--config", metavar="FILE", type=Path, help="the configuration (default: NAME.toml)")

@@ -102,7 +102,7 @@ def finish(line: str, config: Path | None, folder: Path | None, url: str | None,
             raise FleetError(f"{place.config} exists: write the url into its [[endpoint]], and leave --url out")
         table = {**({"listen": listen} if listen else {}), **table, "private_key_file": key}
     else:
-        socket = socket or (f"{name}.sock" if folder is None else f"/run/uavlinkd/{name}/control.sock")
+        socket = socket or (f"{name}.sock" if folder is None else f"/run/uavlinkd/{folder.name}/control.sock")
         table = new_table(reply, key, socket, url, listen)
     _write(place, written(with_fleet(table, reply)))
     if is_replaced:
@@ -115,7 +115,7 @@ def finish(line: str, config: Path | None, folder: Path | None, url: str | None,
         f"{name} is a member of fleet {fingerprint}: compare this with the line of `fleet sign`.",
         f"{place.config}: {certificate.role.name.lower()}, contacts {contacts or 'none'}",
         *([f"Set {SYSTEM_ID} of the autopilot, or {ids}."] if ids_of(certificate) else []),
-        f"Then: uavlinkd run --config {place.config}; if the daemon runs already, restart it.",
+        *([f"Then: uavlinkd run --config {place.config}; if it runs already, restart it."] if folder is None else []),
         *([f"The former key, {place.key(former)}, was deleted."] if is_replaced else []),
     ]
 

@@ -38,6 +38,14 @@ class Identity(NamedTuple):
     ids: tuple[int, int] | None = None
     addresses: tuple[Address, ...] = ()
 
+    def following(self, count: int) -> Identity:
+        """The identity of the machine that is so many places behind the one with this identity: the next ids."""
+        if self.ids is None:
+            return self
+        first, last = self.ids
+        step = count * (last - first + 1)
+        return self._replace(ids=(first + step, last + step))
+
     def is_of(self, member: Member) -> bool:
         """Whether a member is as this says."""
         return (

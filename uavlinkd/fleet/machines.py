@@ -1,0 +1,137 @@
+"""A machine that one command enrolls: `uavlinkd enroll` runs there by the operator's own ssh, or on this machine.
+
+ssh decides where the machine is, who logs in and whether its host key is known, from the operator's configuration and
+agent. Only public lines pass; the private key stays there. Each failure has the machine's own words.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Collection
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Final
+
+from uavlinkd.authority.certificates import NAME
+from uavlinkd.authority.enrolment import WORD, FleetError, Request, parse_request
+from uavlinkd.system.terminal import CommandError
+
+LINK_WAIT_S: Final = 30.0
+"""How long a started daemon may take until its first link is up."""
+_POLL_S: Final = 1.0
+_FAILED_SSH: Final = 255  # ssh(1): an error of ssh itself; else the status is that of the command there
+_REMEDIES: Final = (
+    (r"a password is required|a terminal is required", "Let sudo ask for no password there, or name root@HOST"),
+    (
+        r"[Uu]nit.* (does not exist|not found)",
+        "Install the package there, or copy its unit: systemd/README.md",
+    ),
+    (r"not found|Unknown command", "Install uavlinkd there, with its link in /usr/local/bin"),
+    (r"invalid choice|unrecognized arguments", "Install the version of uavlinkd there that is here"),
+    (r"there is no .*\.key|certificate of another key", "For a new machine or card, run this again with --replace"),
+)
+"""What to do about words of a shell, sudo, systemctl or another version, which name no remedy for this command."""
+
+
+def name_of(target: str) -> str:
+    """The member's name that an ssh target suggests: `v7` of `pi@v7.local`. Raises FleetError if there is none."""
+    host = target.rpartition("@")[2]
+    name = host.partition(".")[0].lower()
+    if not NAME.fullmatch(name) or re.fullmatch(r"[\d.]+", host):
+        raise FleetError(f"{target} does not name its member: add --name NAME")
+    return name
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """A machine that becomes a member of a fleet."""
+
+    name: str
+    target: str | None
+    """The destination of ssh. None: this machine."""
+    instance: str | None = None
+    """The name of the service's files below /etc/uavlinkd. None: the files are in the folder where commands run."""
+
+    @property
+    def _config(self) -> str:
+        return f"{self.name}.toml" if self.instance is None else f"/etc/uavlinkd/{self.instance}.toml"
+
+    @property
+    def _files(self) -> tuple[str, ...]:
+        keys = () if self.instance is None else ("--keys", f"/etc/uavlinkd/{self.instance}")
+        return ("--config", self._config, *keys)
+
+    def request(self) -> Request:
+        """What the machine asks to be signed; it makes its private key if it has none for this."""
+        said = self._run(*self._uavlinkd, "enroll", self.name, *self._files)
+        lines = [line for line in said.splitlines() if line.startswith(WORD)]  # a shell may print a greeting
+        request = parse_request(lines[-1] if lines else "")
+        if request.name != self.name:  # a captured machine could ask for the role of another
+            raise FleetError(f"its line is of {request.name}, not of {self.name}: nothing was signed")
+        return request
+
+    def finish(self, line: str, url: str | None) -> str:
+        """Give the machine its signed line, and return what it says about that."""
+        url_words = () if url is None else ("--url", url)
+        return self._run(*self._uavlinkd, "enroll", "--finish", *self._files, *url_words, line=line)
+
+    def start_service(self) -> None:
+        """Start the service, now and at each boot; a daemon that runs reads its files again."""
+        unit = "uavlinkd-relay" if self.instance == "relay" else f"uavlinkd@{self.instance}"
+        self._run("systemctl", "enable", unit)
+        self._run("systemctl", "restart", unit)
+
+    def wait_for_link(self) -> list[str]:
+        """The names of the peers whose links are up, once there is one. Raises CommandError if none comes."""
+        status, give_up_at = (*self._uavlinkd, "status", "--config", self._config), time.monotonic() + LINK_WAIT_S
+        while time.monotonic() < give_up_at:
+            with suppress(ValueError, LookupError, AttributeError):
+                peers = json.loads(self._run(*status, "--json", accepted=(0, 1)))["peers"]
+                if up := [name for name, peer in peers.items() if peer["state"] == "up"]:
+                    return up
+            time.sleep(_POLL_S)
+        said = self._run(*status, accepted=(0, 1))
+        raise CommandError(f"it is enrolled and its service runs, without a link for {LINK_WAIT_S:.0f} s:\n{said}")
+
+    def _run(self, *words: str, line: str = "", accepted: Collection[int] = (0,)) -> str:
+        """Run a command there, and return what it printed. Raises CommandError with its own words if it fails."""
+        if self.instance is not None:
+            words = (*self._sudo, *words)
+        if self.target is not None:
+            if shutil.which("ssh") is None:
+                raise CommandError("ssh is not installed here: install it, or carry each line by hand")
+            command: tuple[str, ...] = ("ssh", "--", self.target, shlex.join(words))
+        else:
+            command = words
+        try:
+            done = subprocess.run(  # noqa: S603  the operator's own command
+                command, input=line, capture_output=True, encoding="utf-8", errors="replace", check=False
+            )
+        except OSError as error:
+            raise CommandError(f"{command[0]}: {error.strerror}") from None
+        if done.returncode in accepted:
+            return done.stdout
+        said = done.stderr.strip() or done.stdout.strip() or f"exit status {done.returncode}"
+        if self.target is not None and done.returncode == _FAILED_SSH:
+            raise CommandError(f"{said}\nFirst make `ssh {self.target}` work, then run this command again")
+        remedies = [f"\n{remedy}" for pattern, remedy in _REMEDIES if re.search(pattern, said)]
+        raise CommandError(f"`{shlex.join(words)}` failed there:\n{said}{''.join(remedies[:1])}")
+
+    @property
+    def _uavlinkd(self) -> tuple[str, ...]:
+        """The program: on this machine it may not be in the PATH."""
+        return (sys.executable, "-m", "uavlinkd") if self.target is None else ("uavlinkd",)
+
+    @property
+    def _sudo(self) -> tuple[str, ...]:
+        """Root's rights, which a service's files need. Through ssh, sudo has no terminal to ask on."""
+        if self.target is None:
+            return () if os.geteuid() == 0 else ("sudo",)
+        return () if self.target.startswith("root@") else ("sudo", "-n")
