@@ -13,7 +13,8 @@ from tests.processes.udp import open_socket
 from uavlinkd.io.ports import CLIENT_SILENT_S, CLIENTS_PER_ENDPOINT, LocalPort
 from uavlinkd.io.reader import Datagrams, Reader
 from uavlinkd.io.sockets import udp_socket
-from uavlinkd.io.udp import CLIENT_IDLE_S, LOCAL_DATAGRAM_BYTES, MOST_STREAMS, UdpServer
+from uavlinkd.io.udp import CLIENT_IDLE_S, UdpServer
+from uavlinkd.io.udp_clients import LOCAL_DATAGRAM_BYTES, MOST_STREAMS
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.mavlink.frames import MAX_GAP_S
 from uavlinkd.system.addresses import Address
