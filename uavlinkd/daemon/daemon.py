@@ -15,9 +15,7 @@ from uavlinkd.config.load import load_in_thread
 from uavlinkd.config.model import Config, ConfigError
 from uavlinkd.daemon.carrier import FrameCarrier
 from uavlinkd.daemon.features import Feature
-from uavlinkd.daemon.local_endpoints import PilotNotes
 from uavlinkd.daemon.parts import DaemonParts
-from uavlinkd.daemon.peer_link import radio_figures
 from uavlinkd.mavlink.own_frames import INTERVAL_S
 from uavlinkd.observe.observer import Observer
 from uavlinkd.observe.status import daemon_status, overview
@@ -36,7 +34,7 @@ if TYPE_CHECKING:
 
 HOUSEKEEPING_S = INTERVAL_S
 """How often links are measured, and idle clients forgotten."""
-LOOKS_EVERY = 2
+LOOKS_EVERY = 4
 """Intervals from one look for findings to the next: a look costs as much as all else that is done in one."""
 
 
@@ -52,7 +50,6 @@ class Daemon:
         self.parts = DaemonParts(config, self.log, monotonic())
         self.observer = Observer(self.parts, self.log, monotonic())
         self.carrier = FrameCarrier(self.parts)
-        self._notes = PilotNotes(self.parts.switch.router.addresses)
         self._housekeeping: asyncio.TimerHandle | None = None
         self._reporting: asyncio.Handle | None = None
         self._seconds = 0
@@ -228,8 +225,7 @@ class Daemon:
             run(link.measure, now)
             run(link.report_refusals, now)
         self.observer.sample(now)
-        run(parts.local.do_housekeeping, radio_figures(links), now)
-        run(parts.local.write_note, self._notes.next(links, now), now)
+        run(parts.local.do_housekeeping, links, now)
         self._seconds += 1
         if self._seconds % LOOKS_EVERY == 0:
             self._reporting = self._loop.call_soon(self._report, now)  # datagrams must not wait for all of it

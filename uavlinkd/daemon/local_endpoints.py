@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from typing import Final, NamedTuple
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Final, NamedTuple, TypeVar
 
 from uavlinkd.config.model import EndpointConfig
 from uavlinkd.daemon.journal import DaemonJournal
-from uavlinkd.daemon.peer_link import PeerLink
+from uavlinkd.daemon.peer_link import PeerLink, radio_figures
 from uavlinkd.daemon.switch import Switch
 from uavlinkd.io.ports import Endpoint, LocalPort, PortHandler
 from uavlinkd.io.sockets import BindError, udp_socket
@@ -17,7 +17,6 @@ from uavlinkd.mavlink.dialect import IDS, KINDS, UNKNOWN, command_name, name_of
 from uavlinkd.mavlink.frames import SplitCounters, split_payload
 from uavlinkd.mavlink.own_frames import (
     TEXT_BYTES,
-    LinkFigures,
     Note,
     RadioStatusSource,
     StatusTextSource,
@@ -35,6 +34,8 @@ from uavlinkd.system.stall import StallWatch
 
 # TCP and serial are imported only if configured: a daemon on UDP starts faster and stays smaller.
 # ruff: noqa: PLC0415
+
+S = TypeVar("S", RadioStatusSource, StatusTextSource)
 
 
 def open_endpoint(config: EndpointConfig, handler: PortHandler) -> Endpoint:
@@ -75,7 +76,9 @@ class LocalEndpoints:
         """Of :class:`uavlinkd.io.ports.PortHandler`: :meth:`.Line.forward`, without a call in between."""
         self._switch = switch
         self._journal = journal
-        self._sources: dict[str, tuple[RadioStatusSource | None, StatusTextSource | None]] = {}
+        self._radio: dict[Endpoint, RadioStatusSource] = {}
+        self._texts: dict[Endpoint, StatusTextSource] = {}
+        self._notes = PilotNotes(switch.router.addresses)
         self._own = Source(name, Policy({}, is_local=True).incoming)
 
     # From the configuration.
@@ -91,10 +94,10 @@ class LocalEndpoints:
             except (BindError, OSError) as error:
                 raise BindError(f"endpoint.url ({config.name}): {error}") from None
             self.policies[config.name] = config.make_policy()
-            self._sources[config.name] = (
-                RadioStatusSource() if config.radio_status else None,
-                StatusTextSource() if config.status_text else None,
-            )
+            if config.radio_status:
+                self._radio[self.endpoints[-1]] = RadioStatusSource()
+            if config.status_text:
+                self._texts[self.endpoints[-1]] = StatusTextSource()
 
     def start(self) -> None:
         """Start the endpoints."""
@@ -141,28 +144,23 @@ class LocalEndpoints:
 
     # Time.
 
-    def do_housekeeping(self, radio: LinkFigures | None, now: float) -> None:
-        """Forget clients that have gone, and send RADIO_STATUS. Call it once a second."""
+    def do_housekeeping(self, links: Sequence[PeerLink], now: float) -> None:
+        """Forget clients that have gone, and send RADIO_STATUS and texts about links. Call it once a second."""
         for endpoint in self.endpoints:
             run(endpoint.do_housekeeping, now)
-            source, _ = self._sources[endpoint.name]
-            if source is not None and radio is not None:
-                self._write(endpoint, source.frame(radio), now)
+        if self._radio and (figures := radio_figures(links)) is not None:
+            self._write(self._radio, lambda source: source.frame(figures), now)
+        if self._texts and (note := self._notes.next(links, now)) is not None:
+            self._write(self._texts, lambda source: source.frame(note), now)
 
-    def write_note(self, note: Note | None, now: float) -> None:
-        """Send a text to the clients of the endpoints that have ``status_text``. It goes nowhere else."""
-        if note is None:
-            return
-        for endpoint in self.endpoints:
-            _, source = self._sources[endpoint.name]
-            if source is not None:
-                self._write(endpoint, source.frame(note), now)
-
-    def _write(self, endpoint: Endpoint, raw: bytes, now: float) -> None:
-        self._switch.router.sendings.note_own(raw, endpoint.ports, now)
-        frames = split_payload(raw, SplitCounters())
-        for port in endpoint.ports:
-            port.send(frames, self._own, now, 0.0)
+    def _write(self, sources: Mapping[Endpoint, S], frame_of: Callable[[S], bytes], now: float) -> None:
+        """Send a frame of each source to the clients of its endpoint. It goes nowhere else."""
+        for endpoint, source in sources.items():
+            raw = frame_of(source)
+            self._switch.router.sendings.note_own(raw, endpoint.ports, now)
+            frames = split_payload(raw, SplitCounters())
+            for port in endpoint.ports:
+                port.send(frames, self._own, now, 0.0)
 
 
 # What the pilot should know about the links, as short texts for the ground station: at most one a second. Texts wait,

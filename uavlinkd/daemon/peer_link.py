@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import itemgetter, sub
@@ -115,7 +116,8 @@ class PeerLink:
         """In and out, how many envelopes were sent recently, and how many of them lost: by the last measurement."""
         self.lossless_at = [now, now]
         """When the loss of each was last not high."""
-        self._missing: list[tuple[int, int, int]] = []  # session, expected, missing; the oldest first
+        self._missing = deque[tuple[int, int, int]](maxlen=round(LOSS_WINDOW_S) + 1)
+        """Session, expected, missing; the oldest first."""
         self._sample: tuple[int, tuple[int, int, int, int]] | None = None
         # A session, and its counters at one moment: expected and received here, and as the peer reports.
         self.output = PeerOutput(config.egress, peer, carriage.node, carriage.budgets, self._perform, now)
@@ -280,9 +282,9 @@ class PeerLink:
         best, session = self.peer.paths.best, self.peer.sessions.current
         if best is None or session is None:
             return ()
-        counted_now = session.local_index, session.expected, missing
-        earlier = [one for one in self._missing if one[0] == session.local_index]
-        self._missing = [*earlier[-round(LOSS_WINDOW_S) :], counted_now]
+        if self._missing and self._missing[0][0] != session.local_index:
+            self._missing.clear()
+        self._missing.append((session.local_index, session.expected, missing))
         into, out = best.recent_losses(now)
         if not self.peer.paths.has_several:  # then the peer may send few reports
             counted = session.expected - self._missing[0][1], missing - self._missing[0][2]

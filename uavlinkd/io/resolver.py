@@ -70,7 +70,7 @@ async def keep_resolving(
     unresolved: set[str] | None = None,
     wake: asyncio.Event | None = None,
 ) -> None:
-    """Resolve an address now and repeatedly. Runs until cancelled.
+    """Resolve an address now and repeatedly. Runs until cancelled, or until a numeric address was used.
 
     ``interval_s`` returns the interval between look-ups as of now: :data:`LONGEST_WAIT_S` if the addresses so far do
     not answer. Then the first intervals are shorter. While the name fails, the interval is at most
@@ -120,6 +120,8 @@ async def keep_resolving(
                 _cancel(queries)
                 if resolved != known and on_resolved(resolved):
                     known = resolved
+                    if address.ip is not None and "%" not in address.host:
+                        return  # a number stays what it is; an interface may get another one
             elif address.host not in unresolved:
                 unresolved.add(address.host)
                 log.warning("name_not_resolved", host=address.host, meaning=meaning_of(NAME_NOT_RESOLVED))

@@ -48,7 +48,6 @@ know no longer ones.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from enum import IntEnum
 from struct import Struct
 from typing import Final, NamedTuple
@@ -87,8 +86,7 @@ TXBUF_LOST: Final = 50
 _BASE_CREEP: Final = 0.01
 
 
-@dataclass(frozen=True, slots=True)
-class LinkFigures:
+class LinkFigures(NamedTuple):
     """The link since its last measurement. Losses are shares of envelopes; values outside 0 to 1 are clipped."""
 
     is_up: bool

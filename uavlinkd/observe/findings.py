@@ -1,6 +1,6 @@
 """The findings of a moment: the rows of :mod:`.table` whose sign is there.
 
-They are computed every two seconds and when a client asks for the status.
+They are computed every four seconds and when a client asks for the status.
 """
 
 from __future__ import annotations

@@ -83,12 +83,14 @@ class GateHistory:
 
     def update(self, gate: Gate, frames: int, now: float, *, frames_may_be_refused: bool) -> None:
         """Read the counters. ``frames``: all received ones, or those that were sent."""
+        refused = gate.totals.total()
+        if (gate, frames, refused, gate.hiding) == (self._gate, self._frames, self._refused, self._hiding):
+            return
         self.reasons.update(gate.totals, now)
         self.commands.update(gate.refused_commands, now)
         self.systems.update(gate.refused_systems, now)
         if gate is not self._gate:  # a new policy: what the one before refused does not count
             self._gate, self._refused, self._hiding, self._refused_at = gate, 0, 0, float("-inf")
-        refused = gate.totals.total()
         grown = frames - self._frames if frames >= self._frames else frames
         refused_now = refused - self._refused
         self._frames, self._refused = frames, refused

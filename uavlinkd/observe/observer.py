@@ -1,4 +1,4 @@
-"""All that watches a daemon. It reads counters each second, and looks for findings every two. No frame calls it."""
+"""All that watches a daemon. It reads counters each second, and looks for findings every four. No frame calls it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Observer:
         self.parts = parts
         self.history = History(now)
         self.findings: list[Finding] = []
-        """The findings of the last look, at most two seconds ago."""
+        """The findings of the last look, at most four seconds ago."""
         limits = LineLimits()
         self.drops = DropLog(log, parts.journal, limits)
         self.events = EventLog(log, limits, parts.peer_sockets.network_name)

@@ -41,7 +41,7 @@ _STATM = FilePath("/proc/self/statm")
 
 
 def overview(observer: Observer, now: float, detailed: Collection[str]) -> dict[str, object]:
-    """The status with few facts of each peer, except of those that ``detailed`` names; findings are up to 1 s old.
+    """The status with few facts of each peer, except of those that ``detailed`` names; findings are up to 4 s old.
 
     A page that 200 peers are on asks for it every second: the whole status would cost several percent of a core.
     """
