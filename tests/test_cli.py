@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -119,25 +120,42 @@ def test_a_wrong_command_line_gives_status_2(arguments: list[str]) -> None:
     assert status == WRONG
 
 
-@pytest.mark.parametrize(("words", "meant"), [("stauts", "status"), ("fleet lst", "list")])
-def test_a_misspelt_command_is_named(words: str, meant: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """As in a file."""
+@pytest.mark.parametrize(
+    ("words", "wrong", "meant"),
+    [
+        ("stauts", "stauts", "status"),
+        ("help stauts", "stauts", "status"),
+        ("fleet lst", "lst", "list"),
+        ("run --confg drone0.toml", "--confg", "--config"),
+        ("check --config=drone0.toml --verbsoe --key .", "--verbsoe", "--verbose"),
+        ("fleet list --jsn", "--jsn", "--json"),
+        ("fleet sign --role vehicel", "vehicel", "vehicle"),
+        ("--verson", "--verson", "--version"),
+    ],
+)
+def test_a_misspelt_word_is_named(words: str, wrong: str, meant: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """A command, an option or a choice, as in a file."""
     with pytest.raises(SystemExit) as ended:
         main(words.split())
     assert ended.value.code == WRONG
-    assert f"there is no '{words.rpartition(' ')[2]}': did you mean '{meant}'?" in capsys.readouterr().err
+    assert f"there is no '{wrong}': did you mean '{meant}'?" in capsys.readouterr().err
 
 
-def test_a_removed_command_has_its_replacement(capsys: pytest.CaptureFixture[str]) -> None:
-    """The error names it."""
+def test_an_unknown_argument_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    """With the usage of the command itself."""
     with pytest.raises(SystemExit):
-        main(["report", "--yes"])
-    assert "`uavlinkd report` was removed: send" in capsys.readouterr().err
+        main(["fleet", "list", "v7"])
+    assert re.search("^usage: uavlinkd fleet list .*there is no 'v7' here", capsys.readouterr().err, re.DOTALL)
 
 
 def test_help_shows_commands_and_options(capsys: pytest.CaptureFixture[str]) -> None:
     """Of all commands, or of one."""
-    for words, option in (["--help"], "--version"), (["fleet", "sign", "--help"], "--replace"):
+    for words, option in (
+        (["--help"], "--version"),
+        (["help"], "--version"),
+        (["fleet", "sign", "--help"], "--replace"),
+        (["help", "fleet", "sign"], "--replace"),
+    ):
         with pytest.raises(SystemExit) as ended:
             main(words)
         assert ended.value.code == OK
@@ -173,7 +191,7 @@ url = "udpin:127.0.0.1:14550"
 
 [[peer]]
 name = "drone1"
-public_key = "eZPBKM+9Oztdms1v2yiR+byync+zZsR87etuOX4heHE="
+public_key = "6rQAWoQk1TImT5HbhGECTbJyT0zUMPgOWIZDNPtyvkg="
 addresses = ["10.13.0.2:5790"]
 role = "all"
 system_ids = [2]
@@ -191,7 +209,7 @@ def test_check_reads_a_services_keys_from_their_folder(tmp_path: Path, capsys: p
     assert main(["check", "--config", str(path), "--keys", str(tmp_path / "absent")]) == WRONG
     assert "--keys" in capsys.readouterr().err
     assert main(["check", "--config", str(path), "--keys", str(tmp_path / "keys")]) == OK
-    assert capsys.readouterr().out.startswith("warning: "), "before the tables"
+    assert capsys.readouterr().out.startswith("warning: "), "before the facts"
     assert main(["check", "--config", str(path), "--json"]) == WRONG
     assert "drone0.key" in json.loads(capsys.readouterr().out)["errors"][0]
     assert main(["check", "--config", str(path), "--keys", str(tmp_path / "keys"), "--json"]) == OK

@@ -18,13 +18,14 @@ from typing import Any, Final, NoReturn
 
 from uavlinkd import __version__
 from uavlinkd.protocol.constants import PROTOCOL_NAME
-from uavlinkd.system.terminal import FAILED, OK, WRONG, CommandError, UsageError, add_json, printable
+from uavlinkd.system.spelling import meant
+from uavlinkd.system.terminal import FAILED, OK, CommandError, UsageError, printable
 
 _LINE_LIMIT = 4096
 COMMANDS: Final = {
     "run": ("run the daemon", f"{__name__}:_add_run"),
     "relay": ("run a relay: it passes datagrams between its members, and cannot forge them", f"{__name__}:_add_run"),
-    "check": ("check a configuration and show its effect", f"{__name__}:_add_check"),
+    "check": ("check a configuration and show its effect", "uavlinkd.ops.check:add_check"),
     "status": (
         "show the links and problems of a running daemon; exit status 0 if frames can pass",
         "uavlinkd.ops.commands:add_status",
@@ -43,6 +44,7 @@ COMMANDS: Final = {
         "make this machine a member of a fleet, with one line each way",
         "uavlinkd.fleet.commands:add_enroll",
     ),
+    "help": ("show the commands, or with COMMAND the options of one", ""),
     "sim": ("fly a simulated autopilot", "uavlinkd.lab.commands:add_arguments"),
     "demo": ("run two daemons on this machine that exchange frames", "uavlinkd.lab.commands:add_arguments"),
     "evaluate": (
@@ -52,14 +54,6 @@ COMMANDS: Final = {
 }
 """Each command with what it does, and the function that adds its arguments: it is imported for this command only."""
 _LABORATORY: Final = "uavlinkd.lab"
-_REMOVED: Final = {
-    "report": "send what `uavlinkd status --json` prints, and the log of `journalctl -u uavlinkd`",
-    "help": "`uavlinkd --help` shows the commands, and `uavlinkd COMMAND --help` the options of one",
-    "peer": "`uavlinkd status` shows the peers, and `uavlinkd status --json` their keys too",
-    "ping": "`uavlinkd status --watch` shows whether each path answers, its round trip and its loss",
-    "record": "ground stations record, and so does `mavproxy.py --master=udpout:127.0.0.1:14550 --daemon`",
-}
-"""Commands of earlier versions, each with what to do in its place."""
 _NOT_A_RELAY = (
     "is not the file of a relay: that has a [[member]] for each daemon that may use it, no [[peer]] and no"
     " [[endpoint]]. A daemon that is also a relay is started with `uavlinkd run`"
@@ -67,7 +61,9 @@ _NOT_A_RELAY = (
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    words = sys.argv[1:] if arguments is None else arguments
+    words = [*(sys.argv[1:] if arguments is None else arguments)]
+    if words[:1] == ["help"]:
+        words = [*words[1:], "--help"]
 
     def command() -> int:
         options = make_parser().parse_args(words)
@@ -139,6 +135,8 @@ class CommandParser(argparse.ArgumentParser):
 
     adding = ""
     """The function that adds the arguments, with its module; empty if they are there."""
+    words: Sequence[str] = ()
+    """What was written behind the command."""
 
     def fill(self) -> None:
         """Add the arguments. Raises CommandError if the command needs the laboratory, which is not installed."""
@@ -150,20 +148,24 @@ class CommandParser(argparse.ArgumentParser):
             getattr(import_module(module), function)(self)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Parse the command's arguments, ``--help`` among them."""
+        """Parse the command's arguments, ``--help`` among them. An unknown one is an error of this command."""
         self.fill()
-        return super().parse_known_args(args, namespace)
+        self.words = [] if args is None else list(args)
+        namespace, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            self.error(f"there is no {unknown[0]!r} here")
+        return namespace, unknown
 
     def error(self, message: str) -> NoReturn:
-        """End the process. The message names the right spelling of a command, or what replaces a removed one."""
-        import difflib
-
+        """End the process. The message has the right spelling of a command or option."""
+        options = re.findall(r"--[\w-]+", self.format_usage())
+        wrong = {word.partition("=")[0]: options for word in self.words if word.startswith("--")}
         if match := re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message):
-            written, words = match.groups()
-            if self.prog == "uavlinkd" and written in _REMOVED:
-                message = f"`uavlinkd {written}` was removed: {_REMOVED[written]}"
-            elif likely := difflib.get_close_matches(written, re.findall(r"[\w-]+", words), 1):
-                message = f"{message[: match.start()]}there is no {written!r}: did you mean {likely[0]!r}?"
+            wrong = {match[1]: re.findall(r"[\w-]+", match[2])}
+        for written, known in wrong.items():
+            is_short = any(word.startswith(written) for word in known)
+            if not is_short and (likely := meant(written, known)):
+                message = f"there is no {written!r}: did you mean {likely!r}?"
         super().error(message)
 
 
@@ -238,43 +240,7 @@ def _run_daemon(options: argparse.Namespace) -> int:
     return OK
 
 
-# Configurations and keys.
-
-
-def _add_check(parser: argparse.ArgumentParser) -> None:
-    parser.set_defaults(command=_check)
-    parser.add_argument("--config", metavar="FILE", type=Path, required=True)
-    parser.add_argument(
-        "--keys", metavar="DIR", type=Path, help="for a service: the folder of its keys, as in LoadCredential="
-    )
-    add_json(parser)
-
-
-def _check(options: argparse.Namespace) -> int:
-    import json
-
-    from uavlinkd.config.keys import CREDENTIALS
-    from uavlinkd.config.load import load_config
-    from uavlinkd.config.model import ConfigError
-    from uavlinkd.ops.surroundings import look_around
-    from uavlinkd.ops.topology import print_topology
-
-    if options.keys is not None and not (options.keys.is_dir() and os.access(options.keys, os.R_OK | os.X_OK)):
-        raise UsageError(f"--keys: {options.keys} is not a readable folder")
-    environ = os.environ if options.keys is None else {CREDENTIALS: str(options.keys.absolute())}
-    try:
-        config = load_config(options.config, environ)
-    except ConfigError as error:
-        if not options.json:
-            raise
-        print(json.dumps({"errors": list(map(str, error.problems))}))
-        return WRONG
-    lacks = look_around(config)
-    if options.json:
-        print(json.dumps({"errors": [], "warnings": config.warnings, "this_machine": lacks}))
-    else:
-        print_topology(config, lacks)
-    return OK
+# Keys.
 
 
 def _add_keygen(parser: argparse.ArgumentParser) -> None:

@@ -160,7 +160,6 @@ _ROWS = [
         "not the public key of an authority, or was cut: run `uavlinkd enroll --finish` again",
     ),
     (fleet(_ANY), "fleet.certificate", "not a certificate"),
-    (fleet(more='successor = "AAAA"'), "fleet.successor", "was removed: delete the line"),
     (fleet(news=_ANY), "fleet.bulletin", "not a bulletin"),
     (fleet(news=bulletin(signer=OTHER_SIGNER)), "fleet.bulletin", "not signed by the authority"),
     (fleet(news=bulletin()[:-8] + "AAAAAA=="), "fleet.bulletin", "not signed by the authority"),

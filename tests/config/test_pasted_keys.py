@@ -58,5 +58,5 @@ def test_suspicious_key_is_warned_of(tmp_path: Path, what: str) -> None:
     }[what]
     warnings = load(tmp_path, GOOD + text).warnings
     (warning,) = (warning for warning in warnings if "public_key" in warning)
-    assert re.match(rf'{what} "\w+": public_key has the form of a private key.*on the {what}', warning)
+    assert re.match(rf'{what} "\w+": public_key has the form of a private key.*key of that {what}', warning)
     assert private[:8] not in warning

@@ -11,10 +11,12 @@ import pytest
 
 from tests.fleet.conftest import Say
 from tests.fleet.folders import create
+from tests.ops.schema import golden
 from uavlinkd.authority.enrolment import fingerprint_of
 from uavlinkd.cli import main
 from uavlinkd.config.load import load_config
 from uavlinkd.fleet.manifest import read_manifest
+from uavlinkd.ops import FLEET_LIST_SCHEMA
 from uavlinkd.system.addresses import Address
 
 
@@ -209,7 +211,10 @@ def test_members_are_listed(place: Path, say: Say) -> None:
     assert [row[:4] for row in rows[2:]] == [["relay", "relay", "-", "1"], ["v7", "vehicle", "70-79", "2"]]
     assert rows[3][-1] == "revoked"
     facts = json.loads(say("fleet list --json"))
-    assert (facts["bulletin"], [one["is_revoked"] for one in facts["members"]]) == (2, [False, True])
+    revoked = {name: member["is_revoked"] for name, member in facts["members"].items()}
+    assert (facts["number"], revoked) == (2, {"relay": False, "v7": True})
+    names = golden.names_of(facts, maps=["members"])
+    assert golden.differences("fleet-list", FLEET_LIST_SCHEMA, golden.load("fleet-list"), names) == []
     assert "v7 is revoked" in say("fleet sign v7")
     assert 'has no "v8"' in say("fleet sign v8")
 

@@ -67,7 +67,7 @@ LINK_ROWS = (
     Mistake(
         "36",
         scenes.no_addresses,
-        check=r"the peer's file needs an address of this machine",
+        check=r"it connects, to an address of this machine",
         signs=_both("not_connecting", r"address"),
     ),
     Mistake("38", scenes.wrong_system, signs=(Sign("there", "foreign_system", r"SYSID_THISMAV.*MAV_SYS_ID"),)),

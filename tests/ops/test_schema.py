@@ -16,7 +16,7 @@ from tests.test_readmes import ROOT, names_in_table
 from uavlinkd.authority.certificates import MemberRole
 from uavlinkd.lab.sim.loopback_ports import free_port
 from uavlinkd.observe.finding import Finding, Severity, Subject
-from uavlinkd.ops import STATUS_SCHEMA
+from uavlinkd.ops import NETCHECK_SCHEMA, STATUS_SCHEMA
 from uavlinkd.serial.line_framing import RADIO_FIGURES
 
 MAPS = (
@@ -77,11 +77,12 @@ ALSO = {
 }
 """Types that the daemons here do not show."""
 
-_TYPES = {bool: "boolean", int: "integer", float: "number", str: "string", type(None): "null", list: "list"}
 
+async def observed() -> tuple[dict[str, str], dict[str, str]]:
+    """Every name of ``status`` and of ``netcheck``, with its types.
 
-async def observed() -> dict[str, str]:
-    """Every name with its types: of a daemon, then its peer, with a frame to each; with networks, and relays."""
+    Of a daemon, then its peer, with a frame to each; with networks, and relays.
+    """
     statuses: list[dict[str, Any]] = []
     async with Stage() as stage:
         a, b = stage.pair()
@@ -127,6 +128,7 @@ async def observed() -> dict[str, str]:
         statuses.append(await far.status())
         await stage.start(relay, b, linked=False)
         statuses.append(await far.until(lambda status: bool(status["relays"]["vps"]["seen_as"])))
+        netcheck = await far.ask("netcheck")
         statuses.append(await relay.until(lambda status: bool(status["relay"]["members"]["drone1"]["addresses"])))
 
         def is_refused_there(status: dict[str, Any]) -> bool:
@@ -145,44 +147,19 @@ async def observed() -> dict[str, str]:
         await station.start()
         statuses.append(await vehicle.until(lambda status: status["fleet"]["bulletins"] == {"station": 1}))
     findings = [Finding("cause", Severity.FAULT, Subject.PEER, "name", "text", "remedy").as_json()]
-    types: dict[str, set[str]] = {name: {kind} for name, kind in ALSO.items()}
-    for status in statuses:
-        _walk(status | {"findings": findings}, "", types)
-    return {name: "|".join(sorted(kinds)) for name, kinds in types.items()}
-
-
-def _walk(value: Any, path: str, types: dict[str, set[str]]) -> None:
-    if path in COUNTS:
-        _check_counts(value, COUNTS[path], path)
-        types.setdefault(path, set()).add("counts" if COUNTS[path] == 1 else f"counts of {COUNTS[path]} levels")
-    elif isinstance(value, dict):
-        if path:
-            types.setdefault(path, set()).add("object")
-        for key, item in value.items():
-            name = "*" if path in MAPS else key
-            _walk(item, f"{path}.{name}" if path else name, types)
-    elif isinstance(value, list):
-        types.setdefault(path, set()).add("list")
-        for item in value:
-            _walk(item, f"{path}[]", types)
-    else:
-        types.setdefault(path, set()).add(_TYPES[type(value)])
-
-
-def _check_counts(value: Any, levels: int, path: str) -> None:
-    assert isinstance(value, dict), path
-    for item in value.values():
-        if levels == 1:
-            assert isinstance(item, int), path
-        else:
-            _check_counts(item, levels - 1, path)
+    names = golden.names_of(
+        *(status | {"findings": findings} for status in statuses), maps=MAPS, counts=COUNTS, also=ALSO
+    )
+    del netcheck["relays"]  # that of the status
+    return names, golden.names_of(netcheck, maps=["web"])
 
 
 @pytest.mark.long
-async def test_status_has_the_declared_names() -> None:
+async def test_status_and_netcheck_have_the_declared_names() -> None:
     """Of real daemons: one alone, and one with a peer and clients."""
-    names = await observed()
-    problems = golden.differences("status", STATUS_SCHEMA, golden.load("status"), names)
+    status, netcheck = await observed()
+    problems = golden.differences("status", STATUS_SCHEMA, golden.load("status"), status)
+    problems += golden.differences("netcheck", NETCHECK_SCHEMA, golden.load("netcheck"), netcheck)
     assert not problems, "\n".join(problems)
 
 

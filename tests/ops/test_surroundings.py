@@ -56,7 +56,6 @@ def test_control_socket(lacks: Lacks, monkeypatch: pytest.MonkeyPatch) -> None:
     """A missing folder, one without permission, and a path that is too long for a socket. systemd makes /run/NAME."""
     assert "mkdir -p /no/such" in lacks(control="/no/such/c.sock")[0]
     assert lacks(control="/run/no-such-service/control.sock") == []
-    assert "may have 107" in lacks(control=f"/tmp/{'x' * 30}/{'y' * 30}/{'z' * 30}.{'u' * 30}")[0]
     monkeypatch.setattr(os, "access", lambda path, _: str(path) != "/tmp")
     assert "may not write to /tmp" in lacks()[0]
 

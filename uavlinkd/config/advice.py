@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from itertools import combinations
+from typing import Final
 
-from uavlinkd.config.keys import looks_private
-from uavlinkd.config.model import Config, EndpointConfig, PeerConfig
-from uavlinkd.protocol.path import RELAY_HOST
+from uavlinkd.config.keys import encode_key, looks_private
+from uavlinkd.config.model import Config, EndpointConfig, PeerAddress, PeerConfig
+from uavlinkd.protocol.settings import PeerSettings
+
+EXAMPLE_KEYS: Final = frozenset(
+    {
+        "Ya1BcyCMNCoxhVU/dI5z9wlfOD9PHricYw/gaSC3swU=",
+        "eZPBKM+9Oztdms1v2yiR+byync+zZsR87etuOX4heHE=",
+        "tJLyzZrt6Sa42Db32IyrBDlKIWCLqF0Ru8srHbdIT3A=",
+        "Is+OSCKTa6Id2wymhOZXYuDCPcfLOHGwnYi5Ai117ls=",
+    }
+)
+"""The public keys in ``configs/``, of which no private keys exist."""
+_EXAMPLE_HOST: Final = re.compile(r"(.*\.)?example(\.(com|net|org))?", re.IGNORECASE)  # RFC 2606
 
 _READABLE = (
     "a link through a relay is not confidential: its owner cannot alter the frames, but can read them; write"
@@ -37,6 +50,27 @@ def advice(config: Config) -> Iterator[str]:
         )
 
 
+def examples(config: Config) -> Iterator[str]:
+    """Yield what is left from an example, with which no link comes up."""
+    for what, settings, addresses in _others(config):
+        if encode_key(settings.public_key) in EXAMPLE_KEYS:
+            yield f"{what}: public_key is of an example, not of a machine: write what `uavlinkd pubkey` prints there"
+        for address in addresses:
+            if _EXAMPLE_HOST.fullmatch(address.address.host):
+                yield f"{what}: {address} is a name for examples: write the address of that machine"
+
+
+def _others(config: Config) -> Iterator[tuple[str, PeerSettings, tuple[PeerAddress, ...]]]:
+    """The other daemons of a file: the section, the settings and the addresses."""
+    for peer in config.peers:
+        yield f'peer "{peer.name}"', peer.settings, peer.addresses
+    for relay in config.relays:
+        if relay.peer is None:
+            yield f'relay "{relay.name}"', relay.settings, relay.addresses
+    for member in config.relay_server.members if config.relay_server else ():
+        yield f'member "{member.name}"', member.peer, ()
+
+
 def _keys(config: Config) -> Iterator[str]:
     """Warn of keys that are probably in the wrong place: a person who pastes a private key exposes it."""
     if not looks_private(config.private_key.reveal()):
@@ -44,15 +78,12 @@ def _keys(config: Config) -> Iterator[str]:
             "private_key_file holds a key without the form of a private key, perhaps a public key: make one with"
             " `uavlinkd keygen`, unless software other than `uavlinkd` and `wg` made it"
         )
-    owners = [("peer", peer.settings) for peer in config.peers]
-    owners += [("relay", relay.settings) for relay in config.relays if relay.peer is None]
-    owners += [("member", member.peer) for member in config.relay_server.members] if config.relay_server else []
-    for what, owner in owners:
-        if looks_private(owner.public_key):
+    for what, settings, _ in _others(config):
+        if looks_private(settings.public_key):
             yield (
-                f'{what} "{owner.name.removeprefix(RELAY_HOST)}": public_key has the form of a private key.'
-                " `uavlinkd keygen` makes no such public key, `wg` one of 16: compare it with what `uavlinkd pubkey"
-                f" FILE` prints on the {what}. If it is its private key, it is exposed: make a new one there with"
+                f"{what}: public_key has the form of a private key. `uavlinkd keygen` makes no such public key, `wg`"
+                " one of 16: compare it with what `uavlinkd pubkey FILE` prints there. If it is the private key of"
+                f" that {what.partition(' ')[0]}, it is exposed: make a new one there with"
                 " `uavlinkd keygen`, and write here the public key that it prints"
             )
 

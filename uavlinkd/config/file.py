@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +15,7 @@ from uavlinkd.authority.certificates import MemberRole
 from uavlinkd.config.model import ConfigError, PeerAddress, Problem
 from uavlinkd.config.schema import POLICY, SECTIONS, SINGLE, TITLES, TOP
 from uavlinkd.config.section import Keys, Values, read
+from uavlinkd.system.spelling import meant
 
 if TYPE_CHECKING:
     from uavlinkd.authority.trust import HeldCertificate
@@ -147,37 +147,8 @@ _KNOWN: dict[str, str] = {
         'is not known here: a [[peer]] has a list, addresses = ["10.13.0.2:5790"], and an [[endpoint]] has a url',
     ),
     "allowed_ips": "is not known here: write role and system_ids, which say what the peer may do",
-    **dict.fromkeys(
-        ("previous_public_key", "previous_private_key_file"),
-        "was removed: to change a key, write the new public key into the other ends' files, restart the daemon whose"
-        " key it is, and reload the others at the same time; in a fleet, `uavlinkd enroll NAME` there makes one",
-    ),
-    **dict.fromkeys(
-        ("deny_in", "deny_out"),
-        "was removed: to stop a message, write it into rate_in or rate_out with a rate of 0; to keep out a command,"
-        " write no role, and in allow_in and allow_out only what is needed: most commands have others with the same"
-        " effect",
-    ),
-    "successor": "was removed: delete the line: nothing used it",
-    "recording": "was removed: delete [recording]: ground stations record, and so does `mavproxy.py --daemon`",
-    "probe_interval_s": "was removed: delete the line: the round trip is measured every 5 s",
-    "mac_key_bits": "was removed: delete the line: every HMAC key has 256 bits, and a longer one was no stronger",
-    **dict.fromkeys(
-        ("datagrams_s", "member_datagrams_s"),
-        "was removed: delete the line: a relay passes one datagram for each 10,000 bits of bits_s or member_bits_s",
-    ),
-    **dict.fromkeys(
-        ("max_peers", "member_max_peers"),
-        "was removed: delete the line: each member may ask a relay for 256 others",
-    ),
-    "member.bits_s": "was removed: write member_bits_s in [relay_server], which is the limit of each member",
-    **dict.fromkeys(
-        ("relay.psk_file", "member.psk_file"),
-        "was removed: delete the line; against a later quantum computer, write a suite with ML-KEM in [link]",
-    ),
-    "metrics": "was removed: delete [metrics]; `uavlinkd web` serves http://127.0.0.1:8790/metrics",
 }
-"""The remedies for keys and sections of earlier versions, and for keys of WireGuard."""
+"""The remedies for keys that people write from WireGuard's files."""
 
 
 def unknown_key(key: str, kind: str) -> str:
@@ -186,13 +157,13 @@ def unknown_key(key: str, kind: str) -> str:
     plain = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|[ -]", "_", key).lower()
     if key in TITLES:
         return f"does not belong here: write {TITLES[key]}, a section of its own"
-    if remedy := _KNOWN.get(f"{kind}.{plain}") or _KNOWN.get(plain):
-        return remedy
+    if plain in _KNOWN:
+        return _KNOWN[plain]
     if places := [TITLES[section] for section, others in SECTIONS.items() if key in others]:
         return f"does not belong here: write it in {' or '.join(places)}"
     if key in TOP:
         return "does not belong here: write it at the top of the file, before the first section"
     known = [*keys, *(() if kind else TITLES)]
-    if close := get_close_matches(plain, known, n=1, cutoff=0.7):
-        return f"is not known: did you mean {TITLES.get(close[0], close[0])}?"
+    if likely := meant(plain, known, cutoff=0.7):
+        return f"is not known: did you mean {TITLES.get(likely, likely)}?"
     return f"is not known here: the keys are {', '.join(known)}"

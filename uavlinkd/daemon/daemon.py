@@ -19,7 +19,7 @@ from uavlinkd.daemon.parts import DaemonParts
 from uavlinkd.mavlink.own_frames import INTERVAL_S
 from uavlinkd.observe.observer import Observer
 from uavlinkd.observe.status import daemon_status, overview
-from uavlinkd.ops import LOG_SCHEMA
+from uavlinkd.ops import LOG_SCHEMA, NETCHECK_SCHEMA
 from uavlinkd.ops.control import ControlServer
 from uavlinkd.ops.sdnotify import Supervisor
 from uavlinkd.system.base64_text import to_base64
@@ -153,7 +153,9 @@ class Daemon:
                 return {"problems": [], "name": parts.config.name}
             case ("netcheck", "", ""):
                 status = daemon_status(self.observer, monotonic())
-                return {"relays": status["relays"], "web": {} if parts.tls is None else await parts.tls.probe()}
+                facts = {key: status[key] for key in ("name", "public_key", "relays")}
+                web = {} if parts.tls is None else await parts.tls.probe()
+                return {"schema": NETCHECK_SCHEMA, **facts, "web": web}
             case ("bulletin", "", "") if parts.fleet is not None:
                 return {"bulletin": to_base64(parts.fleet.trust.bulletin_bytes)}
             case ("fleet", "", "") if parts.fleet is not None:

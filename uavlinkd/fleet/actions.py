@@ -36,6 +36,7 @@ from uavlinkd.fleet.manifest import (
 )
 from uavlinkd.fleet.recovery import read_source
 from uavlinkd.fleet.signing import Identity
+from uavlinkd.ops import FLEET_LIST_SCHEMA
 from uavlinkd.ops.commands import control_socket, control_sockets
 from uavlinkd.ops.control import ask as ask_daemon
 from uavlinkd.system.base64_text import to_base64
@@ -259,8 +260,8 @@ def _list(options: argparse.Namespace) -> None:
     fingerprint, number = fingerprint_of(fleet.authority.public), fleet.bulletin.number
     last = {member.name: member for member in (*fleet.members, *fleet.current)}.values()  # former keys are no members
     if options.json:
-        members = [_facts(fleet, member) for member in last]
-        print(json.dumps({"fleet": fingerprint, "bulletin": number, "members": members}))
+        members = {member.name: _facts(fleet, member) for member in last}
+        print(json.dumps({"schema": FLEET_LIST_SCHEMA, "fleet": fingerprint, "number": number, "members": members}))
         return
     _say(f"fleet {fingerprint}, bulletin {number}")
     _print_table(fleet, last)
@@ -270,7 +271,7 @@ def _facts(fleet: Fleet, member: Member) -> dict[str, Any]:
     return {
         "name": member.name,
         "role": member.role.name.lower(),
-        "ids": member.ids,
+        "system_ids": member.ids,
         "serial": member.certificate.serial,
         "public_key": to_base64(member.public_key),
         "addresses": list(map(str, member.addresses)),

@@ -196,7 +196,7 @@ _REFUSED: Final = (
     Row(
         *("all_refused", FAULT, traffic_signs.all_refused),
         "{rule} refuses every frame {which}: {reasons}",
-        "`uavlinkd check` prints what passes: write the role that the other end has, or allow what it needs",
+        "`uavlinkd check --verbose` prints what passes: write the role of the other end, or allow what it needs",
         Exit.FAILED,
         frozenset({"roles_exchanged"}),
         code=1,

@@ -9,3 +9,6 @@ from typing import Final
 STATUS_SCHEMA: Final = 5
 LOG_SCHEMA: Final = 5
 METRICS_SCHEMA: Final = 4
+CHECK_SCHEMA: Final = 1
+NETCHECK_SCHEMA: Final = 1
+FLEET_LIST_SCHEMA: Final = 1

@@ -19,7 +19,6 @@ from uavlinkd.io.sockets import family_of, look
 from uavlinkd.io.url import NetworkUrl, SerialUrl
 from uavlinkd.system.addresses import Address
 
-_MAX_SOCKET_PATH = 107
 _SERIAL_DEVICES = ("serial/by-id/*", "ttyACM*", "ttyUSB*", "serial0")
 
 
@@ -95,12 +94,6 @@ def _control_socket(config: Config) -> Iterator[str]:
     path = config.control_socket
     if path is None:
         yield 'there is no control_socket: for `uavlinkd status` and `reload`, add control_socket = "NAME.sock"'
-    elif len(os.fsencode(path)) > _MAX_SOCKET_PATH:
-        yield (
-            f"control_socket: its path has {len(os.fsencode(path))} bytes, and a socket's may have"
-            f" {_MAX_SOCKET_PATH}: the daemon will not start; write a shorter one, such as"
-            ' "/run/uavlinkd/control.sock"'
-        )
     elif not path.parent.is_dir():
         # systemd makes the folder of a service when it starts.
         if path.parent.parent != Path("/run"):

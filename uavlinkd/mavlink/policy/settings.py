@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ from typing import Final, Literal, NamedTuple
 from uavlinkd.mavlink import dialect
 from uavlinkd.mavlink.dialect import COMMANDS, IDS, SAID_ONCE
 from uavlinkd.mavlink.policy.roles import ROLES
+from uavlinkd.system.spelling import meant
 
 MAX_MSGID: Final = 0xFFFFFF
 MAX_COMMAND: Final = 0xFFFF
@@ -296,7 +296,6 @@ def _flag(data: Mapping[str, object], key: str, default: bool, report: Report) -
 
 
 def _did_you_mean(word: str, known: Iterable[str], otherwise: str) -> str:
-    """A suggestion: the known word that is most similar, in capitals or small letters."""
-    by_small = {name.lower(): name for name in known}
-    close = difflib.get_close_matches(word.lower(), by_small, n=1)
-    return f"did you mean {by_small[close[0]]!r}?" if close else otherwise
+    """A suggestion: the known word that is most similar."""
+    likely = meant(word, known)
+    return f"did you mean {likely!r}?" if likely else otherwise
