@@ -172,7 +172,7 @@ def test_lines_that_cannot_be_used_are_refused(
     assert "has the certificate of another key, named v8" in say("enroll --finish --config v7.toml", of_v8)
     assert "the line is of fleet" in say("enroll --finish", foreign)
     assert "is the request" in say("enroll --finish", say("enroll v7"))
-    assert "not a range" in say("fleet sign --ids 7-x", say("enroll v7"))
+    assert "nor a range" in say("fleet sign --id 7-x", say("enroll v7"))
     (place / "v7.2.key").unlink()
     assert "copy it again" in say("fleet sign", "uavlink-enroll-1 v7")
     assert "`uavlinkd enroll NAME`" in say("enroll")
@@ -204,7 +204,7 @@ def test_file_that_a_daemon_would_refuse_is_not_changed(place: Path, say: Say) -
 
 def test_members_are_listed(place: Path, say: Say) -> None:
     """Former ones too."""
-    enrolled(say, "v7", "--ids 70-79")
+    enrolled(say, "v7", "--id 70-79")
     assert "have not heard of it" in say("fleet remove v7")
     rows = [line.split() for line in say("fleet list").splitlines()]
     assert rows[0][2:] == ["bulletin", "2"]

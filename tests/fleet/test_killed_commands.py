@@ -94,6 +94,7 @@ COMMANDS: list[tuple[str, list[str], str]] = [
     # The command; those before it, each of which reads the line of the one before; and what it reads.
     ("fleet remove drone1", [], ""),
     ("fleet sign --id 7", ["enroll v7"], "line"),
+    ("fleet enroll v7 --here", [], ""),
     ("enroll v7", [], ""),
     ("enroll --finish", ["enroll v7", "fleet sign --id 7"], "line"),
     (

@@ -111,7 +111,7 @@ def test_each_machine_is_enrolled_by_two_commands(hosts: Hosts, say: Say) -> Non
     assert certified(hosts, "v8")
     fleet = read_manifest(Path("fleet"))
     assert [fleet.member(name).ids for name in ("v7", "v8")] == ["7", "8"]
-    assert f"v8 is a member of fleet {fingerprint_of(fleet.authority.public)}" in said
+    assert f"pi@v8: v8 is a member of fleet {fingerprint_of(fleet.authority.public)}" in said
 
 
 def test_second_run_keeps_the_key_and_says_so(hosts: Hosts, say: Say) -> None:
@@ -135,7 +135,7 @@ def test_new_card_needs_replace(hosts: Hosts, say: Say) -> None:
         path.unlink()
     error = say("fleet enroll v7")
     assert "there is no v7.key" in error
-    assert "For a new machine or card, run this again with --replace" in error
+    assert "For another machine, card or folder, add --replace" in error
     say("fleet enroll v7 --replace")
     assert certified(hosts, "v7")
 
@@ -182,7 +182,7 @@ def test_one_passphrase_is_asked_for_all(hosts: Hosts, say: Say, monkeypatch: py
         ((127, "", "bash: line 1: uavlinkd: command not found"), "Install uavlinkd there"),
         ((2, "", "uavlinkd: error: there is no 'enroll': invalid choice"), "Install the version of uavlinkd"),
         ((0, "", ""), "not a whole line of `uavlinkd enroll NAME`"),
-        ((1, "", "sudo: a password is required"), "Let sudo ask for no password there"),
+        ((1, "", "sudo: a password is required"), "--service needs root@HOST"),
     ],
 )
 def test_failure_is_named_by_the_hosts_own_words(hosts: Hosts, say: Say, answer: Answer, remedy: str) -> None:
@@ -254,7 +254,7 @@ def test_service_is_started_and_its_link_awaited(hosts: Hosts, say: Say, monkeyp
     hosts.answers["uavlinkd status"] = (1, "0 of 1 peers up", "")
     assert "without a link for 0 s:\n0 of 1 peers up" in say("fleet enroll pi@v7 --service")
     hosts.answers["systemctl enable"] = (1, "", "Failed to enable unit: Unit uavlinkd@v7.service does not exist.")
-    assert "copy its unit: systemd/README.md" in say("fleet enroll pi@v7 --service")
+    assert "copy the unit: systemd/README.md" in say("fleet enroll pi@v7 --service")
 
 
 def test_relay_has_a_unit_of_its_own(hosts: Hosts, say: Say) -> None:

@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable, Iterable
 from functools import cache
 from pathlib import Path
+from textwrap import indent
 from typing import Any
 
 from uavlinkd.authority.certificates import MemberRole
@@ -96,13 +97,13 @@ def _note_contacts(before: Fleet, after: Fleet) -> None:
 
 
 def _identity(options: argparse.Namespace) -> Identity:
+    first, _, last = (options.id or "").partition("-")
     try:
-        ends = [int(end) for end in (options.ids or f"{options.id or 0}").split("-")]
+        ids = None if options.id is None else (int(first), int(last or first))
     except ValueError:
-        raise FleetError("--ids is not a range of system ids: write it as 10-12") from None
+        raise FleetError(f"--id {options.id} is neither a system id nor a range such as 10-12") from None
     role = None if options.role is None else MemberRole[options.role.upper()]
-    is_given = options.id is not None or options.ids is not None
-    return Identity(role, (ends[0], ends[-1]) if is_given else None, parse_addresses("--address", options.address))
+    return Identity(role, ids, parse_addresses("--address", options.address))
 
 
 def _remove(options: argparse.Namespace) -> None:
@@ -202,8 +203,8 @@ def _enroll_machine(
     fleet = read_manifest(options.out)
     known = next((member for member in fleet.current if member.name == name), None)
     role = identity.role or (known.role if known else None)
-    instance = "relay" if role is MemberRole.RELAY else name
-    machine = Machine(name, target, instance if options.service else None)
+    unit = "uavlinkd-relay" if role is MemberRole.RELAY else f"uavlinkd@{name}"
+    machine = Machine(name, target, unit if options.service else "")
     if known is None or options.replace:
         request = machine.request()
         before, fleet = operations.sign(options.out, request, identity, ask, replaces=options.replace)
@@ -213,7 +214,7 @@ def _enroll_machine(
     else:
         _say(f"{name} is a member already: it keeps its key, and gets the present bulletin and contacts")
     said = machine.finish(operations.line_of(fleet, name), options.url)
-    _say(said.rstrip())
+    _say(indent(said.rstrip(), f"{target or 'this machine'}: "))
     if fingerprint_of(fleet.authority.public) not in said:
         raise FleetError("its fleet is another one than this: install the same version of uavlinkd there")
     if options.service:

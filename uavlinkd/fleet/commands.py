@@ -70,11 +70,8 @@ def add_fleet(fleet: argparse.ArgumentParser) -> None:
 
 def _add_identity(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--role", choices=_ROLES, help="(default: vehicle)")
-    ids = parser.add_mutually_exclusive_group()
-    ids.add_argument(
-        "--id", type=int, metavar="N", help="MAVLink system id (default: the next free one); the first of several"
-    )
-    ids.add_argument("--ids", metavar="A-B", help="a range of them")
+    text = "MAVLink system id, or a range of them (default: the next free one); of several machines, the first one's"
+    parser.add_argument("--id", metavar="N or A-B", help=text)
     text = "where members reach it from the start; a relay's wss:// URL, behind its HOST:PORT, is one more"
     parser.add_argument("--address", action="append", default=[], metavar="HOST:PORT", help=text)
 

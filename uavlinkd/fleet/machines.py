@@ -28,14 +28,14 @@ LINK_WAIT_S: Final = 30.0
 _POLL_S: Final = 1.0
 _FAILED_SSH: Final = 255  # ssh(1): an error of ssh itself; else the status is that of the command there
 _REMEDIES: Final = (
-    (r"a password is required|a terminal is required", "Let sudo ask for no password there, or name root@HOST"),
-    (
-        r"[Uu]nit.* (does not exist|not found)",
-        "Install the package there, or copy its unit: systemd/README.md",
-    ),
+    (r"a password is required|sudo: (command )?not found", "--service needs root@HOST, or sudo without a password"),
+    (r"[Uu]nit.* (does not exist|not found)", "Install its package there, or copy the unit: systemd/README.md"),
     (r"not found|Unknown command", "Install uavlinkd there, with its link in /usr/local/bin"),
     (r"invalid choice|unrecognized arguments", "Install the version of uavlinkd there that is here"),
-    (r"there is no .*\.key|certificate of another key", "For a new machine or card, run this again with --replace"),
+    (
+        r"there is no .*\.key|certificate of another key",
+        "For another machine, card or folder, add --replace",
+    ),
 )
 """What to do about words of a shell, sudo, systemctl or another version, which name no remedy for this command."""
 
@@ -56,17 +56,21 @@ class Machine:
     name: str
     target: str | None
     """The destination of ssh. None: this machine."""
-    instance: str | None = None
-    """The name of the service's files below /etc/uavlinkd. None: the files are in the folder where commands run."""
+    unit: str = ""
+    """Its service, which has the files below /etc/uavlinkd. Empty: they are in the folder where commands run."""
 
     @property
     def _config(self) -> str:
-        return f"{self.name}.toml" if self.instance is None else f"/etc/uavlinkd/{self.instance}.toml"
+        return f"{self._of_service}.toml" if self.unit else f"{self.name}.toml"
+
+    @property
+    def _of_service(self) -> str:
+        """The folder of the service's keys: `relay` of `uavlinkd-relay`, `v7` of `uavlinkd@v7`."""
+        return f"/etc/uavlinkd/{self.unit.removeprefix('uavlinkd')[1:]}"
 
     @property
     def _files(self) -> tuple[str, ...]:
-        keys = () if self.instance is None else ("--keys", f"/etc/uavlinkd/{self.instance}")
-        return ("--config", self._config, *keys)
+        return ("--config", self._config, *(("--keys", self._of_service) if self.unit else ()))
 
     def request(self) -> Request:
         """What the machine asks to be signed; it makes its private key if it has none for this."""
@@ -84,9 +88,8 @@ class Machine:
 
     def start_service(self) -> None:
         """Start the service, now and at each boot; a daemon that runs reads its files again."""
-        unit = "uavlinkd-relay" if self.instance == "relay" else f"uavlinkd@{self.instance}"
-        self._run("systemctl", "enable", unit)
-        self._run("systemctl", "restart", unit)
+        self._run("systemctl", "enable", self.unit)
+        self._run("systemctl", "restart", self.unit)
 
     def wait_for_link(self) -> list[str]:
         """The names of the peers whose links are up, once there is one. Raises CommandError if none comes."""
@@ -102,7 +105,7 @@ class Machine:
 
     def _run(self, *words: str, line: str = "", accepted: Collection[int] = (0,)) -> str:
         """Run a command there, and return what it printed. Raises CommandError with its own words if it fails."""
-        if self.instance is not None:
+        if self.unit:
             words = (*self._sudo, *words)
         if self.target is not None:
             if shutil.which("ssh") is None:

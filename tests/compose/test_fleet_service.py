@@ -1,0 +1,50 @@
+"""`fleet enroll --service` under a real systemd: files, units and the link, without another command there."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import cryptography.hazmat.primitives.serialization  # noqa: F401  a module without a specification stays loaded
+import pytest
+
+from tests.compose import images
+from tests.compose.machine import Machine, build
+from tests.needs import need
+from tests.waiting import Stopwatch
+from uavlinkd.cli import main
+
+
+def test_one_command_for_each_service(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A station, a relay and a vehicle on one machine: the vehicle has a link when the command ends."""
+    why = images.why_not()
+    need(why is None, str(why))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    assert main(["fleet", "init", "--no-passphrase"]) == 0
+    with Machine(build()) as machine:
+        machine.stand_in_for_ssh(tmp_path)
+        _enroll("root@relay --role relay --address 127.0.0.1:5789")
+        _enroll("root@gs --role operator --address 127.0.0.1:5790")
+        watch = Stopwatch()
+        capsys.readouterr()
+        _enroll("root@v7 --id 7 --url udpin:127.0.0.1:14551")
+        out = capsys.readouterr().out
+        took_s = watch.elapsed_s
+        assert "v7 has a link with gs" in out
+        for unit in ("uavlinkd-relay", "uavlinkd@gs", "uavlinkd@v7"):
+            assert machine.show(unit, "ActiveState") == "active"
+            assert machine.show(unit, "UnitFileState") == "enabled"
+        before = machine.show("uavlinkd@v7", "MainPID")
+        _enroll("root@v7 --id 7")
+        assert machine.show("uavlinkd@v7", "MainPID") != before
+        machine.say("systemctl stop uavlinkd@gs uavlinkd-relay; rm /etc/systemd/system/uavlinkd@.service")
+        assert main(["fleet", "enroll", "root@v8", "--service"]) == 1
+        assert "Unit file uavlinkd@v8.service does not exist.\nInstall its package there" in capsys.readouterr().err
+    print(f"a vehicle was enrolled, started and linked in {took_s:.1f} s:\n{out}")
+
+
+def _enroll(words: str) -> None:
+    assert main(["fleet", "enroll", *words.split(), "--service"]) == 0
