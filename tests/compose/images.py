@@ -75,6 +75,7 @@ def _build(base: str) -> str:
         for name in ("pyproject.toml", "README.md", "LICENSE"):
             shutil.copy(PROJECT / name, source)
         shutil.copytree(PROJECT / "uavlinkd", source / "uavlinkd", ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(PROJECT / "systemd", source / "systemd", ignore=shutil.ignore_patterns("deb"))
         version = _python_of(base)
         _run(sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--wheel-dir", context / "wheels", source)
         requirements = json.loads(_output(sys.executable, "-c", _REQUIREMENTS, source / "pyproject.toml"))

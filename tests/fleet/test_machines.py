@@ -18,6 +18,7 @@ import pytest
 
 from tests.fleet.conftest import Say
 from tests.fleet.folders import create
+from uavlinkd.authority.certificates import MemberRole
 from uavlinkd.authority.enrolment import FleetError, fingerprint_of
 from uavlinkd.cli import main
 from uavlinkd.config.load import load_config
@@ -141,9 +142,10 @@ def test_new_card_needs_replace(hosts: Hosts, say: Say) -> None:
 
 
 def test_this_machine_is_enrolled_without_ssh(hosts: Hosts, say: Say) -> None:
-    """The station, by the same command."""
-    say("fleet enroll gs --here --role operator --address 10.13.0.254:5790")
+    """The station, by the same command; it is an operator unless a role is named."""
+    say("fleet enroll gs --here --address 10.13.0.254:5790")
     assert hosts.commands == []
+    assert read_manifest(Path("fleet")).member("gs").role is MemberRole.OPERATOR
     config = load_config(Path("gs.toml"), {})
     assert (config.name, list(map(str, config.listen))) == ("gs", ["0.0.0.0:5790"])
 
@@ -235,9 +237,9 @@ def test_machine_gets_its_own_name_only(hosts: Hosts, say: Say) -> None:
 
 
 def test_service_is_started_and_its_link_awaited(hosts: Hosts, say: Say, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Files are where the unit has them, and the daemon is restarted by root."""
-    status = {"peers": {"gs": {"state": "up"}, "v8": {"state": "waiting"}}}
-    hosts.answers |= {"systemctl enable": (0, "", ""), "systemctl restart": (0, "", "")}
+    """Files are where the unit has them, the unit is linked if there is none, and root restarts the daemon."""
+    status = {"peers": {"gs": {"state": "up"}, "v8": {"state": "waiting"}}, "relays": {"relay": {"state": "up"}}}
+    hosts.answers |= {f"systemctl {verb}": (0, "", "") for verb in ("cat", "link", "enable", "restart")}
     hosts.answers["uavlinkd status"] = (1, json.dumps(status), "")
     assert "v7 has a link with gs\n" in say("fleet enroll pi@v7 --service")
     assert (hosts.home("v7") / "etc/uavlinkd/v7/v7.key").exists()
@@ -246,26 +248,37 @@ def test_service_is_started_and_its_link_awaited(hosts: Hosts, say: Say, monkeyp
     assert [command for _, command in hosts.commands] == [
         f"sudo -n uavlinkd enroll v7 {files}",
         f"sudo -n uavlinkd enroll --finish {files}",
+        "sudo -n systemctl cat uavlinkd@v7",
+        "sudo -n systemctl link /opt/uavlinkd/lib/systemd/system/uavlinkd@.service",
         "sudo -n systemctl enable uavlinkd@v7",
         "sudo -n systemctl restart uavlinkd@v7",
         "sudo -n uavlinkd status --config /etc/uavlinkd/v7.toml --json",
     ]
+    hosts.answers["systemctl cat"] = (0, "[Unit]", "")
     monkeypatch.setattr(machines, "LINK_WAIT_S", 0.0)
+    status["peers"]["gs"]["state"] = "waiting"
+    hosts.answers["uavlinkd status"] = (1, json.dumps(status), "")
+    assert "v7 has a link with relay\n" in say("fleet enroll pi@v7 --service")
     hosts.answers["uavlinkd status"] = (1, "0 of 1 peers up", "")
+    hosts.commands.clear()
     assert "without a link for 0 s:\n0 of 1 peers up" in say("fleet enroll pi@v7 --service")
-    hosts.answers["systemctl enable"] = (1, "", "Failed to enable unit: Unit uavlinkd@v7.service does not exist.")
-    assert "copy the unit: systemd/README.md" in say("fleet enroll pi@v7 --service")
+    assert not [command for _, command in hosts.commands if "systemctl link" in command]
+    hosts.answers["systemctl cat"] = (1, "", "No files found for uavlinkd@v7.service.")
+    hosts.answers["systemctl link"] = (1, "", "Failed to link unit: No such file")
+    assert "Install uavlinkd there in /opt/uavlinkd, or its package" in say("fleet enroll pi@v7 --service")
 
 
 def test_relay_has_a_unit_of_its_own(hosts: Hosts, say: Say) -> None:
     """Its files have the names that the unit has; root needs no sudo, and no link is awaited."""
     hosts.home("relay.example.net").mkdir()
-    hosts.answers |= {"systemctl enable": (0, "", ""), "systemctl restart": (0, "", "")}
+    hosts.answers |= {f"systemctl {verb}": (0, "", "") for verb in ("cat", "link", "enable", "restart")}
     say("fleet enroll root@relay.example.net --name relay2 --role relay --address relay.example.net:5790 --service")
     files = "--config /etc/uavlinkd/relay.toml --keys /etc/uavlinkd/relay"
     assert [command for _, command in hosts.commands] == [
         f"uavlinkd enroll relay2 {files}",
         f"uavlinkd enroll --finish {files}",
+        "systemctl cat uavlinkd-relay",
+        "systemctl link /opt/uavlinkd/lib/systemd/system/uavlinkd-relay.service",
         "systemctl enable uavlinkd-relay",
         "systemctl restart uavlinkd-relay",
     ]

@@ -74,12 +74,16 @@ def files(folder: str, pattern: str = "*") -> set[str]:
 
 
 def test_wheel_has_the_whole_package(folder: Path) -> None:
-    """Modules, tables and the marker of types, and the two commands."""
+    """Modules, tables and the marker of types, the two commands, and the units."""
     with zipfile.ZipFile(next((folder / "wheel").iterdir())) as wheel:
         names = set(wheel.namelist())
         entry_points = wheel.read(f"uavlinkd-{__version__}.dist-info/entry_points.txt").decode()
 
-    assert {name for name in names if not name.startswith(f"uavlinkd-{__version__}.dist-info/")} == files("uavlinkd")
+    units = f"uavlinkd-{__version__}.data/data/lib/systemd/system/"
+    assert {name.removeprefix(units) for name in names if name.startswith(units)} == {
+        path.name for path in (ROOT / "systemd").glob("*.service")
+    }
+    assert {name for name in names if not name.startswith(f"uavlinkd-{__version__}.")} == files("uavlinkd")
     assert "uavlinkd = uavlinkd.cli:main" in entry_points
     assert "uavlink-mitm = uavlinkd.cli:mitm" in entry_points
 

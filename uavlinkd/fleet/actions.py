@@ -179,6 +179,7 @@ def _enroll(options: argparse.Namespace) -> None:
     """Enroll each machine. Those that fail stop no other one; a second run does what is left."""
     if options.name is not None and len(options.target) > 1:
         raise FleetError("--name is of one machine: leave it out, or enroll each one by itself")
+    options.role = options.role or ("operator" if options.here else None)
     ask = cache(passphrase_from(options.passphrase_file))
     identity, problems = _identity(options), list[str]()
     for number, target in enumerate(options.target):

@@ -39,7 +39,7 @@ def add_fleet(fleet: argparse.ArgumentParser) -> None:
 
     enroll = add("enroll", "make machines members, by ssh: enroll there, sign here, finish there")
     enroll.add_argument("target", nargs="+", metavar="[USER@]HOST", help="as for ssh; with --here, a member's name")
-    enroll.add_argument("--here", action="store_true", help="enroll this machine, without ssh")
+    enroll.add_argument("--here", action="store_true", help="enroll this machine, without ssh, as an operator")
     enroll.add_argument("--name", metavar="NAME", help="the member's name (default: HOST up to its first dot)")
     enroll.add_argument("--replace", action="store_true", help="a new key for each, and revoke the old one")
     _add_identity(enroll)

@@ -26,10 +26,11 @@ from uavlinkd.system.terminal import CommandError
 LINK_WAIT_S: Final = 30.0
 """How long a started daemon may take until its first link is up."""
 _POLL_S: Final = 1.0
+_UNITS: Final = "/opt/uavlinkd/lib/systemd/system"  # where pip puts them; a package's are where systemd looks
 _FAILED_SSH: Final = 255  # ssh(1): an error of ssh itself; else the status is that of the command there
 _REMEDIES: Final = (
     (r"a password is required|sudo: (command )?not found", "--service needs root@HOST, or sudo without a password"),
-    (r"[Uu]nit.* (does not exist|not found)", "Install its package there, or copy the unit: systemd/README.md"),
+    (r"Failed to link unit", "Install uavlinkd there in /opt/uavlinkd, or its package"),
     (r"not found|Unknown command", "Install uavlinkd there, with its link in /usr/local/bin"),
     (r"invalid choice|unrecognized arguments", "Install the version of uavlinkd there that is here"),
     (
@@ -87,19 +88,29 @@ class Machine:
         return self._run(*self._uavlinkd, "enroll", "--finish", *self._files, *url_words, line=line)
 
     def start_service(self) -> None:
-        """Start the service, now and at each boot; a daemon that runs reads its files again."""
+        """Start the service, now and at each boot; a daemon that runs starts again, with its new files."""
+        if not self._run("systemctl", "cat", self.unit, accepted=(0, 1)):
+            template = "".join(self.unit.partition("@")[:2])
+            self._run("systemctl", "link", f"{_UNITS}/{template}.service")
         self._run("systemctl", "enable", self.unit)
         self._run("systemctl", "restart", self.unit)
 
     def wait_for_link(self) -> list[str]:
-        """The names of the peers whose links are up, once there is one. Raises CommandError if none comes."""
+        """The names of the peers whose links are up, once there are any; else, in the end, of the relays.
+
+        Raises CommandError with the status there if nothing is up.
+        """
         status, give_up_at = (*self._uavlinkd, "status", "--config", self._config), time.monotonic() + LINK_WAIT_S
-        while time.monotonic() < give_up_at:
-            with suppress(ValueError, LookupError, AttributeError):
-                peers = json.loads(self._run(*status, "--json", accepted=(0, 1)))["peers"]
-                if up := [name for name, peer in peers.items() if peer["state"] == "up"]:
-                    return up
+        while True:
+            up: dict[str, list[str]] = {"peers": [], "relays": []}
+            with suppress(ValueError, LookupError, AttributeError):  # the daemon does not answer yet
+                facts = json.loads(self._run(*status, "--json", accepted=(0, 1)))
+                up = {kind: [name for name, one in facts[kind].items() if one["state"] == "up"] for kind in up}
+            if up["peers"] or time.monotonic() >= give_up_at:
+                break
             time.sleep(_POLL_S)
+        if names := up["peers"] or up["relays"]:
+            return names
         said = self._run(*status, accepted=(0, 1))
         raise CommandError(f"it is enrolled and its service runs, without a link for {LINK_WAIT_S:.0f} s:\n{said}")
 
