@@ -38,7 +38,8 @@ class Network:
             "scp", f'shift; for last; do :; done; exec cp -pr "$1" {shlex.quote(str(folder))}/"${{last%:}}"/'
         )
         pid = f'"$(cat {shlex.quote(str(folder))}/$host.pid)"'
-        self._add_tool("ssh", f'[ "$1" != -- ] || shift; host=$1; shift; exec nsenter --target={pid} --mount --net sh -euc "cd {HOME}; $*"')
+        there = f'nsenter --target={pid} --mount --net sh -euc "cd {HOME}; $*"'
+        self._add_tool("ssh", f'[ "$1" != -- ] || shift; host=$1; shift; exec {there}')
         self.switch = Host(self, "switch")
         self.switch.run("ip link add air type bridge && ip link set air up")
 
