@@ -25,6 +25,7 @@ from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.delivery import Source
 from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.mavlink.routing import Router, Unrouted
+from uavlinkd.mavlink.vehicles import Vehicles
 from uavlinkd.protocol.peer import Peer as CorePeer
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.stall import STALL_S, StallWatch
@@ -67,6 +68,7 @@ class Peer(PeerLink):
     def __init__(self) -> None:
         self.name = "peer"
         self.received: list[bytes] = []
+        self.vehicles = Vehicles()
         self.peer = cast("CorePeer", SimpleNamespace(paths=SimpleNamespace(is_multiple=True)))
         self.output = cast("PeerOutput", SimpleNamespace(is_plain=False))
 
@@ -200,6 +202,21 @@ def test_rule_that_depends_on_the_frame_is_checked_for_each_frame(stage: Stage) 
     stage.forward(stage.a.port, [attitude(number) for number in range(10)], 0.0)
     assert stage.delivered() == (0, 10, 2)
     assert (stage.withheld, stage.refused) == ([("c", Refusal.RATE_LIMITED)] * 8, [])
+
+
+def test_each_heartbeat_of_a_peer_is_kept_for_the_status(stage: Stage) -> None:
+    """The first of a flow and later ones, also without a client; one that the policy refuses is not."""
+    peer = Peer()
+    stage.switch.add(peer, policy(system_ids=[2]))
+    for mode in range(4):
+        if mode == 3:
+            for client in (stage.a, stage.b, stage.c):
+                stage.switch.remove(client.port)
+        for system in (2, 3):
+            heartbeat = mavlink.MAVLink_heartbeat_message(2, 3, 0, mode, 4, 3)
+            stage.line.forward(peer, [made(heartbeat, system)], float(mode), stage.stall.epoch)
+        assert [(one["system"], one["custom_mode"]) for one in peer.vehicles.status(float(mode))] == [(2, mode)]
+    assert stage.delivered() == (3, 3, 3)
 
 
 def test_system_that_a_port_may_no_longer_send_as_is_not_looked_for_there(stage: Stage) -> None:

@@ -14,6 +14,7 @@ from uavlinkd.mavlink.flows import NewestStates
 from uavlinkd.mavlink.frames import Frame, SplitCounters
 from uavlinkd.mavlink.own_frames import LinkFigures, worst
 from uavlinkd.mavlink.policy.delivery import Source
+from uavlinkd.mavlink.vehicles import Vehicles
 from uavlinkd.protocol.constants import CONFIGURED_PATHS, LOSS_WINDOW_S, NEVER
 from uavlinkd.protocol.drops import LinkProblem
 from uavlinkd.protocol.node import Node
@@ -92,6 +93,8 @@ class PeerLink:
         self.policy = config.make_policy()
         self.counters = SplitCounters()
         """Frames and faults in its payloads."""
+        self.vehicles = Vehicles()
+        """What the autopilots behind it reported last."""
         self.frames_superseded = 0
         """Frames with states older than one already delivered: see :meth:`pick_newest`."""
         self.frames_sent = 0

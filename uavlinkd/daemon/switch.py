@@ -20,6 +20,7 @@ from uavlinkd.mavlink.headers import Header
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.delivery import Source
 from uavlinkd.mavlink.routing import Router
+from uavlinkd.mavlink.vehicles import REPORTS
 
 MAX_FLOWS = 2048
 """Flows of one source that are remembered."""
@@ -34,7 +35,8 @@ class Route(NamedTuple):
     comes_once: bool
     """No other port may send frames of this system, and none goes from one local client to another: all are new."""
     is_conditional: bool
-    """A policy decides about each frame, by its contents or by a rate limit. Otherwise all of them pass."""
+    """A policy decides about each frame, by its contents or by a rate limit, or the status shows its contents.
+    Otherwise all of them pass."""
 
 
 @dataclass(slots=True, eq=False)
@@ -99,6 +101,9 @@ class Switch:
         if refusal is not None:
             self._report(owner_of(source), header, refusal, now)
             return ()
+        shows = source.vehicles if header.msgid in REPORTS and isinstance(source, PeerLink) else None
+        if shows is not None:
+            shows.note(frame, now)
         ports = self.router.route(frame, source, now)
         if ports:
             if now >= self.router.valid_until:
@@ -106,7 +111,7 @@ class Switch:
             if len(known.flows) >= MAX_FLOWS:
                 del known.flows[next(iter(known.flows))]
             gates = (incoming, *(self.ports[port].policy.outgoing for port in ports))
-            is_conditional = not all(gate.always_passes(header) for gate in gates)
+            is_conditional = shows is not None or not all(gate.always_passes(header) for gate in gates)
             is_local = isinstance(source, LocalPort) and any(isinstance(port, LocalPort) for port in ports)
             comes_once = not is_local and self._has_one_route(header.system)
             known.flows[header] = Route(ports, comes_once, is_conditional)
@@ -118,6 +123,8 @@ class Switch:
         if refusal is not None:
             self._report(owner_of(source), frame.header, refusal, now)
             return ()
+        if frame.header.msgid in REPORTS and isinstance(source, PeerLink):
+            source.vehicles.note(frame, now)
         if not route.comes_once and not self.router.sendings.is_new(frame, source, route.ports, now):
             return ()
         return self._pass_outgoing(frame, route.ports, now)

@@ -157,7 +157,7 @@ def fleet_status(fleet: FleetMembers, links: Mapping[str, PeerLink], now: float)
 
 def _few_facts(link: PeerLink, now: float, way_of: WayOf) -> dict[str, object]:
     """What a table of peers shows."""
-    return _peer_now(link, now) | {"paths": [_path_now(link, state, way_of) for state in _best_first(link)]}
+    return _peer_now(link, now) | {"paths": [_path_now(link, state, way_of, now) for state in _best_first(link)]}
 
 
 def _peer_now(link: PeerLink, now: float) -> dict[str, object]:
@@ -166,6 +166,10 @@ def _peer_now(link: PeerLink, now: float) -> dict[str, object]:
         "state": state_of(peer),
         "path": None if peer.path is None else shown(peer.path.address),
         "last_received_s": _age(peer.received_at, now),
+        "freshness_unverified_s": _age(peer.unverified_since, now),
+        "role": link.config.policy.get("role"),
+        "commands": {"in": link.policy.incoming.passes_commands, "out": link.policy.outgoing.passes_commands},
+        "vehicles": link.vehicles.status(now),
         "round_trip_s": link.round_trip_s,
         "loss_in": figures.loss_in,
         "loss_out": figures.loss_out,
@@ -183,7 +187,6 @@ def peer_status(link: PeerLink, now: float, way_of: WayOf) -> dict[str, object]:
     return _peer_now(link, now) | {
         "public_key": encode_key(peer.settings.public_key),
         "handshake_s": _age(peer.established_at, now),
-        "freshness_unverified_s": _age(peer.unverified_since, now),
         "paths": paths_status(link, way_of, now),
         "session": None
         if session is None
@@ -204,7 +207,6 @@ def peer_status(link: PeerLink, now: float, way_of: WayOf) -> dict[str, object]:
         "bytes_elsewhere": traffic.bytes_elsewhere,
         "bytes_received": totals.bytes_received,
         **{problem.value: count for problem, count in link.problems(now).items()},
-        "role": link.config.policy.get("role"),
         "frames_sent": link.frames_sent,
         "frames_received": link.counters.frames,
         "frames_unknown": link.counters.unknown,
@@ -342,7 +344,7 @@ def _best_first(link: PeerLink | RelayLink) -> list[PathState]:
     return sorted(paths.states, key=lambda state: state is not paths.best)
 
 
-def _path_now(link: PeerLink | RelayLink, state: PathState, way_of: WayOf) -> dict[str, object]:
+def _path_now(link: PeerLink | RelayLink, state: PathState, way_of: WayOf, now: float) -> dict[str, object]:
     bytes_in_s, bytes_out_s = link.rates.of(state)
     return {
         "number": state.number,
@@ -352,6 +354,7 @@ def _path_now(link: PeerLink | RelayLink, state: PathState, way_of: WayOf) -> di
         "state": state.condition.value,
         "reason": state.reason,
         "role": link.peer.paths.role(state),
+        "answered_s": now - state.answered_at if state.is_validated else None,
         "round_trip_s": state.srtt_s,
         "loss_in": state.loss_in,
         "loss_out": state.loss_out,
@@ -363,14 +366,13 @@ def _path_now(link: PeerLink | RelayLink, state: PathState, way_of: WayOf) -> di
 def _path_status(link: PeerLink | RelayLink, state: PathState, way_of: WayOf, now: float) -> dict[str, object]:
     peer = link.peer
     relay_address = way_of(state.path)[1]
-    return _path_now(link, state, way_of) | {
+    return _path_now(link, state, way_of, now) | {
         "relay_address": None if relay_address is None else str(Address.of(relay_address)),
         "envelope_bytes": state.envelope_limit.limit,
         "own_address": own if isinstance(own := state.path.address[-1], str) else None,
         "is_configured": state.is_configured,
         "state_s": now - state.since,
         "carries": [cls.value for cls, route in peer.paths.routes.items() if peer.is_up and state in route],
-        "answered_s": now - state.answered_at if state.is_validated else None,
         "jitter_s": state.rttvar_s,
         "bytes_received": state.bytes_received,
         "bytes_sent": state.bytes_sent,

@@ -49,8 +49,9 @@ _SHOWN_NAMES: Final = 8
 _ABSENT: Final[Mapping[str, object]] = {
     "state": "waiting",
     "path": None,
-    "last_received_s": None,
-    "round_trip_s": None,
+    **dict.fromkeys(("last_received_s", "freshness_unverified_s", "round_trip_s", "role")),
+    "commands": {"in": False, "out": False},
+    "vehicles": (),
     "paths": (),
     **dict.fromkeys(("loss_in", "loss_out", "bytes_in_s", "bytes_out_s"), 0.0),
 }

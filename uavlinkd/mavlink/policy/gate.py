@@ -32,6 +32,8 @@ DIRECT_COMMANDS: Final = frozenset((IDS["COMMAND_LONG"], IDS["COMMAND_INT"]))
 # An autopilot answers these with hundreds of frames: components of a system share one rate.
 REQUESTS_OF_LISTS: Final = frozenset((IDS["PARAM_REQUEST_LIST"], IDS["PARAM_EXT_REQUEST_LIST"]))
 
+ARM: Final = COMMANDS["MAV_CMD_COMPONENT_ARM_DISARM"]
+
 # A request for one message, by its number in the first parameter, a float at the payload's start. Some autopilots do
 # more than answer: PX4 adds parameters to its list if it is asked for UAVIONIX_ADSB_OUT_CFG.
 REQUEST_MESSAGE: Final = COMMANDS["MAV_CMD_REQUEST_MESSAGE"]
@@ -229,6 +231,11 @@ class Gate:
         return not any(
             (rules.allows_all, rules.allowed, rules.allowed_numbers, rules.allowed_commands, rules.opcodes)
         )
+
+    @property
+    def passes_commands(self) -> bool:
+        """Whether the rules allow the command to arm, which stands for those that fly a vehicle."""
+        return self._rules.allows_command(ARM)
 
     def may_speak_as(self, system: int) -> bool:
         """Whether frames of this system are let pass at all."""
