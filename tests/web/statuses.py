@@ -43,5 +43,7 @@ def few_facts(**facts: object) -> Status:
     measured = {"round_trip_s": 0.02, "loss_in": 0.0, "loss_out": 0.25, "bytes_in_s": 1000.0, "bytes_out_s": 500.0}
     address = "10.0.0.1:5790"
     where = {"number": 0, "network": None, "address": address, "relay": None}
-    path = where | {"state": "usable", "reason": "", "role": "stream"} | measured
-    return {"state": "up", "path": address, "last_received_s": 0.1, "paths": [path], **measured, **facts}
+    path = where | {"state": "usable", "reason": "", "role": "stream", "answered_s": 0.2} | measured
+    rules = {"role": "vehicle", "commands": {"in": False, "out": True}}
+    what = {"state": "up", "path": address, "last_received_s": 0.1, "freshness_unverified_s": None, "vehicles": []}
+    return what | rules | {"paths": [path], **measured, **facts}

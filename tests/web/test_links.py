@@ -36,7 +36,7 @@ async def along_two_paths(stage: Stage) -> tuple[DaemonProcess, DaemonProcess, l
 
 
 def role_of(path: Locator) -> Locator:
-    return path.locator("p b").first
+    return path.locator("small")
 
 
 async def test_a_pulled_path_is_down_and_the_other_best(browser: Browser) -> None:
@@ -47,15 +47,21 @@ async def test_a_pulled_path_is_down_and_the_other_best(browser: Browser) -> Non
             card = card_of(page, drone.name)
             await expect(card.locator(".state")).to_have_text("up")
             await expect(card.locator(".path.usable")).to_have_count(2)
-            await expect(role_of(card.locator(".path").first)).to_have_text("best")
-            paths = [card.locator(".path").filter(has_text=shown(network.address_for(End.B))) for network in networks]
+            await expect(card.get_by_text("best", exact=True)).to_have_count(1)
+            status = await ground.status()
+            numbers = {path["address"]: path["number"] for path in status["peers"][drone.name]["paths"]}
+            keys = [numbers[shown(network.address_for(End.B))] for network in networks]
+            paths = [card.locator(f".path[data-key='{key}']") for key in keys]
             pulled, other = paths if await role_of(paths[0]).inner_text() == "best" else reversed(paths)
             network = networks[paths.index(pulled)]
             network.on_datagram = lambda end, datagram: None
             await expect(role_of(pulled)).to_have_text("down: no answer")
-            await expect(pulled).to_contain_text("round trip -, loss - in, - out, ")
+            await expect(pulled.get_by_role("cell")).to_have_text(["-", "-", ""])
             await expect(role_of(other)).to_have_text("best")
-            await expect(other).to_contain_text("direct, carries all")
+            await expect(other.get_by_role("rowheader")).to_contain_text("direct")
+            await card.get_by_text("Details").click()
+            await expect(card).to_contain_text("best, carries all")
+            await expect(card).to_contain_text("round trip -, loss - in, - out, ")
             await expect(headline(page)).to_have_text("1 of 1 peers up")
             network.on_datagram = network.deliver
             await expect(card.locator(".path.usable")).to_have_count(2)
@@ -72,15 +78,16 @@ async def test_a_problem_has_the_words_of_status(browser: Browser) -> None:
             lambda status: ["the PSKs differ" in finding["text"] for finding in status["findings"]] == [True]
         )
         async with served(ground.folder / "control.sock") as web, window(browser, web.url) as page:
-            shown_problem = page.get_by_role("region", name="Problems", exact=True).get_by_role("paragraph")
+            shown_problem = page.get_by_role("region", name="Problems", exact=True).get_by_role("listitem")
             await expect(shown_problem).to_have_count(1)
             (line,) = problems(status["findings"])
-            sentence = f"{line.who}: {line.text}. Remedy: {line.remedy}"
-            await expect(shown_problem).to_have_text(f"{line.severity} {sentence}.")
+            plain = [f"{line.text}.", f"Remedy: {line.remedy}."]
+            said = [f"{line.severity}{line.who}", *(text.replace("`", "") for text in plain)]
+            await expect(shown_problem.get_by_role("paragraph")).to_have_text(said)
             await expect(card_of(page, drone.name).locator(".state")).to_have_text("waiting")
             await expect(headline(page)).to_have_text("0 of 1 peers up")
-            await expect(page.get_by_role("region", name="Log of problems")).to_contain_text(line.remedy)
-        assert sentence in await terminal(ground)
+            await expect(page.get_by_role("region", name="Log of problems")).to_contain_text(said[2])
+        assert f"{line.who}: {line.text}. Remedy: {line.remedy}" in await terminal(ground)
 
 
 async def terminal(daemon: DaemonProcess) -> str:

@@ -5,11 +5,14 @@ from __future__ import annotations
 import json
 from typing import Any
 
+import pytest
+from pymavlink import mavutil
+
 from tests.processes.conftest import stage
 from tests.processes.harness import Stage
 from tests.waiting import PATIENCE_S, Stopwatch
 from tests.web.statuses import few_facts, overview
-from uavlinkd.web.view import view
+from uavlinkd.web.view import mode_name, view
 
 __all__ = ["stage"]
 
@@ -68,4 +71,24 @@ def test_a_member_that_never_came_is_on_the_page() -> None:
     facts = view(overview(fleet=fleet), [], "")
     assert facts["headline"][0]["text"] == "1 of 2 peers up"
     assert [(card["name"], card["word"]) for card in facts["cards"]] == [("v9", "waiting"), ("drone1", "up")]
-    assert view(overview("abcdef", fleet=fleet), [], "")["rows"][0][:3] == ["v9", "waiting", None]
+    first = view(overview("abcdef", fleet=fleet), [], "")["rows"][0]
+    assert (first["name"], first["word"], first["last_received_s"]) == ("v9", "waiting", None)
+
+
+def test_modes_have_the_names_that_ground_stations_show() -> None:
+    """Of ArduPilot: those of pymavlink, where its dialect still has the mode; a number that nobody named is one."""
+    mapped = ((2, mavutil.mode_mapping_acm), (1, mavutil.mode_mapping_apm), (10, mavutil.mode_mapping_rover))
+    for kind, names in mapped:
+        for number in range(256):
+            name = mode_name({"autopilot": 3, "type": kind, "custom_mode": number})
+            assert name in (names.get(number), f"mode {number}")
+    assert mode_name({"autopilot": 3, "type": 2, "custom_mode": 5}) == "LOITER"
+    assert mode_name({"autopilot": 3, "type": 12, "custom_mode": 4}) == "mode 4", "a submarine"
+
+
+@pytest.mark.parametrize(
+    ("main", "sub", "name"), [(3, 0, "POSCTL"), (4, 4, "MISSION"), (4, 99, "AUTO"), (6, 3, "OFFBOARD"), (77, 0, None)]
+)
+def test_modes_of_px4_have_a_main_and_a_sub_mode(main: int, sub: int, name: str | None) -> None:
+    number = main << 16 | sub << 24
+    assert mode_name({"autopilot": 12, "type": 2, "custom_mode": number}) == (name or f"mode {number}")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Iterator, Mapping, Sequence
+from importlib.resources import files
 from typing import Any, Final
 
 from uavlinkd.mavlink.policy.gate import Refusal
@@ -16,7 +18,11 @@ MOST_CARDS: Final = 4
 PathKey = tuple[str, int]
 """Peer and number of a path."""
 _WORDS: Final = {"security": "attack", "fault": "blocked", "warning": "warning"}
+_ORDER: Final = ("attack", "lost", "blocked", "waiting", "warning", "up")
 _SHOWN_REFUSALS: Final = 30
+_ARDUPILOT: Final = 3  # MAV_AUTOPILOT
+_PX4: Final = 12
+_MODES: Final[Mapping[str, Any]] = tomllib.loads((files("uavlinkd.web") / "modes.toml").read_text())
 
 
 def paths_of(status: Status) -> Iterator[tuple[PathKey, tuple[float | None, float | None, float]]]:
@@ -37,8 +43,11 @@ def view(status: Status, past: Sequence[Mapping[str, Any]], peer: str) -> dict[s
     lines, peers = words.problems(status["findings"]), words.peers_of(status)
     states = dict(_states(peers, lines))
     names = [peer] if peer else list(states) if len(states) <= MOST_CARDS else []
+    fleet = status["fleet"]
     facts: dict[str, Any] = {
         "daemon": status["name"],
+        "fleet": "" if fleet is None else titled("fleet", fleet["fleet"]),
+        "word": _overall(status, list(states.values()), lines),
         "headline": [part._asdict() for part in words.headline(status)],
         "problems": [line._asdict() for line in lines if not peer or not line.peers or peer in line.peers],
         "past": [line for line in past if not peer or line["name"] == peer],
@@ -47,16 +56,16 @@ def view(status: Status, past: Sequence[Mapping[str, Any]], peer: str) -> dict[s
     }
     if peer:
         return facts
-    relay, fleet = status["relay"], status["fleet"]
+    relay = status["relay"]
     return facts | {
-        "rows": [] if names else [row(name, peers[name], word) for name, word in states.items()],
-        "members": [] if relay is None else [_member(*item) for item in relay["members"].items()],
+        "rows": [] if names else [top(name, peers[name], word) for name, word in states.items()],
+        "members": {} if relay is None else relay["members"],
         "endpoints": [_endpoint(*item) for item in status["endpoints"].items()],
         "networks": [_network(*item) for item in status["networks"].items()],
         "lines": [
             *([] if fleet is None else [words.fleet_line(fleet)._asdict()]),
             *(words.used_relay(*item)._asdict() for item in status["relays"].items()),
-            *({"text": text, "is_good": False} for text in words.other_losses(status)),
+            *({"text": text, "is_good": True} for text in words.other_losses(status)),
         ],
     }
 
@@ -74,29 +83,39 @@ def _states(peers: dict[str, Status], lines: Sequence[words.ProblemLine]) -> Ite
             found[name] = _WORDS[severity] if severity else "up"
         else:
             found[name] = peer["state"]
-    order = ("attack", "lost", "waiting", "blocked", "warning", "up")
-    yield from sorted(found.items(), key=lambda item: (order.index(item[1]), item[0]))
+    yield from sorted(found.items(), key=lambda item: (_ORDER.index(item[1]), item[0]))
 
 
-def row(name: str, peer: Status, word: str) -> list[Any]:
-    """A peer in the table."""
-    return [name, word, *_figures(peer), peer["path"], len(peer["paths"])]
+def _overall(status: Status, states: Sequence[str], lines: Sequence[words.ProblemLine]) -> str:
+    """The word for the whole daemon. Members that never came do not count while frames pass."""
+    if any(line.severity == "security" for line in lines):
+        return "attack"
+    if status["frames_pass"]:
+        return "warning" if lines else "up"
+    worst = states[0] if states else "waiting"
+    return "blocked" if worst in ("up", "warning") else worst
 
 
-def _figures(peer: Status) -> list[float | None]:
-    silent_s, time_s, is_up = peer["last_received_s"], peer["round_trip_s"], peer["state"] == "up"
-    return [
-        None if silent_s is None else round(silent_s, 1),
-        round(time_s, 4) if is_up and time_s is not None else None,
-        round(max(peer["loss_in"], peer["loss_out"]), 3) if is_up else None,
-        round(peer["bytes_in_s"]),
-        round(peer["bytes_out_s"]),
-    ]
+def top(name: str, peer: Status, word: str) -> dict[str, Any]:
+    """What a row of the table shows, and the top of a card: also of a peer with few facts."""
+    time_s, is_up, paths = peer["round_trip_s"], peer["state"] == "up", peer["paths"]
+    return {
+        "name": name,
+        "word": word,
+        **{key: peer[key] for key in ("role", "commands", "last_received_s", "freshness_unverified_s")},
+        "is_up": is_up,
+        "vehicles": [vehicle | {"mode": mode_name(vehicle)} for vehicle in peer["vehicles"]],
+        "answered_s": min((path["answered_s"] for path in paths if path["answered_s"] is not None), default=None),
+        "path": _kind(paths[0]) if paths else None,
+        "round_trip_s": round(time_s, 4) if is_up and time_s is not None else None,
+        "loss": round(max(peer["loss_in"], peer["loss_out"]), 3) if is_up else None,
+        "rates": [round(peer["bytes_in_s"]), round(peer["bytes_out_s"])],
+    }
 
 
 def card(name: str, peer: Status, word: str) -> dict[str, Any]:
     """Everything about one peer. The daemon was perhaps asked for a few facts only."""
-    facts: dict[str, Any] = {"name": name, "word": word, "figures": _figures(peer)}
+    facts = top(name, peer, word)
     if "session" not in peer:
         return facts | {"paths": [], "facts": [], "refused": [], "dropped": [], "reported": []}
     session = peer["session"] or {}
@@ -120,13 +139,32 @@ def card(name: str, peer: Status, word: str) -> dict[str, Any]:
     }
 
 
+def mode_name(vehicle: Mapping[str, int]) -> str:
+    """The flight mode as ground stations name it; the number of one that the table does not have."""
+    number, family = vehicle["custom_mode"], _MODES["types"]
+    names: list[str] = []
+    if vehicle["autopilot"] == _ARDUPILOT:
+        kind = next((kind for kind, types in family.items() if vehicle["type"] in types), "")
+        names, at = _MODES["ardupilot"].get(kind, []), number
+    elif vehicle["autopilot"] == _PX4:
+        names, at = _MODES["px4"]["main"], number >> 16 & 0xFF
+        if names.index("AUTO") == at and 0 < number >> 24 < len(_MODES["px4"]["auto"]):
+            names, at = _MODES["px4"]["auto"], number >> 24
+    return (names[at] if names and at < len(names) else "") or f"mode {number}"
+
+
+def _kind(path: Status) -> str:
+    """What the path leads along: a network, a relay, or neither."""
+    relay = "" if path["relay"] is None else titled("relay", path["relay"])
+    return " by ".join(filter(None, (path["network"], relay))) or "direct"
+
+
 def _path(path: Status, address: str, *, is_up: bool) -> dict[str, Any]:
     is_measured = is_up and path["state"] != "down"
     return {
         "number": path["number"],
-        "network": path["network"] or "",
+        "kind": _kind(path),
         "address": address,
-        "way": "direct" if path["relay"] is None else titled("relay", path["relay"]),
         "condition": words.condition(path) if is_up else "unknown",
         "state": words.path_state(path) if is_up else "no link",
         "carries": words.carried(path),
@@ -149,16 +187,6 @@ def _refused(peer: Status) -> Iterator[tuple[str, str, str, int]]:
 def _reported(claim: Mapping[str, Any]) -> str:
     what = " ".join(filter(None, (claim["message"], claim["command"])))
     return f"it refused {what} {claim['count']:,} times: {claim['reason'].replace('_', ' ')}"
-
-
-def _member(name: str, member: Status) -> list[Any]:
-    return [
-        name,
-        "up" if member["is_up"] else "lost",
-        round(member["since_s"]),
-        ", ".join(dict.fromkeys(member["addresses"])),
-        *(member[key] for key in ("bound", "waiting", "datagrams", "over_limit")),
-    ]
 
 
 def _endpoint(name: str, endpoint: Status) -> dict[str, Any]:

@@ -22,6 +22,8 @@ LONGEST_S: Final = 1.5
 PATIENCE_S: Final = 1.2
 SHARE: Final = 0.01
 """Of the time, the daemon may need so much for the answers."""
+MOST_PLOTTED: Final = 48
+"""Paths of which the whole page has plots. The plots of a peer's own page are always there."""
 MOST_DETAILED: Final = 20
 """Of so many peers the daemon is asked for everything. A browser that looks at another one sees its figures alone."""
 SAMPLE_S: Final = 4.0
@@ -147,7 +149,7 @@ class Watcher:
         samples = list(self._samples)[-last:]
         keys = [key for key in dict.fromkeys(key for sample in samples for key in sample) if peer in ("", key[0])]
         lines: dict[str, dict[int, list[Sequence[float | None]]]] = {}
-        for key in keys if peer else keys[: MOST_CARDS * 4]:
+        for key in keys if peer else keys[:MOST_PLOTTED]:
             points = [sample.get(key, (None, None, None)) for sample in samples]
             lines.setdefault(key[0], {})[key[1]] = list(zip(*points, strict=True))
         return lines

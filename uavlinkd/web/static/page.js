@@ -3,26 +3,31 @@
 "use strict";
 
 const LOST_MS = 3000; // without an event, or with one that is so late, nothing on the page counts any more
+const COPIED_MS = 3000; // how long a button says that it copied
+const SILENT_S = 5; // without a heartbeat: autopilots send one each second
+const SAMPLE_S = 4; // between two points of a plot
+const SAMPLES = 150; // of ten minutes
 const SHAPES = {
   up: "M8 1a7 7 0 1 0 .01 0z", // disc
   warning: "M8 1 15.5 14.5H.5z", // triangle
-  blocked: "M1.5 1.5h13v13h-13z", // square
   waiting: "M8 1a7 7 0 1 0 .01 0zM8 4.500a3.500 3.500 0 1 1-.01 0z", // ring
+  blocked: "M1.5 1.5h13v13h-13z", // square
   lost: "M3 .5 8 5.500 13 .5 15.500 3 10.500 8 15.500 13 13 15.500 8 10.500 3 15.500 .5 13 5.500 8 .5 3z", // cross
   attack: "M5 .5h6L15.500 5v6L11 15.500H5L.5 11V5z", // octagon
   unknown: "M8 .5 15.500 8 8 15.500.5 8z", // diamond
 };
-const PEERS = ["peer", "state", "silent", "round trip", "loss", "in", "out", "path", "paths"];
+const SEVERITIES = { security: "attack", fault: "blocked", warning: "warning" };
+const PEERS = ["vehicle", "state", "flight", "battery", "commands pass", "path", "round trip", "loss", "in", "out"];
 const MEMBERS = ["member", "state", "since", "address", "bound", "waiting", "forwarded", "over limit"];
 const TABLES = { peers: { order: [1, 1], columns: PEERS }, members: { order: [1, 1], columns: MEMBERS } };
 const ORDER = Object.keys(SHAPES).reverse();
-const PLOTS = [["round trip", ms], ["loss", percent], ["bytes", rate]];
 
 const peer = location.pathname.startsWith("/peer/") ? decoded(location.pathname.slice(6)) : "";
 const at = (id) => document.getElementById(id);
 let now = null; // the latest event
 let lost = null; // why its facts do not count
 let plotted = {};
+let copied = ""; // what a button copied just now
 let heardAt = performance.now();
 let source = null; // of the events, while the page is visible
 let quickest = Infinity; // difference between this clock and the server's, in the event that travelled fastest
@@ -34,12 +39,12 @@ function decoded(text) {
 // Elements. `attributes` of undefined or false are left out; children are elements, text or null.
 
 function el(tag, attributes, ...children) {
-  const is_svg = ["svg", "path", "polyline", "line"].includes(tag);
+  const is_svg = ["svg", "path", "polyline", "line", "rect"].includes(tag);
   const made = is_svg ? document.createElementNS("http://www.w3.org/2000/svg", tag) : document.createElement(tag);
   for (const [name, value] of Object.entries(attributes || {})) {
     if (value !== undefined && value !== false) made.setAttribute(name, value === true ? "" : value);
   }
-  made.append(...children.flat().filter((child) => child !== null).map((child) => (child.nodeType ? child : String(child))));
+  made.append(...children.flat(2).filter((child) => child !== null).map((child) => (child.nodeType ? child : String(child))));
   return made;
 }
 
@@ -78,107 +83,244 @@ function fill(parent, children) {
 
 function ms(seconds) { return seconds === null ? "-" : `${(1000 * seconds).toFixed(seconds < 0.01 ? 1 : 0)}\u00a0ms`; }
 function percent(share) { return share === null ? "-" : `${(100 * share).toFixed(0)}\u00a0%`; }
-function rate(bytes) { return bytes === null ? "-" : bytes < 1000 ? `${Math.round(bytes)}\u00a0B/s` : `${(bytes / 1000).toFixed(1)}\u00a0kB/s`; }
-function age(s) { return s === null ? "never" : s < 100 ? `${s.toFixed(s < 10 ? 1 : 0)}\u00a0s` : s < 6000 ? `${Math.round(s / 60)}\u00a0min` : `${Math.round(s / 3600)}\u00a0h`; }
+function rate(bytes) {
+  if (bytes === null) return "-";
+  return bytes < 1000 ? `${Math.round(bytes)}\u00a0B/s` : `${(bytes / 1000).toFixed(1)}\u00a0kB/s`;
+}
+function age(s) {
+  if (s === null) return "never";
+  if (s < 100) return `${s.toFixed(s < 10 ? 1 : 0)}\u00a0s`;
+  return s < 6000 ? `${Math.round(s / 60)}\u00a0min` : `${Math.round(s / 3600)}\u00a0h`;
+}
+function charge(whole) { return whole === null ? "-" : `${whole}\u00a0%`; }
 function count(number) { return number.toLocaleString("en"); }
 function clock(agoS) {
   const then = new Date(Date.now() - 1000 * agoS), isToday = then.toDateString() === new Date().toDateString();
   return isToday ? then.toLocaleTimeString() : then.toLocaleString();
 }
 
-function state(word) {
+function state(word, text = word) {
   const shown = lost === null ? word : "unknown";
   const shape = el("svg", { viewBox: "0 0 16 16", "aria-hidden": "true" }, el("path", { d: SHAPES[shown], "fill-rule": "evenodd" }));
-  return el("span", { class: `state ${shown}` }, shape, shown);
+  return el("span", { class: `state ${shown}` }, shape, lost === null ? text : shown);
 }
 
-// Plots: the last ten minutes, a gap where nothing is known.
+// Plots: the last ten minutes. Nothing is drawn where nothing is known; an outage is a band.
 
-function plot([name, format], values, index) {
-  const known = values.filter((value) => value !== null);
-  const most = Math.max(...known, index === 1 ? 0.05 : 1e-9);
-  const last = values.length ? values[values.length - 1] : null;
-  const runs = [[]];
+function runs(values, wanted) {
+  const found = [];
   values.forEach((value, i) => {
-    if (value === null) runs.push([]);
-    else runs[runs.length - 1].push(`${(150 - values.length + i).toFixed(0)},${(38 - (36 * value) / most).toFixed(1)}`);
+    if (!wanted(value, i)) return;
+    const last = found[found.length - 1];
+    if (last && last[1] === i) last[1] = i + 1;
+    else found.push([i, i + 1]);
   });
-  const said = `${name}, last ten minutes: ${format(last)} now, at most ${format(known.length ? most : null)}`;
-  return el("figure", {},
-    el("figcaption", {}, name, " ", el("b", {}, lost === null ? format(last) : "-"), ` of ${format(known.length ? most : null)}`),
-    el("svg", { viewBox: "0 0 150 40", preserveAspectRatio: "none", role: "img", "aria-label": said },
-      el("line", { x1: 0, y1: 38, x2: 150, y2: 38 }),
-      runs.filter((run) => run.length).map((run) => el("polyline", { points: run.length > 1 ? run.join(" ") : `${run[0]} ${run[0]}` }))));
+  return found;
 }
 
-// Parts of the page.
+function plot(name, format, lines, index) {
+  const values = lines[index], known = values.filter((value) => value !== null);
+  const most = Math.max(...known, index === 1 ? 0.05 : 1e-9), left = SAMPLES - values.length;
+  const outages = index === 2 ? [] : runs(values, (_, i) => lines[1][i] === null && lines[2][i] !== null);
+  const downS = SAMPLE_S * outages.reduce((sum, [from, to]) => sum + to - from, 0);
+  const latest = format(values.length ? values[values.length - 1] : null);
+  const down = outages.length ? `; ${outages.length} ${outages.length > 1 ? "outages" : "outage"}, ${age(downS)} together` : "";
+  const at = (value, i) => `${left + i},${(31 - (24 * value) / most).toFixed(1)}`;
+  const line = (points) => el("polyline", { points: points.length > 1 ? points.join(" ") : `${points[0]} ${points[0]}` });
+  return [
+    `${latest} now, at most ${format(known.length ? most : null)}`,
+    el("svg", { viewBox: `0 0 ${SAMPLES} 32`, preserveAspectRatio: "none", role: "img",
+      "aria-label": `${name}, last ten minutes: ${latest} now, at most ${format(known.length ? most : null)}${down}` },
+      [0, 37.5, 75, 112.5, 150].map((x) => el("line", { x1: x, y1: 0, x2: x, y2: 32 })),
+      outages.map(([from, to]) => el("rect", { x: left + from - 0.5, y: 0, width: to - from, height: 32 })),
+      runs(values, (value) => value !== null).map(([from, to]) => line(values.slice(from, to).map((value, i) => at(value, from + i))))),
+  ];
+}
+
+function axis() {
+  return el("div", { class: "axis", "aria-hidden": "true" }, ["10 min ago", "5", "now"].map((text) => el("span", {}, text)));
+}
+
+// The plots of a peer's best path at each moment.
+function together(paths) {
+  const all = Object.values(paths || {});
+  if (!all.length) return null;
+  const length = Math.max(...all.map((lines) => lines[0].length));
+  const least = (kind, i) => {
+    const known = all.map((lines) => lines[kind][lines[kind].length - length + i] ?? null).filter((value) => value !== null);
+    return known.length ? Math.min(...known) : null;
+  };
+  return [0, 1, 2].map((kind) => Array.from({ length }, (_, i) => least(kind, i)));
+}
+
+// Problems: a cause, and what to do about it.
+
+function quoted(text) { // what is between backticks is for a terminal or a file
+  return text.split("`").map((part, i, all) => (i % 2 && i < all.length - 1 ? el("code", {}, part) : part));
+}
+
+function commands(text) { // a name with other signs could be more than it seems to be
+  return text.split("`").filter((part, i, all) => i % 2 && i < all.length - 1 && /^[ -~]+ [ -~]+$/.test(part));
+}
 
 function problems(lines) {
-  return lines.map((line) => el("p", { class: `problem ${line.severity}` },
-    el("strong", {}, line.severity), " ", line.who ? el("b", {}, `${line.who}: `) : null, `${line.text}. Remedy: ${line.remedy}.`));
+  if (!lines.length) return [];
+  const one = (line) => el("li", { class: `problem ${line.severity}` },
+    el("p", { class: "who" }, state(SEVERITIES[line.severity], line.severity), line.who ? el("b", {}, line.who) : null),
+    el("p", { class: "cause" }, quoted(`${line.text}.`)),
+    el("p", { class: "remedy" }, el("b", {}, "Remedy: "), quoted(`${line.remedy}.`)),
+    !navigator.clipboard ? null : commands(line.remedy).map((command) => el("button", { type: "button", class: "copy", "data-copy": command },
+      el("span", {}, copied === command ? "Copied" : "Copy"), el("code", {}, command))));
+  return [el("h2", {}, lines.length > 1 ? `${lines.length} problems` : "1 problem"), el("ul", {}, lines.map(one))];
+}
+
+// Peers.
+
+function link(name) { return el("a", { href: `/peer/${encodeURIComponent(name)}` }, name); }
+
+// What a pilot asks: each answer is a title, a value, what more there is to say, and whether it is good, bad or neither.
+
+function flight({ vehicles: [vehicle, ...others], role, is_up }) {
+  if (vehicle === undefined) return role === "vehicle" && is_up ? ["Vehicle", "no heartbeat", "", ""] : null;
+  const armed = vehicle.is_armed ? "armed" : "disarmed", more = others.length ? ` and ${others.length} more` : "";
+  if (vehicle.heartbeat_s > SILENT_S) return ["Vehicle", `was ${armed}`, `${vehicle.mode}, ${age(vehicle.heartbeat_s)} ago`, ""];
+  return ["Vehicle", armed, vehicle.mode + more, armed];
+}
+
+function battery({ vehicles: [vehicle] }) {
+  const { battery_percent: whole = null, battery_v: volts = null } = vehicle || {};
+  const known = [whole === null ? null : charge(whole), volts === null ? null : `${volts.toFixed(1)}\u00a0V`].filter((part) => part !== null);
+  return known.length ? ["Battery", known[0], known[1] || "", ""] : null;
+}
+
+function commanded(facts) {
+  if (!facts.commands.in && !facts.commands.out) return null;
+  const title = facts.commands.out ? "Commands pass" : "Its commands pass", unanswered = facts.freshness_unverified_s;
+  const why = !facts.is_up ? "the link is down" : facts.word === "blocked" ? "see the problem" : unanswered !== null ? `no answer for ${age(unanswered)}` : "";
+  if (lost !== null) return [title, "unknown", "", ""];
+  return why ? [title, "no", why, "bad"] : [title, "yes", `${age(facts.answered_s ?? facts.last_received_s)} old`, "good"];
+}
+
+function cell([title, value, more, tone]) {
+  return el("div", { class: (lost === null ? tone : "old") || false }, el("dt", {}, title), el("dd", {}, el("b", {}, value), more ? ` ${more}` : null));
+}
+
+function row(facts) {
+  const said = (answer, between) => (answer === null ? "" : answer.slice(1, 3).filter((part) => part).join(between));
+  const flying = facts.last_received_s === null ? "never seen" : said(flight(facts), " ");
+  return [facts.name, facts.word, flying, battery(facts)?.[1] ?? "", said(commanded(facts), ", "), facts.path, facts.round_trip_s, facts.loss, ...facts.rates];
+}
+
+function member([name, is]) {
+  const state = is.is_up ? "up" : "lost", addresses = [...new Set(is.addresses)].join(", ");
+  return [name, state, is.since_s, addresses, is.bound, is.waiting, is.datagrams, is.over_limit];
 }
 
 function card(facts) {
-  const [silent, roundTrip, loss, bytesIn, bytesOut] = facts.figures;
+  const cells = [flight(facts), battery(facts), commanded(facts)].filter((answer) => answer !== null).map(cell);
+  const seen = facts.last_received_s === null ? "never seen here" : `seen ${age(facts.last_received_s)} ago`;
   return el("article", { "data-key": facts.name, class: lost === null ? facts.word : "unknown" },
-    el("h2", {}, el("a", { href: `/peer/${encodeURIComponent(facts.name)}` }, facts.name), " ", state(facts.word)),
-    el("p", { class: "figures" }, `silent ${age(silent)}, round trip ${ms(roundTrip)}, loss ${percent(loss)}, in ${rate(bytesIn)}, out ${rate(bytesOut)}`),
-    el("div", { class: "paths" }, facts.paths.map((path) => onePath(facts.name, path))),
-    facts.dropped.length ? el("p", {}, el("b", {}, "dropped: "), facts.dropped.map(([why, times]) => `${count(times)} ${why}`).join(", ")) : null,
-    facts.refused.length ? el("details", { "data-key": "refused" }, el("summary", {}, "refused by this daemon's policy"), list(facts.refused, ["direction", "message", "why", "times"])) : null,
-    facts.reported.length ? el("details", { "data-key": "reported", open: true }, el("summary", {}, "reported by this peer; a captured one can lie"), el("ul", {}, facts.reported.map((text) => el("li", {}, text)))) : null,
-    el("details", { "data-key": "session" }, el("summary", {}, "session"), el("dl", {}, facts.facts.flatMap(([name, text]) => [el("dt", {}, name), el("dd", {}, text)]))));
+    el("header", {}, el("h2", {}, link(facts.name)), state(facts.word), facts.word === "up" ? null : el("span", { class: "seen" }, seen)),
+    cells.length ? el("dl", { class: "cells" }, cells) : null,
+    facts.paths.length ? paths(facts) : null,
+    facts.facts.length ? details(facts) : null);
+}
+
+function paths(facts) {
+  const titles = ["path", "round trip", "loss", "last ten minutes"];
+  const one = (path) => {
+    const loss = path.loss[0] === null ? null : Math.max(...path.loss);
+    const [, drawing] = plot(`round trip, ${path.kind}`, ms, linesOf(facts.name, path), 0);
+    return el("tr", { "data-key": String(path.number), class: `path ${lost === null ? path.condition : "unknown"}` },
+      el("th", { scope: "row" }, el("b", {}, path.kind), " ", el("small", {}, lost === null ? path.state : "unknown")),
+      el("td", {}, lost === null ? ms(path.rtt) : "-"), el("td", {}, lost === null ? percent(loss) : "-"), el("td", {}, drawing));
+  };
+  const inOrder = [...facts.paths].sort((a, b) => a.number - b.number); // however often the best one changes
+  return el("table", { class: "paths" },
+    el("thead", {}, el("tr", {}, titles.map((title) => el("th", { scope: "col" }, title)))),
+    el("tbody", {}, inOrder.map(one)),
+    el("tfoot", {}, el("tr", {}, el("td", { colspan: 3 }), el("td", {}, axis()))));
+}
+
+function linesOf(name, path) { return (plotted[name] || {})[path.number] || [[], [], []]; }
+
+function details(facts) {
+  const { dropped, refused, reported } = facts;
+  return el("details", { "data-key": "details", open: Boolean(peer) }, el("summary", {}, "Details"),
+    facts.paths.map((path) => onePath(facts.name, path)),
+    dropped.length ? [el("h3", {}, "Dropped"), list(dropped.map(([why, times]) => [count(times), why]), ["times", "why"])] : null,
+    refused.length ? [el("h3", {}, "Refused by this daemon's policy"), list(refused.map((row) => [...row.slice(0, 3), count(row[3])]), ["direction", "message", "why", "times"])] : null,
+    reported.length ? [el("h3", {}, "Reported by this peer; a captured one can lie"), el("ul", {}, reported.map((text) => el("li", {}, text)))] : null,
+    el("h3", {}, "Session"), el("dl", { class: "facts" }, facts.facts.map(([name, text]) => [el("dt", {}, name), el("dd", {}, text)])));
 }
 
 function onePath(name, path) {
-  const lines = (plotted[name] || {})[path.number] || [[], [], []];
   const jitter = path.jitter === null ? "" : ` ± ${ms(path.jitter)}`;
-  return el("div", { "data-key": String(path.number), class: `path ${lost === null ? path.condition : "unknown"}` },
-    el("h3", {}, path.network ? `${path.network} ` : "", el("code", {}, path.address)),
-    el("p", {}, el("b", {}, lost === null ? path.state : "unknown"), `, ${path.way}, carries ${path.carries === "-" ? "nothing" : path.carries}`),
+  const figure = (title, format, index) => {
+    const [said, drawing] = plot(`${title}, ${path.kind}`, format, linesOf(name, path), index);
+    return el("figure", {}, el("figcaption", {}, el("b", {}, title), ` ${said}`), drawing, axis());
+  };
+  return el("section", { "data-key": `path ${path.number}`, class: "one" },
+    el("h3", {}, `${path.kind} `, el("code", {}, path.address)),
+    el("p", {}, `${lost === null ? path.state : "unknown"}, carries ${path.carries === "-" ? "nothing" : path.carries}`),
     el("p", {}, `round trip ${ms(path.rtt)}${jitter}, loss ${percent(path.loss[0])} in, ${percent(path.loss[1])} out, ${rate(path.rate[0])} in, ${rate(path.rate[1])} out`),
-    el("div", { class: "plots" }, PLOTS.map((kind, index) => plot(kind, lines[index], index))));
+    el("div", { class: "plots" }, figure("loss", percent, 1), figure("bytes", rate, 2)));
 }
 
-function list(rows, titles) {
-  return el("table", {}, el("thead", {}, el("tr", {}, titles.map((title) => el("th", { scope: "col" }, title)))),
-    el("tbody", {}, rows.map((row) => el("tr", {}, row.map((cell, index) => el("td", { "data-title": titles[index] }, cell))))));
+// Tables. Roles are written down: a browser forgets those of a table that is shown in another way on a phone.
+
+function list(rows, titles, more = {}) {
+  return el("table", { role: "table", class: "list", ...more },
+    el("thead", { role: "rowgroup" }, el("tr", { role: "row" }, titles.map((title) => el("th", { scope: "col", role: "columnheader" }, title)))),
+    el("tbody", { role: "rowgroup" }, rows.map((row) => el("tr", { role: "row" }, row.map((cell, index) => el("td", { role: "cell", "data-title": titles[index] }, cell))))));
 }
 
 const CELLS = {
-  state, silent: age, since: age, "round trip": ms, loss: percent, in: rate, out: rate,
-  peer: (name) => el("a", { href: `/peer/${encodeURIComponent(name)}` }, name), path: (text) => text || "-",
+  state, since: age, "round trip": ms, loss: percent, in: rate, out: rate, vehicle: link,
 };
 
-function table(id, rows) {
+function table(id) {
+  const rows = id === "peers" ? (now.rows || []).map(row) : Object.entries(now.members || {}).map(member);
   const { order: [column, direction], columns } = TABLES[id];
   const section = at(id), wanted = section.querySelector("input").value.toLowerCase();
   const value = (row) => (columns[column] === "state" ? ORDER.indexOf(row[column]) : row[column]);
   const shown = rows.filter((row) => row.some((cell) => String(cell).toLowerCase().includes(wanted)));
-  const unknown = (row) => value(row) === null; // last, in either direction
-  shown.sort((a, b) => unknown(a) - unknown(b) || direction * (value(a) < value(b) ? -1 : value(a) > value(b) ? 1 : 0));
-  const head = columns.map((title, index) => el("th", { scope: "col", "aria-sort": index !== column ? false : direction > 0 ? "ascending" : "descending" },
+  const unknown = (row) => value(row) === null || value(row) === ""; // last, in either direction
+  const compare = (a, b) => (typeof a === "string" ? a.localeCompare(b, "en", { numeric: true }) : a - b);
+  shown.sort((a, b) => unknown(a) - unknown(b) || direction * compare(value(a), value(b)) || compare(a[0], b[0]));
+  const has = id === "peers" && Object.keys(plotted).length > 0;
+  const sorted = (index) => (index !== column ? false : direction > 0 ? "ascending" : "descending");
+  const head = columns.map((title, index) => el("th", { scope: "col", role: "columnheader", "aria-sort": sorted(index) },
     el("button", { type: "button", "data-column": String(index) }, title)));
-  const body = shown.map((row) => el("tr", { "data-key": row[0] }, row.map((cell, index) => el("td", {}, (CELLS[columns[index]] || ((is) => (is === null ? "-" : is)))(cell)))));
+  const plain = (is) => (is === null || is === "" ? "-" : is);
+  const drawn = (name) => {
+    const lines = together(plotted[name]);
+    return el("td", { role: "cell", class: "drawn" }, lines === null ? "-" : plot(`round trip of ${name}`, ms, lines, 0)[1]);
+  };
+  const body = shown.map((row) => el("tr", { role: "row", "data-key": row[0], class: lost === null ? row[1] : "unknown" },
+    row.map((cell, index) => el("td", { role: "cell", "data-title": columns[index] }, (CELLS[columns[index]] || plain)(cell))),
+    has ? drawn(row[0]) : null));
   section.hidden = !rows.length;
-  morph(section.querySelector("table"), el("table", {}, el("thead", {}, el("tr", {}, head)), el("tbody", {}, body)));
+  morph(section.querySelector("table"), el("table", { role: "table" },
+    el("thead", { role: "rowgroup" }, el("tr", { role: "row" }, head, has ? el("th", { scope: "col", role: "columnheader", class: "drawn" }, "last ten minutes", axis()) : null)),
+    el("tbody", { role: "rowgroup" }, body)));
 }
 
 function rest(facts) {
   const clients = (endpoint) => endpoint.clients.map(([address, silent]) => `${address} (${age(silent)})`).join(", ") || "no client";
+  const panel = (title, ...parts) => el("section", { class: "panel", "data-key": title }, el("h2", {}, title), parts);
   return [
-    facts.endpoints.length ? el("h2", {}, "Local endpoints") : null,
-    facts.endpoints.length ? list(facts.endpoints.map((e) => [e.name, clients(e), count(e.frames[0]), count(e.frames[1]), e.problems || "-"]), ["endpoint", "clients (silent)", "frames in", "frames out", "problems"]) : null,
-    facts.networks.length ? el("h2", {}, "Networks") : null,
-    facts.networks.length ? list(facts.networks.map((n) => [n.name, n.exit, n.is_metered ? "metered" : "-", n.text]), ["network", "exit", "metered", "addresses"]) : null,
-    ...facts.lines.map((line) => el("p", { class: line.is_good ? false : "warning" }, line.text)),
+    facts.endpoints.length ? panel("Local endpoints", list(facts.endpoints.map((e) => [e.name, clients(e), count(e.frames[0]), count(e.frames[1]), e.problems || "-"]), ["endpoint", "clients (silent)", "frames in", "frames out", "problems"])) : null,
+    facts.networks.length ? panel("Networks", list(facts.networks.map((n) => [n.name, n.exit, n.is_metered ? "metered" : "-", n.text]), ["network", "exit", "metered", "addresses"])) : null,
+    facts.lines.length ? panel("This daemon", facts.lines.map((line) => el("p", { class: line.is_good ? false : "warning" }, line.text))) : null,
   ].filter((part) => part !== null);
 }
 
 function past(lines) {
   const newest = [...lines].sort((a, b) => (b.ended_s === null) - (a.ended_s === null) || a.began_s - b.began_s);
-  const rows = newest.map((line) => [clock(line.began_s), line.ended_s === null ? "lasts" : clock(line.ended_s), line.severity, line.name || "-", `${line.text}. Remedy: ${line.remedy}.`]);
-  return newest.length ? [el("h2", {}, "Problems in the log"), list(rows, ["began", "ended", "kind", "of", "what"])] : [];
+  const rows = newest.map((line) => [clock(line.began_s), line.ended_s === null ? "lasts" : clock(line.ended_s), line.severity, line.name || "-", el("span", {}, quoted(`${line.text}. Remedy: ${line.remedy}.`))]);
+  if (!rows.length) return [];
+  return [el("details", { "data-key": "past" }, el("summary", {}, `Problems in the log: ${rows.length}`), list(rows, ["began", "ended", "kind", "of", "what"]))];
 }
 
 function render() {
@@ -191,13 +333,15 @@ function render() {
   const title = peer || now.daemon;
   document.title = `${title} - uavlinkd`;
   at("title").textContent = title;
+  fill(at("state"), peer ? [] : [state(now.word)]);
+  at("fleet").textContent = peer ? now.daemon : now.fleet;
+  at("clock").textContent = lost === null ? `live ${now.seen}` : "";
   const missing = peer && !now.cards.length ? [el("span", { class: "bad" }, `${now.daemon} has no peer of this name`)] : [];
   const said = [...missing, ...now.headline.map((part) => el("span", { class: part.is_good ? "good" : "bad" }, part.text))];
   fill(at("headline"), lost === null ? said : [el("span", { class: "bad" }, `LOST: ${lost}. What is below was true at ${now.seen}.`)]);
   fill(at("problems"), problems(now.problems));
   fill(at("cards"), now.cards.map(card));
-  table("peers", now.rows || []);
-  table("members", now.members || []);
+  for (const id of Object.keys(TABLES)) table(id);
   fill(at("rest"), peer ? [] : rest(now));
   fill(at("past"), past(now.past));
 }
@@ -233,7 +377,7 @@ function listen() {
     for (const [name, paths] of Object.entries(JSON.parse(event.data))) {
       for (const [number, lines] of Object.entries(paths)) {
         const kept = ((plotted[name] ??= {})[number] ??= [[], [], []]);
-        lines.forEach((points, index) => { kept[index] = [...kept[index], ...points].slice(-150); });
+        lines.forEach((points, index) => { kept[index] = [...kept[index], ...points].slice(-SAMPLES); });
       }
     }
   });
@@ -243,7 +387,7 @@ function listen() {
 }
 
 for (const id of Object.keys(TABLES)) {
-  const section = at(id), shown = () => now && table(id, now[id === "peers" ? "rows" : "members"] || []);
+  const section = at(id), shown = () => now && table(id);
   section.addEventListener("input", shown);
   section.addEventListener("click", (event) => {
     const column = Number(event.target.dataset.column), order = TABLES[id].order;
@@ -252,6 +396,15 @@ for (const id of Object.keys(TABLES)) {
     shown();
   });
 }
+at("problems").addEventListener("click", async (event) => {
+  const command = event.target.closest("[data-copy]")?.dataset.copy;
+  if (command === undefined) return;
+  try { await navigator.clipboard.writeText(command); } catch { return; } // the browser's owner forbids it
+  copied = command;
+  at("said").textContent = `Copied: ${command}`;
+  render();
+  setTimeout(() => { copied = at("said").textContent = ""; render(); }, COPIED_MS);
+});
 document.addEventListener("visibilitychange", () => { // a browser has six connections to a server, for all its tabs
   source?.close();
   heardAt = performance.now();
