@@ -16,6 +16,21 @@ import shtab
 from uavlinkd import __version__, cli
 from uavlinkd.system.terminal import CommandError
 
+LIST = "uavlinkd fleet list 2>/dev/null | tail -n +3 | cut -d ' ' -f 1"
+MEMBERS = {
+    "bash": "_uavlinkd_members",
+    "zsh": "_uavlinkd_members",
+    "fish": "(_uavlinkd_members)",
+    "preamble": {
+        "bash": f'_uavlinkd_members() {{ compgen -W "$({LIST})" -- "$1"; }}',
+        "zsh": f'_uavlinkd_members() {{ compadd -- ${{(f)"$({LIST})"}} }}',
+        "fish": f"function _uavlinkd_members; {LIST}; end",
+    },
+}
+"""How each shell completes a member's name: those of the fleet in the present folder, when Tab is pressed."""
+OF_MEMBERS = ("uavlinkd fleet sign", "uavlinkd fleet remove")
+"""Commands whose NAME is a member's."""
+
 
 def main() -> None:
     """Write all files."""
@@ -25,7 +40,7 @@ def main() -> None:
     zsh = "vendor-completions" if prefix.name == "usr" else "site-functions"
     for parser in parsers():
         name = parser.prog
-        complete_paths(parser)
+        complete_arguments(parser)
         files = {
             f"man/man1/{name}.1.gz": gzip.compress("\n".join(man_page(parser)).encode(), mtime=0),
             f"bash-completion/completions/{name}": shtab.complete(parser, "bash").encode(),
@@ -61,14 +76,16 @@ def subparsers(parser: argparse.ArgumentParser) -> Iterator[argparse._SubParsers
     yield from (action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
 
 
-def complete_paths(parser: argparse.ArgumentParser) -> None:
-    """Complete files and folders where an argument is a path."""
+def complete_arguments(parser: argparse.ArgumentParser) -> None:
+    """Complete files and folders where an argument is a path, and names of members."""
     for action in parser._actions:
+        if action.metavar == "NAME" and parser.prog in OF_MEMBERS:
+            action.complete = MEMBERS  # type: ignore[attr-defined]
         if action.type is Path:
             action.complete = shtab.DIRECTORY if action.metavar == "DIR" else shtab.FILE  # type: ignore[attr-defined]
     for commands in subparsers(parser):
         for command in commands.choices.values():
-            complete_paths(command)
+            complete_arguments(command)
 
 
 # Man pages.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 import sys
@@ -33,6 +34,22 @@ def share(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "share"
 
 
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A working folder with a file and a fleet."""
+    folder = tmp_path_factory.mktemp("place")
+    (folder / "LICENSE").touch()
+    enroll = "uavlinkd enroll drone1 | uavlinkd fleet sign --role operator --address 127.0.0.1:5790"
+    command = f"uavlinkd fleet init --no-passphrase && {enroll}"
+    subprocess.run(["sh", "-c", command], check=True, cwd=folder, env=environ(), capture_output=True)
+    return folder
+
+
+def environ() -> dict[str, str]:
+    """With the command, which the shells ask for names."""
+    return {**os.environ, "PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])}
+
+
 LINES = pytest.mark.parametrize(
     ("line", "completed"),
     [
@@ -41,27 +58,29 @@ LINES = pytest.mark.parametrize(
         ("uavlinkd fleet pub", "publish"),
         ("uavlinkd evaluate ti", "timing"),
         ("uavlinkd check --config LIC", "LICENSE"),
+        ("uavlinkd fleet remove dr", "drone1"),
+        ("uavlinkd fleet sign --replace dr", "drone1"),
         ("uavlink-mitm --li", "--list"),
     ],
 )
 
 
 @LINES
-def test_bash_completes(line: str, completed: str, share: Path) -> None:
-    """Commands, options, choices and files."""
+def test_bash_completes(line: str, completed: str, share: Path, place: Path) -> None:
+    """Commands, options, choices, files and members."""
     script = share / "bash-completion/completions" / line.split(maxsplit=1)[0]
-    command: list[str | Path] = ["bash", "-c", PRESS_TAB, "bash", script, ROOT, *line.split()]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    command: list[str | Path] = ["bash", "-c", PRESS_TAB, "bash", script, place, *line.split()]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environ())
     assert (done.stdout.strip(), done.stderr) == (completed, "")
 
 
 @LINES
-def test_fish_completes(line: str, completed: str, share: Path) -> None:
+def test_fish_completes(line: str, completed: str, share: Path, place: Path) -> None:
     """The same. It adds a description to each."""
     need(shutil.which("fish") is not None, "fish")
     script = share / "fish/vendor_completions.d" / f"{line.split(maxsplit=1)[0]}.fish"
     command = ["fish", "--no-config", "--command", f"source {script}; complete --do-complete '{line}'"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT)
+    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=place, env=environ())
     assert (done.stdout.split()[0], done.stderr) == (completed, "")
 
 
