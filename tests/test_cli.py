@@ -141,11 +141,29 @@ def test_a_misspelt_word_is_named(words: str, wrong: str, meant: str, capsys: py
     assert f"there is no '{wrong}': did you mean '{meant}'?" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("words", "shown"),
+    [
+        ([], "run the daemon"),
+        (["fleet"], "revoke a member"),
+        (["run", "x.toml"], "write `uavlinkd run --config x.toml`"),
+    ],
+)
+def test_an_incomplete_command_line_shows_what_to_write(
+    words: list[str], shown: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The commands, or the option before a file."""
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == WRONG
+    assert shown in capsys.readouterr().err
+
+
 def test_an_unknown_argument_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     """With the usage of the command itself."""
     with pytest.raises(SystemExit):
         main(["fleet", "list", "v7"])
-    assert re.search("^usage: uavlinkd fleet list .*there is no 'v7' here", capsys.readouterr().err, re.DOTALL)
+    assert re.search("^usage: uavlinkd fleet list .*unknown argument 'v7'", capsys.readouterr().err, re.DOTALL)
 
 
 def test_help_shows_commands_and_options(capsys: pytest.CaptureFixture[str]) -> None:

@@ -19,7 +19,7 @@ from typing import Any, Final, NoReturn
 from uavlinkd import __version__
 from uavlinkd.protocol.constants import PROTOCOL_NAME
 from uavlinkd.system.spelling import meant
-from uavlinkd.system.terminal import FAILED, OK, CommandError, UsageError, printable
+from uavlinkd.system.terminal import FAILED, OK, WRONG, CommandError, UsageError, printable
 
 _LINE_LIMIT = 4096
 COMMANDS: Final = {
@@ -153,11 +153,14 @@ class CommandParser(argparse.ArgumentParser):
         self.words = [] if args is None else list(args)
         namespace, unknown = super().parse_known_args(args, namespace)
         if unknown:
-            self.error(f"there is no {unknown[0]!r} here")
+            self.error(f"unknown argument {unknown[0]!r}")
         return namespace, unknown
 
     def error(self, message: str) -> NoReturn:
-        """End the process. The message has the right spelling of a command or option."""
+        """End the process. The message has the right spelling of a command or option, or where a file belongs."""
+        if not self.words:
+            self.print_help(sys.stderr)
+            raise SystemExit(WRONG)
         options = re.findall(r"--[\w-]+", self.format_usage())
         wrong = {word.partition("=")[0]: options for word in self.words if word.startswith("--")}
         if match := re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message):
@@ -166,6 +169,8 @@ class CommandParser(argparse.ArgumentParser):
             is_short = any(word.startswith(written) for word in known)
             if not is_short and (likely := meant(written, known)):
                 message = f"there is no {written!r}: did you mean {likely!r}?"
+        if message.endswith("required: --config") and not self.words[0].startswith("-"):
+            message = f"write `{self.prog} --config {self.words[0]}`"
         super().error(message)
 
 

@@ -75,7 +75,7 @@ _CHANGE_ROWS = [
     (URL, "udpout:127.0.0.1:5790", "endpoint[0].url (autopilot)", "has the port of listen too"),
     ("[[peer]]", "[[peers]]", "peers", "did you mean [[peer]]?"),
     ("swarm-member", "pilot", "peer[0].role (drone1)", "the roles are vehicle, "),
-    ("system_ids", "#", "peer[0].system_ids (drone1)", "which systems"),
+    ("system_ids", "#", "peer[0].system_ids (drone1)", "the systems that the peer may send as"),
     (KEY["drone1"], "A" * 40, "peer[0].public_key (drone1)", "is not a key: "),
     ("public_key", "#", "peer[0].public_key (drone1)", "what `uavlinkd pubkey` prints there"),
     ("10.13.0.2", "0.0.0.0", "peer[0].addresses[0] (drone1)", "every address of this machine"),
@@ -364,7 +364,7 @@ def test_remedy_for_a_missing_key_fits_its_kind(tmp_path: Path) -> None:
     private, psk = problems({})
     assert f"make it with `uavlinkd keygen --out {tmp_path}/drone0.key`" in private
     assert "copy it from the peer, or make it on one of the two with `uavlinkd psk --out" in psk
-    assert "name it with --keys at `uavlinkd check`" in private
+    assert "a service's keys with `uavlinkd check --keys DIR`" in private
     for problem in problems({"CREDENTIALS_DIRECTORY": str(tmp_path / "credentials")}):
         assert re.search("LoadCredential=.*next start", problem)
         assert not re.search("keygen|uavlinkd psk", problem)

@@ -22,7 +22,7 @@ from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import Gate, Refusal
 from uavlinkd.mavlink.policy.roles import ROLES
 from uavlinkd.ops import CHECK_SCHEMA
-from uavlinkd.ops.check import judge, report, table_rows
+from uavlinkd.ops.check import judge, report
 from uavlinkd.system.terminal import FAILED, OK, WRONG
 
 _PUBLIC = [keys.public_key_text(keys.generate_private_key()) for _ in range(2)]
@@ -88,8 +88,8 @@ def test_fleet_is_shown_for_a_review(tmp_path: Path) -> None:
         r"certificate +v7: vehicle, system id 7, serial 7",
         r"contact gs +operator, at gs\.example\.org:5790",
         r"contact r1 +relay, used as a relay, at r1\.example\.org:5790",
-        r"connects to +contacts, and members of the role operator",
-        r"members: vehicle +swarm-member, system ids of their certificates",
+        r"members: operator +operator, systems of their certificates; this daemon connects to them",
+        r"members: vehicle +swarm-member, systems of their certificates; they connect",
     ):
         assert re.search(rf"^{line}$", _printed(config), re.MULTILINE), line
     assert "\nPolicy of members: observer\n" in _printed(config, is_verbose=True)
@@ -225,6 +225,6 @@ def test_table_agrees_with_the_gates(case: str) -> None:
     """Read back, it allows what the gates allow."""
     data = {"system_ids": [1], **_POLICIES[case]}
     policy = Policy(data)
-    rows = [row for row in table_rows(policy, data) if row.subject in dialect.GROUPS]
+    rows = [row for row in policy.describe() if row.subject in dialect.GROUPS]
     assert _read({row.subject: row.incoming for row in rows}) == _passing(policy.incoming)
     assert _read({row.subject: row.outgoing for row in rows}) == _passing(policy.outgoing)

@@ -147,8 +147,9 @@ _KNOWN: dict[str, str] = {
         'is not known here: a [[peer]] has a list, addresses = ["10.13.0.2:5790"], and an [[endpoint]] has a url',
     ),
     "allowed_ips": "is not known here: write role and system_ids, which say what the peer may do",
+    **dict.fromkeys(("attack", "radio"), "is of the man in the middle: `uavlink-mitm --config` reads such a file"),
 }
-"""The remedies for keys that people write from WireGuard's files."""
+"""The remedies for keys of WireGuard's files, and of the man in the middle's."""
 
 
 def unknown_key(key: str, kind: str) -> str:

@@ -168,8 +168,7 @@ def read_private_file(path: Path, limit: int, *, credential: bool = False) -> by
     except FileNotFoundError:
         raise KeyFileError(f"{path}: no such file") from None
     except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not a file name"
-        raise KeyFileError(f"{path}: cannot be opened: {reason}") from None
+        raise KeyFileError(f"{path}: cannot be opened: {reason_of(error)}") from None
     try:
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode):
@@ -181,6 +180,13 @@ def read_private_file(path: Path, limit: int, *, credential: bool = False) -> by
         raise KeyFileError(f"{path}: cannot be read: {error.strerror}") from None
     finally:
         os.close(descriptor)
+
+
+def reason_of(error: OSError | ValueError) -> str:
+    """Why a file cannot be opened, with the remedy if another user can. ValueError: a name with a zero byte."""
+    if isinstance(error, PermissionError):
+        return f"{error.strerror}: run this command as the file's owner, or with sudo"
+    return str(error.strerror) if isinstance(error, OSError) else "not a file name"
 
 
 def _check_access(path: Path, status: os.stat_result, allowed: int) -> None:

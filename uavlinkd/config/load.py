@@ -19,7 +19,7 @@ from uavlinkd.config import checks
 from uavlinkd.config.advice import advice
 from uavlinkd.config.build import build
 from uavlinkd.config.file import File, example_of
-from uavlinkd.config.keys import CREDENTIALS, KeyFileError, find_secret_file, read_secret_file
+from uavlinkd.config.keys import CREDENTIALS, KeyFileError, find_secret_file, read_secret_file, reason_of
 from uavlinkd.config.model import Config, ConfigError, Problem
 from uavlinkd.config.schema import TOP
 from uavlinkd.config.section import Values, read
@@ -94,8 +94,7 @@ def read_toml(path: Path) -> dict[str, Any]:
         with path.open("rb") as file:
             content = file.read(_MAX_FILE_BYTES + 1)
     except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not a file name"
-        raise ConfigError((Problem(str(path), "", f"cannot be read: {reason}"),)) from None
+        raise ConfigError((Problem(str(path), "", f"cannot be read: {reason_of(error)}"),)) from None
     if len(content) > _MAX_FILE_BYTES:
         raise ConfigError((Problem(str(path), "", "is over a megabyte: name a configuration file"),))
     try:
@@ -162,4 +161,4 @@ def _how_to_get(key: str, path: Path) -> str:
     if key == "psk_file":
         return f"copy it from the peer, or make it on one of the two with `uavlinkd psk --out {where}`"
     remedy = f"make it with `uavlinkd keygen --out {where}`"
-    return f"{remedy}; the keys of a service are in a folder: name it with --keys at `uavlinkd check`"
+    return f"{remedy}, or name the folder of a service's keys with `uavlinkd check --keys DIR`"

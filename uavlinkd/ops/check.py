@@ -9,7 +9,7 @@ import argparse
 import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
@@ -25,12 +25,10 @@ from uavlinkd.config.model import (
     FleetConfig,
     NetworkConfig,
     PeerConfig,
-    PolicyData,
 )
 from uavlinkd.io.url import SerialUrl
 from uavlinkd.mavlink import dialect
 from uavlinkd.mavlink.policy.compilation import Policy, PolicyRow
-from uavlinkd.mavlink.policy.roles import ROLES
 from uavlinkd.ops import CHECK_SCHEMA
 from uavlinkd.ops.surroundings import look_around
 from uavlinkd.system.terminal import FAILED, OK, WRONG, UsageError, add_json, printable
@@ -42,8 +40,6 @@ Verdict = dict[str, list[str]]
 _LABELS: Final = {"examples": "example", "warnings": "warning", "this_machine": "this machine"}
 _ROOM: Final = 20
 """Rows of a terminal that the facts fill without ``--verbose``: of 24, with what is above and below them."""
-_NOT_IN_TABLES: Final = frozenset({"role", "may speak as", "urgent"})
-"""Rows beside the name; and a group that sets only the order: each of its messages is in another group."""
 
 
 def add_check(parser: argparse.ArgumentParser) -> None:
@@ -110,7 +106,9 @@ def _rows(config: Config, is_verbose: bool) -> Iterator[Row]:
     key = _key if is_verbose else lambda public_key: ""  # without the keys, most rows fit into a line
     yield "name", config.name
     yield "public key", encode_key(config.public_key)  # whole: the user copies it into the files of the peers
-    yield "listens on", _listening(config)
+    where = ", ".join(map(str, config.listen))
+    nowhere = "nothing: it connects to its peers, from any free port"
+    yield "listens on", f"{where} (UDP; answers only senders that know the public key)" if where else nowhere
     for peer in config.peers:
         yield f"peer {peer.name}", _peer(peer, config) + key(peer.settings.public_key)
     yield from map(_endpoint, config.endpoints)
@@ -133,17 +131,6 @@ def _key(public_key: bytes) -> str:
     return f"; public key {'(private?)' if looks_private(public_key) else encode_key(public_key)}"
 
 
-def _listening(config: Config) -> str:
-    if not config.listen:
-        return "nothing: it connects to its peers, from any free port"
-    where = ", ".join(str(address) for address in config.listen)
-    if config.has_ip_networks:
-        where += " of each network"
-    elif all(address.is_loopback for address in config.listen):
-        return f"{where} (UDP, this machine only)"
-    return f"{where} (UDP; answers only senders that know the public key)"
-
-
 def _peer(peer: PeerConfig, config: Config) -> str:
     link = peer.settings.link
     where = ", ".join([*map(str, peer.addresses), *(f"relayed via {name}" for name in peer.relays)])
@@ -151,7 +138,7 @@ def _peer(peer: PeerConfig, config: Config) -> str:
         where = f"it connects, to an address of this machine with port {config.listen[0].port}"
     suites = " ".join(suite.name for suite in link.suites)
     mode = "encrypted" if link.confidential else f"{8 * link.tag_bytes}-bit tag"
-    return f"{where}; {_rights(peer.make_policy())}; {suites}, {mode}{', PSK' if peer.settings.psk else ''}"
+    return f"{where}; {peer.make_policy()}; {suites}, {mode}{', PSK' if peer.settings.psk else ''}"
 
 
 def _endpoint(endpoint: EndpointConfig) -> Row:
@@ -160,16 +147,8 @@ def _endpoint(endpoint: EndpointConfig) -> Row:
         exposure = "THE NETWORK"
     elif isinstance(endpoint.url, SerialUrl):
         exposure = "the wire"
-    gets = {"RADIO_STATUS": endpoint.radio_status, "STATUSTEXT": endpoint.status_text}
-    told = "".join(f"; gets {name}" for name, is_on in gets.items() if is_on)
-    rights = _rights(endpoint.make_policy()) if endpoint.policy else "may send all but SETUP_SIGNING"
-    return f"endpoint {endpoint.name}", f"{endpoint.url}, open to {exposure}; {rights}{told}"
-
-
-def _rights(policy: Policy) -> str:
-    facts = {row.subject: row.incoming for row in policy.describe()}
-    role = "by its lists" if facts["role"] == "none" else facts["role"]
-    return f"{role}, system {facts['may speak as']}"
+    rights = endpoint.make_policy() if endpoint.policy else "may send all but SETUP_SIGNING"
+    return f"endpoint {endpoint.name}", f"{endpoint.url}, open to {exposure}; {rights}"
 
 
 def _fleet(fleet: FleetConfig) -> Iterator[Row]:
@@ -184,11 +163,12 @@ def _fleet(fleet: FleetConfig) -> Iterator[Row]:
     for contact in fleet.contacts:
         what = contact.role.name.lower() + (", used as a relay" if contact.relays else "")
         yield f"contact {contact.name}", f"{what}, at {', '.join(map(str, contact.addresses))}"
-    called = ", ".join(sorted(role.name.lower() for role in fleet.call))
-    yield "connects to", f"contacts{f', and members of the role {called}' if called else ''}"
     for role, limits in fleet.policies.items():
-        may = limits.get("role", "what its lists pass")
-        yield f"members: {role.name.lower()}", f"{may}, system ids of their certificates"
+        calls = "this daemon connects to them" if role in fleet.call else "they connect"
+        yield (
+            f"members: {role.name.lower()}",
+            f"{limits.get('role', 'by its lists')}, systems of their certificates; {calls}",
+        )
 
 
 def _network(network: NetworkConfig) -> Row:
@@ -205,31 +185,12 @@ def _network(network: NetworkConfig) -> Row:
 def _policies(config: Config) -> Iterator[str]:
     """Each policy once, with the names of its peers and endpoints."""
     of_file: list[PeerConfig | EndpointConfig] = [*config.peers, *config.endpoints]
-    senders = [(one.name, one.policy, one.make_policy()) for one in of_file if one.policy]
+    policies = [(one.name, one.make_policy()) for one in of_file if one.policy]
     for role, limits in config.fleet.policies.items() if config.fleet else ():
-        of_role = {**limits, "system_ids": dialect.ALL}
-        senders.append((f"members: {role.name.lower()}", of_role, Policy(of_role)))
+        policies.append((f"members: {role.name.lower()}", Policy({**limits, "system_ids": dialect.ALL})))
     names_of: dict[tuple[PolicyRow, ...], list[str]] = {}
-    for name, data, policy in senders:
-        names_of.setdefault(table_rows(policy, data), []).append(name)
+    for name, policy in policies:
+        names_of.setdefault(tuple(policy.describe()), []).append(name)
     for rows, names in names_of.items():
         yield from ("", f"Policy of {', '.join(names)}")
         yield from (f"{row.subject}: from it {row.incoming}; to it {row.outgoing}" for row in rows)
-
-
-def table_rows(policy: Policy, data: PolicyData) -> tuple[PolicyRow, ...]:
-    """The rows of the policy, whose source is ``data``.
-
-    A message passes in a direction if a row allows its group or its name, and no row refuses a whole group that
-    contains it.
-    """
-    role = ROLES.get(str(data.get("role")))
-    rates = PolicyRow("rates", _rates(data.get("rate_in"), role and role.rate_in), _rates(data.get("rate_out")))
-    return *(row for row in policy.describe() if row.subject not in _NOT_IN_TABLES), rates
-
-
-def _rates(written: object, by_role: object = None) -> str:
-    """The rates of the file, then those of the role for what the file does not name."""
-    rates = [part for part in (written, by_role) if isinstance(part, Mapping)]
-    texts = [", ".join(f"{name} {rate:g}/s" for name, rate in part.items()) for part in rates]
-    return "; else ".join(filter(None, texts)) or "-"

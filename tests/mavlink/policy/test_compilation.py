@@ -123,7 +123,9 @@ def test_table_describes_the_gate() -> None:
     assert rows["messages unknown to the dialect"] == ("refused", "passes")
     assert rows["MAVLink 1"] == ("refused", "refused")
     assert rows["ground station's HEARTBEAT"] == ("refused", "passes")
-    assert rows["may speak as"][0] == "1, 5-9"
+    files = sorted(dialect.GROUPS["files"], key=dialect.IDS.__getitem__)
+    assert rows["rates"] == ("MISSION_CLEAR_ALL 0/s", f"{', '.join(files)} 0/s")
+    assert str(made) == "by its lists, system 1, 5-9"
 
 
 def test_the_lowest_rate_of_two_groups_counts() -> None:

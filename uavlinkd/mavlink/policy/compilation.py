@@ -55,23 +55,31 @@ class Policy:
         # Sentences for the operator, the most severe first.
         self.warnings = tuple(_warnings(settings))
 
+    def __str__(self) -> str:
+        """The role and the systems, for a line of text."""
+        settings = self._settings
+        systems = settings.systems_text if settings.systems is None else f"system {settings.systems_text}"
+        return f"{settings.role or 'by its lists'}, {systems}"
+
     def describe(self) -> list[PolicyRow]:
-        """The policy as a table: each group of messages, and the other rules."""
+        """The policy as a table: each group of messages, and the other rules.
+
+        A message passes in a direction if a row allows its group or its name, and no row refuses a whole group that
+        contains it. The group `urgent` sets only the order: each of its messages is in another group.
+        """
         settings = self._settings
         gates, rules = (self.incoming, self.outgoing), settings.rules.values()
-        role = settings.role or "none"
         mavlink1 = _passes(settings.mavlink1)
         unknown = (_passes(side.allows_all) for side in rules)
-        groups = dialect.GROUPS.items()
+        groups = [(name, members) for name, members in dialect.GROUPS.items() if name != "urgent"]
         return [
-            PolicyRow("role", role, role),
-            PolicyRow("may speak as", settings.systems_text, "-"),
             *(PolicyRow(name, *(_group_text(gate, members) for gate in gates)) for name, members in groups),
             PolicyRow("commands by number", *map(_commands_text, rules)),
             PolicyRow("messages by number", *map(_numbers_text, rules)),
             PolicyRow("messages unknown to the dialect", *unknown),
             PolicyRow("MAVLink 1", mavlink1, mavlink1),
             PolicyRow("ground station's HEARTBEAT", _passes(settings.ground_station), "passes"),
+            PolicyRow("rates", *map(_rates_text, settings.rates.values())),
         ]
 
 
@@ -115,3 +123,10 @@ def _commands_text(rules: Rules) -> str:
 
 def _numbers_text(rules: Rules) -> str:
     return ", ".join(map(str, sorted(rules.allowed_numbers))) or "-"
+
+
+def _rates_text(rates: Mapping[int, float]) -> str:
+    by_rate: dict[float, list[str]] = {}
+    for msgid, rate in sorted(rates.items()):
+        by_rate.setdefault(rate, []).append(dialect.name_of(msgid))
+    return "; ".join(f"{', '.join(names)} {rate:g}/s" for rate, names in by_rate.items()) or "-"

@@ -232,7 +232,7 @@ def _systems(data: Mapping[str, object], report: Report, *, is_needed: bool) -> 
     value = data.get("system_ids")
     if value is None:
         if is_needed:
-            report("system_ids", "missing: which systems may it send as?", remedy)
+            report("system_ids", "missing: it names the systems that the peer may send as", remedy)
         return None, "any system"
     if value in (dialect.ALL, [dialect.ALL]):
         return None, "any system"
