@@ -44,6 +44,10 @@ COMMANDS: Final = {
         "make this machine a member of a fleet, with one line each way",
         "uavlinkd.fleet.commands:add_enroll",
     ),
+    "station": (
+        "add a ground station that has the WireGuard app and nothing of uavlinkd",
+        "uavlinkd.stations.commands:add_arguments",
+    ),
     "help": ("show the commands, or with COMMAND the options of one", ""),
     "sim": ("fly a simulated autopilot", "uavlinkd.lab.commands:add_arguments"),
     "demo": ("run two daemons on this machine that exchange frames", "uavlinkd.lab.commands:add_arguments"),

@@ -94,7 +94,7 @@ _ONE_ADDRESS = "is not one address of this machine"
 _FILE_ROWS = [
     (GOOD + "[[link]]\ntag_bits = 96\n", "link", "write [link]"),
     (f"peer = [1]\n{HEAD}{ENDPOINT}", "peer", "[[peer]]"),
-    (link('role = "vehicle"'), "link.role", "write it in [[endpoint]] or [[peer]] or [[fleet_role]]"),
+    (link('role = "vehicle"'), "link.role", "write it in [[endpoint]] or [[peer]] or [[station]] or [[fleet_role]]"),
     ((GOOD + GCS).replace(URL, "serial:/dev/a:57600"), _URLS, f"is the device of {_SECOND} too"),
     (GOOD + GCS.replace("127.0.0.1", "0.0.0.0"), _URLS, "has the port of endpoint[0].url (autopilot) too"),
     ((GOOD + GCS).replace("udpin", "tcpin"), _URLS, "has the port of endpoint[0].url (autopilot) too"),

@@ -13,6 +13,7 @@ from uavlinkd.config.section import REQUIRED, Choice, Key, Keys, Number, read
 from uavlinkd.mavlink.dialect import GROUPS
 from uavlinkd.mavlink.policy.roles import ROLES
 from uavlinkd.mavlink.policy.settings import read_settings
+from uavlinkd.system.addresses import Address
 
 PAGE = (Path(__file__).parents[2] / "uavlinkd/config/README.md").read_text()
 _ROW = re.compile(r"^\| `(\w+)` \| (.+?) \| (.+?) \| `(.+?)` \| .+ \|$", re.MULTILINE)
@@ -45,7 +46,7 @@ def _default(key: Key) -> object:
     """A key's default as the page writes it."""
     if key.default is REQUIRED:
         return "required"
-    return "off" if key.default is None else key.default
+    return "off" if key.default is None else str(key.default) if isinstance(key.default, Address) else key.default
 
 
 ALL_ROWS = [(title, key, *row) for title in _TITLES for key, row in _rows(title).items()]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from dataclasses import replace
+from ipaddress import ip_network
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
@@ -23,9 +24,11 @@ from uavlinkd.config.model import (
     PolicyData,
     RelayConfig,
     RelayServer,
+    StationsConfig,
 )
 from uavlinkd.config.schema import LINK, POLICY
 from uavlinkd.config.section import Values
+from uavlinkd.io.url import StationUrl
 from uavlinkd.mavlink.egress.peer_egress import EgressSettings
 from uavlinkd.mavlink.policy.settings import PolicyError, read_settings
 from uavlinkd.protocol import constants as c
@@ -73,7 +76,7 @@ def build(file: File, states: Path) -> Config:
         private_key=private,
         public_key=file.own_key,
         listen=tuple(top.get("listen")),
-        endpoints=tuple(_endpoint(endpoint) for endpoint in file["endpoint"]),
+        endpoints=(*map(_endpoint, file["endpoint"]), *map(_station, file["station"])),
         peers=(*(_peer(file, peer) for peer in file["peer"]), *(_contact_peers(file, fleet) if fleet else ())),
         relays_frames=file.one("routing").get("relay"),
         control_socket=file.folder / socket if socket else None,
@@ -82,7 +85,23 @@ def build(file: File, states: Path) -> Config:
         relay_server=_relay_server(file) if file.is_relay else None,
         relays=tuple(_relay(file, relay, fleet) for relay in file.used_relays),
         fleet=fleet,
+        stations=_stations(file, states) if file["station"] else None,
     )
+
+
+def _stations(file: File, states: Path) -> StationsConfig:
+    keys = file.one("stations")
+    return StationsConfig(
+        listen=keys.get("listen"),
+        private_key=keys.get("private_key_file"),
+        address=str(ip_network(keys.get("network"))[1]),
+        state_file=states / f"{file.top.get('name')}.stations-state",
+    )
+
+
+def _station(section: Values) -> EndpointConfig:
+    url = StationUrl(section.get("address"), tuple(section.get("ports")), section.get("public_key"))
+    return EndpointConfig(section.get("name"), url, policy_data(section))
 
 
 def _fleet(file: File, states: Path) -> FleetConfig:

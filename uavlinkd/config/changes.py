@@ -24,6 +24,7 @@ _FIXED: Final[dict[str, Callable[[Config], object]]] = {
     "relay_server.https": lambda config: config.relay_server and config.relay_server.https,
     "fleet.authority": lambda config: config.fleet and (config.fleet.authority, config.fleet.state_file),
     "fleet.certificate": lambda config: config.fleet and config.fleet.own,
+    "stations": lambda config: config.stations,
     "contact": lambda config: config.fleet and config.fleet.contacts,
     "endpoint": lambda config: [replace(endpoint, policy={}) for endpoint in config.endpoints],
 }

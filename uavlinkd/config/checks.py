@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from ipaddress import ip_address, ip_network
 from itertools import combinations
 from typing import Final
 
@@ -23,7 +24,8 @@ from uavlinkd.system.addresses import Address, overlaps
 
 _UNIQUE: Final = (
     *((kind, "name") for kind in ("endpoint", "network", "fleet_role")),
-    *((kind, "public_key") for kind in ("peer", "member", "relay", "contact")),
+    *((kind, "public_key") for kind in ("peer", "member", "relay", "contact", "station")),
+    ("station", "address"),
     *(("network", key) for key in ("interface", "address")),
 )
 _EXITS: Final = ("interface", "address", "serial")
@@ -33,9 +35,10 @@ _MOST_RELAYS: Final = 3  # Relays of one daemon. A peer has room for the paths a
 def check(file: File) -> Found:
     for kind, key in _UNIQUE:
         yield from unique(file[kind], key)
-    for rule in (_keys, _members, _relays, _uses, fleet_rules.check, _networks, _who_initiates, _ports, _devices):
+    of_others = (_keys, _members, _relays, _uses, fleet_rules.check, _networks, _who_initiates)
+    for rule in (*of_others, _ports, _devices, _stations):
         yield from rule(file)
-    for kind in ("endpoint", "peer"):
+    for kind in ("endpoint", "peer", "station"):
         for section in file[kind]:
             yield from policy_problems(section, policy_data(section), is_local=kind == "endpoint")
 
@@ -57,6 +60,8 @@ def _ports(file: File) -> Found:
     """Each port has one listener. Endpoints do not send to this daemon, nor several to one client."""
     ends = [("listen", NetworkUrl(EndpointKind.UDPIN, address)) for address in file.top.get("listen")]
     ends += [(one.at("url"), url) for one in file["endpoint"] if isinstance(url := one.get("url"), NetworkUrl)]
+    if file["station"] and (listen := file.one("stations").get("listen")) is not None:
+        ends.append(("stations.listen", NetworkUrl(EndpointKind.UDPIN, listen)))
     if https := file.one("relay_server").get("https"):
         ends.append(("relay_server.https", NetworkUrl(EndpointKind.TCPIN, https.listen)))
     for (other, one), (place, two) in combinations(ends, 2):
@@ -83,6 +88,42 @@ def _devices(file: File) -> Found:
             other = users.setdefault(os.path.realpath(line.device), section)
             if other is not section:
                 yield section.at(key), f"is the device of {other.at()} too, and only one can open it: write another"
+
+
+def _stations(file: File) -> Found:
+    """Each station has an inner address and system ids of its own, and is one who commands or watches."""
+    stations, keys = file["station"], file.one("stations")
+    if not stations:
+        return
+    yield from unique([*file["endpoint"], *stations], "name")
+    if not file["stations"]:
+        yield "stations", 'is missing: write [stations] with private_key_file = "stations.key"'
+    if (secret := keys.get("private_key_file")) is not None and secret == file.top.get("private_key_file"):
+        text = "is the key of the daemon for other daemons too, and a key is for one protocol: make another one with"
+        yield "stations.private_key_file", f"{text} `uavlinkd keygen`"
+    network = ip_network(keys.get("network")) if "network" not in keys.invalid else None
+    local = {system: one for one in file["endpoint"] for system in _numbers(one)}
+    for station in stations:
+        if network is not None and "address" in station.valid:
+            address = ip_address(station.get("address"))
+            if address not in network or address in (network[0], network[1], network[-1]):
+                first, last = network[2], network[-2]
+                text = f"is not for a station of {network}, or the daemon's own: write one from {first} to {last}"
+                yield station.at("address"), text
+        if station.get("role") == "vehicle":
+            text = "is not the role of a ground station: write operator, or observer for one that only watches"
+            yield station.at("role"), text
+        for system in _numbers(station) & set(local):
+            text = (
+                f"has the system id of {local[system].at()} too: a station could speak as the vehicle; write its own"
+            )
+            yield station.at("system_ids"), f"{text}, such as 255"
+
+
+def _numbers(section: Values) -> set[int]:
+    """The system ids that a section names one by one."""
+    ids = section.get("system_ids")
+    return {one for one in ids if isinstance(one, int)} if isinstance(ids, list) else set()
 
 
 def _keys(file: File) -> Found:

@@ -160,10 +160,10 @@ def unknown_key(key: str, kind: str) -> str:
         return f"does not belong here: write {TITLES[key]}, a section of its own"
     if plain in _KNOWN:
         return _KNOWN[plain]
-    if places := [TITLES[section] for section, others in SECTIONS.items() if key in others]:
-        return f"does not belong here: write it in {' or '.join(places)}"
     if key in TOP:
         return "does not belong here: write it at the top of the file, before the first section"
+    if places := [TITLES[section] for section, others in SECTIONS.items() if key in others]:
+        return f"does not belong here: write it in {' or '.join(places)}"
     known = [*keys, *(() if kind else TITLES)]
     if likely := meant(plain, known, cutoff=0.7):
         return f"is not known: did you mean {TITLES.get(likely, likely)}?"

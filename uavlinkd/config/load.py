@@ -46,7 +46,8 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
     for contact in file["contact"]:
         if (held := contact.get("certificate")) is not None:
             contact.valid["name"] = held.certificate.name
-    for section, key in ((file.top, "private_key_file"), *((peer, "psk_file") for peer in file["peer"])):
+    secrets = ((section, "private_key_file") for section in (file.top, *file["stations"]))
+    for section, key in (*secrets, *((peer, "psk_file") for peer in file["peer"])):
         _read_secret(file, section, key, environ)
     if (private := file.top.get("private_key_file")) is not None:
         file.own_key = x25519_public_key(private.reveal())

@@ -239,6 +239,19 @@ class FleetConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class StationsConfig:
+    """Where stations reach this daemon with WireGuard. Each is an endpoint too.
+
+    ``address``: the daemon's own inside the tunnels. ``state_file``: what must not be forgotten.
+    """
+
+    listen: Address
+    private_key: Secret
+    address: str
+    state_file: Path
+
+
+@dataclass(frozen=True, slots=True)
 class Log:
     """``level``: debug, info, warning or error. ``format``: console, json, or auto (console on a terminal)."""
 
@@ -269,6 +282,7 @@ class Config:
     relay_server: RelayServer | None = None
     relays: tuple[RelayConfig, ...] = ()
     fleet: FleetConfig | None = None
+    stations: StationsConfig | None = None
     warnings: tuple[str, ...] = ()
 
     @property

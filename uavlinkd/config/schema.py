@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from contextlib import suppress
-from ipaddress import IPv6Address, ip_address
+from ipaddress import IPv6Address, ip_address, ip_network
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -153,6 +153,23 @@ def _certificate(data: bytes) -> HeldCertificate:
     return HeldCertificate(parse_certificate(data), data)
 
 
+def _inner_network(value: Any) -> str:
+    with suppress(ValueError):
+        network = ip_network(text(value))
+        if network.is_private and 4 <= network.num_addresses <= 65536:
+            return str(network)
+    raise ValueError(
+        "is not a private network of 4 to 65536 addresses: write one that your stations do not use otherwise, such as"
+        ' "10.66.0.0/24"'
+    )
+
+
+def _inner_address(value: Any) -> str:
+    with suppress(ValueError):
+        return str(ip_address(text(value)))
+    raise ValueError('is not an address inside the tunnels: write one such as "10.66.0.2"')
+
+
 def _seconds(default: float, least: float, most: float) -> Key:
     return Key(Number(least, most), default)
 
@@ -199,6 +216,11 @@ SINGLE: Final[dict[str, Keys]] = {
         "bits_s": Key(_BITS_S, 10**10, "100_000_000"),
         "member_bits_s": Key(_BITS_S, MEMBER_BITS_S, "20_000_000"),
     },
+    "stations": {
+        "private_key_file": Key(_file_name, written='"stations.key"'),
+        "listen": Key(_listening, parse_address("0.0.0.0:51820", allow_names=False), '"0.0.0.0:51820"'),
+        "network": Key(_inner_network, "10.66.0.0/24"),
+    },
     "fleet": {
         "authority": Key(_signed(AuthorityKey, "the public key of an authority"), written=_SIGNED),
         "certificate": _CERTIFICATE,
@@ -234,6 +256,13 @@ REPEATED: Final[dict[str, Keys]] = {
         "relays": Key(each(_name), None, "[]"),
         **POLICY,
         **LINK,
+    },
+    "station": {
+        "name": Key(_name, written='"tablet"'),
+        "public_key": Key(_public_key, written='"…", what `uavlinkd station add` prints'),
+        "address": Key(_inner_address, written='"10.66.0.2"'),
+        "ports": Key(each(integer(1, 65535), least=1), [14550]),
+        **POLICY,
     },
     "member": _WITH_KEY,
     "relay": {**_WITH_KEY, "addresses": Key(each(_peer_address), [], '["relay.example.org:5790"]')},

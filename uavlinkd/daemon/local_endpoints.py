@@ -12,7 +12,7 @@ from uavlinkd.daemon.switch import Switch
 from uavlinkd.io.ports import Endpoint, LocalPort, PortHandler
 from uavlinkd.io.sockets import BindError, udp_socket
 from uavlinkd.io.udp import UdpClient, UdpServer
-from uavlinkd.io.url import EndpointKind, NetworkUrl, SerialUrl
+from uavlinkd.io.url import EndpointKind, NetworkUrl, SerialUrl, StationUrl
 from uavlinkd.mavlink.dialect import IDS, KINDS, UNKNOWN, command_name, name_of
 from uavlinkd.mavlink.frames import SplitCounters, split_payload
 from uavlinkd.mavlink.own_frames import (
@@ -72,6 +72,8 @@ class LocalEndpoints:
         self.policies: dict[str, Policy] = {}
         """By the endpoint's name."""
         self.stall = stall
+        self.open_station: Callable[[EndpointConfig, PortHandler], Endpoint]
+        """Opens the endpoint of a station, if the file has any."""
         self.on_frames: Callable[..., None]
         """Of :class:`uavlinkd.io.ports.PortHandler`: :meth:`.Line.forward`, without a call in between."""
         self._switch = switch
@@ -90,7 +92,8 @@ class LocalEndpoints:
         """
         for config in configs:
             try:
-                self.endpoints.append(open_endpoint(config, self))
+                is_station = isinstance(config.url, StationUrl)
+                self.endpoints.append((self.open_station if is_station else open_endpoint)(config, self))
             except (BindError, OSError) as error:
                 raise BindError(f"endpoint.url ({config.name}): {error}") from None
             self.policies[config.name] = config.make_policy()

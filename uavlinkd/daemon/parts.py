@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from uavlinkd.relay.clients import Relays
     from uavlinkd.relay.service import RelayService
     from uavlinkd.serial.serial_networks import SerialNetworks
+    from uavlinkd.stations.service import Stations
     from uavlinkd.tls.listener import WebListener
     from uavlinkd.tls.relays import WebRelays
 
@@ -87,6 +88,8 @@ class DaemonParts:
         """Where members reach this relay by TLS."""
         self.tls = self._tls()
         """The connections by TLS to relays."""
+        self.stations = self._stations()
+        """Who comes with WireGuard."""
 
     # Features. Each is imported only if it is configured: a daemon on UDP starts faster and stays smaller.
 
@@ -143,6 +146,16 @@ class DaemonParts:
         listener = WebListener(https, self.node, self.stall, self.journal)
         self.path_kinds.append(listener)
         return listener
+
+    def _stations(self) -> Stations | None:
+        if (config := self.config.stations) is None:
+            return None
+        from uavlinkd.stations.service import Stations  # noqa: PLC0415
+
+        stations = Stations(config, self.stall, self.line)
+        self.local.open_station = stations.endpoint
+        self.features.append(stations)
+        return stations
 
     def _tls(self) -> WebRelays | None:
         if not any(written.address.resource for relay in self.config.relays for written in relay.addresses):

@@ -34,6 +34,7 @@ class EndpointKind(StrEnum):
     TCP = "tcp"
     TCPIN = "tcpin"
     SERIAL = "serial"
+    STATION = "station"
 
 
 _LISTENING = frozenset({EndpointKind.UDPIN, EndpointKind.TCPIN})
@@ -76,7 +77,23 @@ class SerialUrl:
     is_exposed: ClassVar = False  # access to a wire needs presence
 
 
-EndpointUrl = NetworkUrl | SerialUrl
+@dataclass(frozen=True, slots=True)
+class StationUrl:
+    """The inner address of a station that speaks WireGuard, the ports of its software, and its key."""
+
+    host: str
+    ports: tuple[int, ...]
+    key: bytes
+
+    def __str__(self) -> str:
+        return f"{self.kind}:{self.host}"
+
+    kind: ClassVar = EndpointKind.STATION
+    listens: ClassVar = True
+    is_exposed: ClassVar = False  # only the holder of the key is there
+
+
+EndpointUrl = NetworkUrl | SerialUrl | StationUrl
 
 _MAX_BAUD = 20_000_000
 _FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT or serial:/dev/DEVICE:BAUD"
@@ -105,6 +122,8 @@ def parse_url(text: str) -> EndpointUrl:
     if scheme not in set(EndpointKind):
         raise UrlError(_foreign(scheme.lower(), rest))
     kind = EndpointKind(scheme)
+    if kind is EndpointKind.STATION:
+        raise UrlError("is that of a station, which is a section of its own: write [[station]]")
     return _serial(rest) if kind is EndpointKind.SERIAL else _network(kind, rest)
 
 

@@ -171,19 +171,22 @@ class EndpointFacts(PartFacts):
         if silent_s < SILENT_S:
             return "", {}
         url, ports = self.config.url, self.endpoint.ports
+        if url.kind is EndpointKind.STATION and not ports:
+            return "station_absent", {}
         failures = self.history.failures.within(SILENT_S, self.now)
         error = next((name for name in failures if name in KERNEL_ERRORS or name == "connect_timeout"), "")
         # A client of `udpin` has sent MAVLink: the bytes are another sender's.
         is_known = url.kind is EndpointKind.UDPIN and bool(ports)
         if not is_known and self.history.garbage.within(SILENT_S, self.now):
             return "garbage", {}
-        if ports and not (url.kind is EndpointKind.UDPOUT and error):
+        sends_first = url.kind in (EndpointKind.UDPOUT, EndpointKind.STATION)
+        if ports and not (sends_first and error):
             return "client_silent", {"clients": listed(port.name for port in ports), "silent_s": silent_s}
         if url.kind is EndpointKind.SERIAL:
             error = next(iter(failures), "")
             meaning = meaning_of(error) or "plug the device in"
             return "device_unavailable", {"error": f" ({error})" if error else "", "meaning": meaning}
-        if url.listens:
+        if url.listens and not ports:
             return "no_client", {"silent_s": silent_s}
         if "not_resolved" in failures or (url.kind is EndpointKind.UDPOUT and not ports):
             why, meaning = "its host has no address now", "write an IP address, or see `getent hosts NAME`"

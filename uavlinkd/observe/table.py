@@ -363,6 +363,19 @@ OF_ENDPOINT: Final = (
         code=3,
     ),
     Row(
+        *("station_unverified", FAULT, traffic_signs.station_unverified),
+        "commands of {who} are dropped, because nothing shows that they are new: its firewall drops pings from"
+        " {address}, or an attacker delays its datagrams. Reports pass",
+        "let it answer them; on Windows, as administrator: netsh advfirewall firewall add rule name=uavlinkd dir=in"
+        " action=allow protocol=icmpv4:8,any remoteip={address}",
+    ),
+    Row(
+        *("station_absent", WARNING, traffic_signs.is_silent_by("station_absent")),
+        "{who} has no session: its tunnel is off, or has another key or address of this daemon",
+        "switch its tunnel on; else `uavlinkd station remove {who}` and `station add {who}` make a new code",
+        Exit.EVERYWHERE,
+    ),
+    Row(
         *("client_unreachable", WARNING, traffic_signs.is_silent_by("client_unreachable")),
         *("{url} cannot be reached: {why}", "{meaning}"),
         Exit.EVERYWHERE,

@@ -17,6 +17,7 @@ from uavlinkd.observe.facts import KERNEL_ERRORS, NOT_LISTENING, SILENT_S, Endpo
 from uavlinkd.observe.signs import SECURITY_S, Signs
 from uavlinkd.ops.log import shown
 from uavlinkd.protocol import constants as c
+from uavlinkd.protocol.drops import DropReason
 from uavlinkd.protocol.peer import Peer
 from uavlinkd.protocol.reports import Claim
 from uavlinkd.system.error_meanings import meaning_of
@@ -215,6 +216,13 @@ def is_silent_by(cause: str) -> Callable[[EndpointFacts], Signs]:
             yield fields
 
     return signs
+
+
+def station_unverified(endpoint: EndpointFacts) -> Signs:
+    """A station answers no questions, and makes no new keys either."""
+    if DropReason.DOUBTFUL in endpoint.history.failures.lasting(endpoint.now):
+        stations = endpoint.daemon.config.stations
+        yield {"address": stations.address if stations else ""}
 
 
 def send_fails(endpoint: EndpointFacts) -> Signs:

@@ -7,10 +7,9 @@ a cookie, and above all for one at an address where a peer is known to be. READM
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple, NoReturn
+from typing import NamedTuple, NoReturn, Protocol
 
 from uavlinkd.protocol import constants as c
-from uavlinkd.protocol.cookie import CookieJar
 from uavlinkd.protocol.drops import Drop, DropReason
 from uavlinkd.protocol.limits import GroupBudget, SourceLimiter, TokenBucket, prefix_of, source_of
 from uavlinkd.protocol.outputs import Transmit
@@ -27,13 +26,23 @@ class CookieRequired(Drop):
         self.reply = reply
 
 
+class Cookies(Protocol):
+    """The cookies of one static key of this daemon, in one protocol."""
+
+    def has_valid_mac2(self, datagram: bytes, path: Path, now: float) -> bool:
+        """Whether the message proves its address by a cookie."""
+
+    def reply(self, datagram: bytes, sender_index: int, path: Path, now: float) -> bytes:
+        """A cookie for the sender of the message."""
+
+
 class Message(NamedTuple):
     """A handshake message that asks for work, and the cookies of the key that it is for."""
 
     datagram: bytes
     sender_index: int
     path: Path
-    cookies: CookieJar
+    cookies: Cookies
 
     def has_cookie(self, now: float) -> bool:
         """Whether it proves its address."""

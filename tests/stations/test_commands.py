@@ -1,0 +1,90 @@
+"""``uavlinkd station add`` and ``remove``: the daemon's file before and after, and what is printed."""
+
+from __future__ import annotations
+
+import base64
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from uavlinkd.cli import main
+from uavlinkd.config import keys
+from uavlinkd.config.load import load_config
+
+CONFIG = """name = "drone1"
+private_key_file = "drone1.key"  # a comment that stays
+
+[[endpoint]]
+name = "autopilot"
+url = "udpin:127.0.0.1:14550"
+system_ids = [1]
+"""
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Path:
+    keys.write_secret_file(tmp_path / "drone1.key", keys.generate_private_key())
+    path = tmp_path / "drone1.toml"
+    path.write_text(CONFIG)
+    return path
+
+
+def test_station_is_added_and_removed(config: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The file keeps its comments; the printed text has a private key that fits the public one in the file."""
+    command = ("station", "add", "tablet", "--config", str(config), "--at", "203.0.113.7")
+    assert main(command) == 0
+    printed = capsys.readouterr().out
+    assert config.read_text().startswith(CONFIG)
+    loaded = load_config(config, {})
+    (station,) = tomllib.loads(config.read_text())["station"]
+    text = printed[printed.index("[Interface]") :]
+    lines = dict(line.split(" = ", 1) for line in text.splitlines() if " = " in line)
+    assert keys.public_key_text(lines["PrivateKey"]) == station["public_key"]
+    assert loaded.stations is not None
+    own = base64.b64encode(loaded.stations.private_key.reveal()).decode()
+    assert lines["PublicKey"] == keys.public_key_text(own)
+    assert (lines["Address"], lines["AllowedIPs"]) == ("10.66.0.2/32", "10.66.0.1/32")
+    assert lines["Endpoint"] == "203.0.113.7:51820"
+    assert lines["PrivateKey"] not in config.read_text()
+    assert main(("station", "add", "second", "--config", str(config), "--at", "h", "--system-id", "254")) == 0
+    assert [one["address"] for one in tomllib.loads(config.read_text())["station"]] == ["10.66.0.2", "10.66.0.3"]
+    for name in ("tablet", "second"):
+        assert main(("station", "remove", name, "--config", str(config))) == 0
+    assert config.read_text() == CONFIG
+    assert sorted(path.name for path in config.parent.iterdir()) == ["drone1.key", "drone1.toml", "stations.key"]
+
+
+def test_key_of_a_tunnel_that_the_app_made(config: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """No private key is made, and none is printed."""
+    public = keys.public_key_text(keys.generate_private_key())
+    assert main(("station", "add", "tablet", "--config", str(config), "--at", "h", "--public-key", public)) == 0
+    assert "that of the tunnel, which the app made" in capsys.readouterr().out
+    assert tomllib.loads(config.read_text())["station"][0]["public_key"] == public
+
+
+@pytest.mark.parametrize(
+    ("more", "says"),
+    [
+        (("--system-id", "1"), "has the system id of endpoint[0] (autopilot) too"),
+        (("--public-key", "short"), "station[0].public_key (tablet)"),
+        (("--public-key", base64.b64encode(bytes(32)).decode()), "point of low order"),
+    ],
+)
+def test_invalid_station_changes_nothing(
+    config: Path, capsys: pytest.CaptureFixture[str], more: tuple[str, ...], says: str
+) -> None:
+    assert main(("station", "add", "tablet", "--config", str(config), "--at", "h", *more)) == 2
+    said = capsys.readouterr().err
+    assert says in said
+    assert f"{config}: " in said
+    assert ".trial" not in said
+    assert config.read_text() == CONFIG
+
+
+def test_names_that_are_taken_or_absent(config: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    add = ("station", "add", "tablet", "--config", str(config), "--at", "h")
+    assert main(add) == 0
+    assert main(add) == 2
+    assert main(("station", "remove", "other", "--config", str(config))) == 2
+    assert "has no station other" in capsys.readouterr().err

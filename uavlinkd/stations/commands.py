@@ -1,0 +1,151 @@
+"""``uavlinkd station add`` and ``remove``: a section of the daemon's file, and what the WireGuard app scans."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import shutil
+import socket
+from collections.abc import Callable
+from contextlib import suppress
+from ipaddress import ip_network
+from pathlib import Path
+from typing import Any, Final
+
+from uavlinkd.config import keys
+from uavlinkd.config.load import load_config, read_toml
+from uavlinkd.config.model import ConfigError
+from uavlinkd.config.schema import SECTIONS
+from uavlinkd.stations.inner import MTU
+from uavlinkd.system.folders import replace_file
+from uavlinkd.system.terminal import OK, CommandError, UsageError
+
+_KEY_FILE: Final = "stations.key"
+_KEEPALIVE_S: Final = 15
+"""Between two packets of an idle station: most NATs keep a mapping for 30 s."""
+_ANYWHERE: Final = "192.0.2.1", 9
+"""An address (RFC 5737) to which nothing is sent: the kernel says from which own address it would be."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Ground stations without uavlinkd: the WireGuard app of a tablet or laptop scans a code, and QGroundControl"
+        " or Mission Planner there finds the vehicle on UDP port 14550."
+    )
+    actions = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+
+    def action(name: str, text: str, command: Callable[[argparse.Namespace], int]) -> argparse.ArgumentParser:
+        added = actions.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+        added.set_defaults(command=command)
+        added.add_argument("name", metavar="NAME")
+        added.add_argument("--config", metavar="FILE", type=Path, required=True, help="the daemon's configuration")
+        added.add_argument("--keys", metavar="DIR", type=Path, help="for a service: the folder of its keys")
+        return added
+
+    add = action("add", "add a station to a daemon's file, and print its code for the WireGuard app", _add)
+    add.add_argument("--at", metavar="HOST", help="where the station reaches this machine (default: its own address)")
+    add.add_argument("--role", choices=("operator", "observer"), default="operator", help="(default: operator)")
+    add.add_argument("--system-id", type=int, default=255, metavar="N", help="of its software (default: 255)")
+    text = "of a tunnel that the app made; without it, the code has a private key that is kept nowhere else"
+    add.add_argument("--public-key", metavar="KEY", help=text)
+    action("remove", "remove a station from a daemon's file", _remove)
+
+
+def _add(options: argparse.Namespace) -> int:
+    path, name = options.config, options.name
+    table = read_toml(path)
+    stations, settings = table.get("station", []), table.get("stations", {})
+    if any(station.get("name") == name for station in stations):
+        raise UsageError(f"{path}: has a station {name} already: `uavlinkd station remove {name}` first")
+    private = None if options.public_key else keys.generate_private_key()
+    public = keys.public_key_text(private) if private else options.public_key
+    network = ip_network(settings.get("network") or SECTIONS["stations"]["network"].default)
+    used = {station.get("address") for station in stations}
+    address = next((str(host) for host in list(network)[2:-1] if str(host) not in used), None)
+    if address is None:
+        raise CommandError(f"{path}: {network} has no address left: write a larger network in [stations]")
+    text = ""
+    key_file = (options.keys or path.absolute().parent) / settings.get("private_key_file", _KEY_FILE)
+    if "stations" not in table:
+        text = f'\n[stations]\nprivate_key_file = "{_KEY_FILE}"\n'
+        if not os.path.lexists(key_file):
+            keys.write_secret_file(key_file, keys.generate_private_key())
+    text += (
+        f'\n[[station]]\nname = "{name}"\npublic_key = "{public}"\naddress = "{address}"\n'
+        f'role = "{options.role}"\nsystem_ids = [{options.system_id}]\n'
+    )
+    config = _replace(path, path.read_text().rstrip("\n") + "\n" + text, options.keys)
+    assert config.stations is not None
+    own = keys.public_key_text(keys.encode_key(config.stations.private_key.reveal()))
+    host, port = options.at or _own_address(), config.stations.listen.port
+    _print_code(name, private, own, (address, config.stations.address), f"{host}:{port}")
+    print(
+        f"Restart the daemon of {path}; UDP port {port} must be open. Compare: the tunnel's peer has the key\n  {own}"
+    )
+    return OK
+
+
+def _print_code(name: str, private: str | None, own: str, inner: tuple[str, str], place: str) -> None:
+    import segno  # noqa: PLC0415  for this command only
+
+    bits = 32 if "." in inner[0] else 128
+    text = (
+        f"[Interface]\nPrivateKey = {private or 'that of the tunnel, which the app made'}\n"
+        f"Address = {inner[0]}/{bits}\nMTU = {MTU}\n\n[Peer]\nPublicKey = {own}\nAllowedIPs = {inner[1]}/{bits}\n"
+        f"Endpoint = {place}\nPersistentKeepalive = {_KEEPALIVE_S}\n"
+    )
+    if private is not None:
+        print(f"Scan this in the WireGuard app ({name}), or save the text as a file. It is shown once.\n")
+        segno.make(text, error="l").terminal(compact=True)
+    print(f"\n{text}")
+
+
+def _remove(options: argparse.Namespace) -> int:
+    path, name = options.config, options.name
+    blocks = re.split(r"^(?=[ \t]*\[)", path.read_text(), flags=re.MULTILINE)
+    if all(station.get("name") != name for station in read_toml(path).get("station", [])):
+        raise UsageError(f"{path}: has no station {name}")
+    kept = [block for block in blocks if not _is_station(block, name)]
+    if not any(block.lstrip().startswith("[[station]]") for block in kept):
+        kept = [block for block in kept if not block.lstrip().startswith("[stations]")]
+    _replace(path, "".join(kept).rstrip("\n") + "\n", options.keys)
+    print(f"Restart the daemon of {path}: then {name} gets no answer any more")
+    return OK
+
+
+def _is_station(block: str, name: str) -> bool:
+    return block.lstrip().startswith("[[station]]") and bool(
+        re.search(rf"""^\s*name\s*=\s*["']{re.escape(name)}["']""", block, re.MULTILINE)
+    )
+
+
+def _replace(path: Path, text: str, folder: Path | None) -> Any:
+    """Replace the file, if the text is a valid one. Returns its configuration. Raises ConfigError."""
+    environ = os.environ if folder is None else {keys.CREDENTIALS: str(folder.absolute())}
+    trial = path.with_name(f".{path.name}.trial")
+    try:
+        trial.write_text(text)
+        config = load_config(trial, environ)
+        shutil.copystat(path, trial)
+        replace_file(path, text.encode())
+        shutil.copystat(trial, path)
+    except ConfigError as error:
+        raise ConfigError(tuple(one._replace(file=str(path)) for one in error.problems)) from None
+    except OSError as error:
+        raise CommandError(f"{path}: cannot be written: {error.strerror}") from None
+    finally:
+        with suppress(OSError):
+            trial.unlink()
+    return config
+
+
+def _own_address() -> str:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(_ANYWHERE)
+        except OSError:
+            raise CommandError(
+                "this machine has no route to a network: write --at HOST, as the station reaches it"
+            ) from None
+        return str(probe.getsockname()[0])

@@ -1,0 +1,161 @@
+"""The packets inside the tunnel: UDP with MAVLink, and echo requests with their answers. Nothing else passes.
+
+IPv4 (RFC 791) and IPv6 (RFC 8200) with UDP (RFC 768), ICMP (RFC 792) or ICMPv6 (RFC 4443). A packet with options,
+extension headers or fragments is refused: stations send none. Every checksum is verified, also of UDP over IPv4 where
+the sender left it out (RFC 768 permits 0, and no known client sends it).
+"""
+
+from __future__ import annotations
+
+from ipaddress import ip_address
+from struct import Struct
+from typing import Final, NamedTuple
+
+MTU: Final = 1280
+"""What the file for a station says: with WireGuard's 60 bytes around it a packet passes where 1,340 bytes pass."""
+TOKEN_BYTES: Final = 16
+"""Random bytes in an echo request of this daemon."""
+_UDP, _ICMP, _ICMP6 = 17, 1, 58
+_ECHO: Final = {4: (8, 0), 6: (128, 129)}
+"""Types of an echo request and its answer, by IP version."""
+_CLOSED: Final = {4: (3, 3), 6: (1, 4)}
+"""Type and code of "port unreachable"."""
+_IPV4: Final = Struct("!BBHHHBBH4s4s")
+_IPV6: Final = Struct("!IHBB16s16s")
+_UDP_HEADER: Final = Struct("!HHHH")
+_HOPS: Final = 64
+_DONT_FRAGMENT: Final = 0x4000
+
+
+class Ends(NamedTuple):
+    """Two inner addresses of one family, as packed bytes: the station's and the daemon's."""
+
+    station: bytes
+    daemon: bytes
+
+    @classmethod
+    def of(cls, station: str, daemon: str) -> Ends:
+        """The ends with these addresses."""
+        return cls(ip_address(station).packed, ip_address(daemon).packed)
+
+    @property
+    def version(self) -> int:
+        """4 or 6."""
+        return 4 if len(self.daemon) == 4 else 6
+
+
+class Closed(NamedTuple):
+    """The station's system says that no software has opened a port there (ICMP "port unreachable")."""
+
+
+class Datagram(NamedTuple):
+    """A UDP datagram from the station."""
+
+    source_port: int
+    port: int
+    payload: bytes
+
+
+class Ping(NamedTuple):
+    """An echo request of the station, with its identifier, sequence number and data; or an answer to one of ours."""
+
+    is_answer: bool
+    content: bytes
+
+    @property
+    def token(self) -> bytes:
+        """The data, behind identifier and sequence number."""
+        return self.content[4:]
+
+
+def parse(packet: bytes, ends: Ends) -> Datagram | Ping | Closed | None:
+    """What a station sent to the daemon. None for anything else, whatever it is. Total."""
+    body = _ipv4_body(packet, ends) if ends.version == 4 else _ipv6_body(packet, ends)
+    if body is None:
+        return None
+    protocol, content = body
+    pseudo = ends.station + ends.daemon
+    if protocol == _UDP:
+        if len(content) < _UDP_HEADER.size:
+            return None
+        source_port, port, length, checksum = _UDP_HEADER.unpack_from(content)
+        if length != len(content) or not checksum or not source_port or _sum(_pseudo(pseudo, _UDP, content)):
+            return None
+        return Datagram(source_port, port, content[_UDP_HEADER.size :])
+    if protocol != (_ICMP if ends.version == 4 else _ICMP6) or len(content) < 8:
+        return None
+    if _sum(content if ends.version == 4 else _pseudo(pseudo, _ICMP6, content)):
+        return None
+    kind = content[0], content[1]
+    if kind == _CLOSED[ends.version]:
+        return Closed()
+    request, answer = _ECHO[ends.version]
+    return Ping(kind[0] == answer, content[4:]) if kind in ((request, 0), (answer, 0)) else None
+
+
+def _ipv4_body(packet: bytes, ends: Ends) -> tuple[int, bytes] | None:
+    if len(packet) < _IPV4.size or packet[0] != 0x45:  # no options
+        return None
+    _, _, length, _, fragment, _, protocol, _, source, destination = _IPV4.unpack_from(packet)
+    if not _IPV4.size <= length <= len(packet) or fragment & ~_DONT_FRAGMENT:
+        return None
+    if (source, destination) != ends or _sum(packet[: _IPV4.size]):
+        return None
+    return protocol, packet[_IPV4.size : length]
+
+
+def _ipv6_body(packet: bytes, ends: Ends) -> tuple[int, bytes] | None:
+    if len(packet) < _IPV6.size or packet[0] >> 4 != 6:
+        return None
+    _, length, protocol, _, source, destination = _IPV6.unpack_from(packet)
+    if _IPV6.size + length > len(packet) or (source, destination) != ends:
+        return None
+    return protocol, packet[_IPV6.size : _IPV6.size + length]
+
+
+def udp(ends: Ends, port: int, to_port: int, payload: bytes) -> bytes:
+    """A packet with a UDP datagram from a port of the daemon to a port of the station."""
+    length = _UDP_HEADER.size + len(payload)
+    content = _UDP_HEADER.pack(port, to_port, length, 0) + payload
+    checksum = _sum(_pseudo(ends.daemon + ends.station, _UDP, content)) or 0xFFFF
+    return _packet(ends, _UDP, content[:6] + checksum.to_bytes(2, "big") + payload)
+
+
+def question(ends: Ends, token: bytes) -> bytes:
+    """A packet with an echo request of the daemon."""
+    return _echo(ends, is_answer=False, content=bytes(4) + token)
+
+
+def answer(ends: Ends, request: Ping) -> bytes:
+    """A packet with the answer to an echo request of the station."""
+    return _echo(ends, is_answer=True, content=request.content)
+
+
+def _echo(ends: Ends, *, is_answer: bool, content: bytes) -> bytes:
+    kind = _ECHO[ends.version][is_answer]
+    protocol = _ICMP if ends.version == 4 else _ICMP6
+    message = bytes([kind, 0, 0, 0]) + content
+    summed = message if protocol == _ICMP else _pseudo(ends.daemon + ends.station, protocol, message)
+    return _packet(ends, protocol, message[:2] + _sum(summed).to_bytes(2, "big") + content)
+
+
+def _packet(ends: Ends, protocol: int, content: bytes) -> bytes:
+    if ends.version == 6:
+        return _IPV6.pack(6 << 28, len(content), protocol, _HOPS, ends.daemon, ends.station) + content
+    length, addresses = _IPV4.size + len(content), (ends.daemon, ends.station)
+    header = _IPV4.pack(0x45, 0, length, 0, _DONT_FRAGMENT, _HOPS, protocol, 0, *addresses)
+    return _IPV4.pack(0x45, 0, length, 0, _DONT_FRAGMENT, _HOPS, protocol, _sum(header), *addresses) + content
+
+
+def _pseudo(addresses: bytes, protocol: int, content: bytes) -> bytes:
+    """The content behind the pseudo header over which UDP and ICMPv6 compute their checksums."""
+    return addresses + len(content).to_bytes(4, "big") + bytes([0, 0, 0, protocol]) + content
+
+
+def _sum(data: bytes) -> int:
+    """The Internet checksum (RFC 1071): 0 over data that has a valid one."""
+    if len(data) % 2:
+        data += b"\0"
+    # The number of all bytes is, modulo 65,535, the sum of its words.
+    total = int.from_bytes(data, "big") % 0xFFFF
+    return 0xFFFF - total if total or not any(data) else 0
