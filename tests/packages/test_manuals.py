@@ -53,7 +53,7 @@ def environ() -> dict[str, str]:
 LINES = pytest.mark.parametrize(
     ("line", "completed"),
     [
-        ("uavlinkd st", "status"),
+        ("uavlinkd statu", "status"),
         ("uavlinkd status --so", "--socket"),
         ("uavlinkd fleet pub", "publish"),
         ("uavlinkd evaluate ti", "timing"),
