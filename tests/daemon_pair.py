@@ -15,7 +15,7 @@ from uavlinkd.protocol.settings import Link, PeerSettings
 from uavlinkd.system.addresses import Address
 
 ANY_PORT: Final = Address("127.0.0.1", 0)
-_PRIVATE: Final = {"left": bytes([1]) * 32, "right": bytes([2]) * 32}
+PRIVATE: Final = {"left": bytes([1]) * 32, "right": bytes([2]) * 32}
 _OTHER: Final = {"left": "right", "right": "left"}
 _RULES: Final[dict[str, dict[str, Any]]] = {
     "left": {"role": "vehicle", "system_ids": [1]},
@@ -30,12 +30,12 @@ def config(name: str, url: NetworkUrl, addresses: tuple[Address, ...] = ()) -> C
     ``addresses``: of the other one, if this one connects.
     """
     other = _OTHER[name]
-    settings = PeerSettings(other, KeyPair(_PRIVATE[other]).public, None, Link())
+    settings = PeerSettings(other, KeyPair(PRIVATE[other]).public, None, Link())
     return Config(
         path=Path(name),
         name=name,
-        private_key=Secret(_PRIVATE[name]),
-        public_key=KeyPair(_PRIVATE[name]).public,
+        private_key=Secret(PRIVATE[name]),
+        public_key=KeyPair(PRIVATE[name]).public,
         listen=(ANY_PORT,),
         endpoints=(EndpointConfig("client", url),),
         peers=(PeerConfig(settings, tuple(map(PeerAddress, addresses)), _RULES[other]),),
