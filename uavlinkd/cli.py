@@ -134,6 +134,16 @@ def _need_lab(command: str) -> None:
         )
 
 
+class Help(argparse.HelpFormatter):
+    """Help as wide as the terminal. argparse itself would import shutil for that, 0.5 MB in every daemon."""
+
+    def __init__(self, prog: str) -> None:
+        width = 80
+        with suppress(OSError):  # no terminal
+            width = os.get_terminal_size().columns
+        super().__init__(prog, width=width - 2)
+
+
 class CommandParser(argparse.ArgumentParser):
     """The parser of a command. :meth:`fill` adds the arguments, and imports what they need, for that command only."""
 
@@ -184,11 +194,13 @@ def make_parser() -> argparse.ArgumentParser:
         prog="uavlinkd",
         description="Carry MAVLink between drones over an authenticated link. An attacker on the network cannot "
         "forge, alter, replay or redirect a frame.",
+        formatter_class=Help,
     )
     parser.add_argument("--version", action="version", version=f"uavlinkd {__version__}, {PROTOCOL_NAME.decode()}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for name, (text, adding) in COMMANDS.items():
-        command = commands.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
+        description = f"{text[0].upper()}{text[1:]}."
+        command = commands.add_parser(name, help=text, description=description, formatter_class=Help)
         command.adding = adding
     return parser
 

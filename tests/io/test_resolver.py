@@ -39,8 +39,8 @@ def names(monkeypatch: pytest.MonkeyPatch) -> Names:
     known: Names = {}
     genuine = socket.getaddrinfo
 
-    def look_up(host: str, port: int, *arguments: Any, **options: Any) -> Any:
-        if host.endswith(".test"):
+    def look_up(asked: bytes, port: int, *arguments: Any, **options: Any) -> Any:
+        if (host := asked.decode()).endswith(".test"):
             if host not in known:
                 raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
             return [answer for ip in known[host] for answer in genuine(ip, port, *arguments, **options)]
@@ -165,15 +165,15 @@ def test_silent_server_gets_a_query_every_two_seconds(monkeypatch: pytest.Monkey
 async def test_names_without_answer_do_not_delay_others(monkeypatch: pytest.MonkeyPatch) -> None:
     """The queries of ten absent peers hang, and another name still resolves."""
     gate = threading.Event()
-    asked: list[str] = []
+    asked: list[bytes] = []
     genuine = socket.getaddrinfo
 
-    def look_up(host: str, *arguments: Any, **options: Any) -> Any:
-        if host.startswith("gone"):
+    def look_up(host: bytes, *arguments: Any, **options: Any) -> Any:
+        if host.startswith(b"gone"):
             asked.append(host)
             gate.wait()
             raise socket.gaierror(socket.EAI_AGAIN, "Temporary failure in name resolution")
-        return genuine("10.0.0.1" if host == "there.test" else host, *arguments, **options)
+        return genuine("10.0.0.1" if host == b"there.test" else host, *arguments, **options)
 
     monkeypatch.setattr(socket, "getaddrinfo", look_up)
     monkeypatch.setattr(resolver, "OVERLAP_S", 0.01)
@@ -181,7 +181,7 @@ async def test_names_without_answer_do_not_delay_others(monkeypatch: pytest.Monk
     try:
         await until(lambda: len(asked) >= 10 * resolver.MAX_QUERIES)
         await asyncio.sleep(0.1)  # enough time for ten times more queries
-        assert Counter(asked) == {f"gone{number}.test": resolver.MAX_QUERIES for number in range(10)}
+        assert Counter(asked) == {f"gone{number}.test".encode(): resolver.MAX_QUERIES for number in range(10)}
         there = Following(Address("there.test", 1))
         await until(lambda: bool(there.results))
         await there.stop()

@@ -104,10 +104,10 @@ async def test_silent_name_server_of_the_peers_delays_no_endpoint(
 ) -> None:
     """Their look-ups may use all threads of theirs."""
     server.start()
-    is_over, waiting = threading.Event(), list[str]()
+    is_over, waiting = threading.Event(), list[bytes]()
 
-    def look_up(host: str, port: int, **_: object) -> list[tuple[object, ...]]:
-        if host == "peer.test":
+    def look_up(host: bytes, port: int, **_: object) -> list[tuple[object, ...]]:
+        if host == b"peer.test":
             waiting.append(host)
             is_over.wait(PATIENCE_S)
         return [(socket.AF_INET, socket.SOCK_STREAM, 6, "", address_of(server))]

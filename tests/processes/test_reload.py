@@ -190,7 +190,7 @@ def hang(name, *arguments, **options):
         time.sleep(600)
     return None
 def getaddrinfo(host, *arguments, **options):
-    return hang(host) or genuine["getaddrinfo"](host, *arguments, **options)
+    return hang(os.fsdecode(host)) or genuine["getaddrinfo"](host, *arguments, **options)
 def open_file(path, *arguments, **options):
     return hang(path) or genuine["open"](path, *arguments, **options)
 socket.getaddrinfo, os.open = getaddrinfo, open_file

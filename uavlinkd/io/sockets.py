@@ -55,7 +55,7 @@ def new_socket(address: Address, kind: socket.SocketKind) -> Iterator[tuple[sock
     try:
         # This only turns a zone ("%wlan0") into its number. A host name is an error here.
         family, _, proto, _, sockaddr = socket.getaddrinfo(
-            address.host, address.port, type=kind, flags=socket.AI_NUMERICHOST | socket.AI_PASSIVE
+            address.host.encode("ascii"), address.port, type=kind, flags=socket.AI_NUMERICHOST | socket.AI_PASSIVE
         )[0]
         # Others ask at a port that is configured. From any other port this machine asks first.
         is_asked = kind is socket.SOCK_DGRAM and address.is_wildcard and address.port and sys.platform == "linux"
@@ -273,7 +273,7 @@ def look(interface: str | None, address: str | None) -> Presence:
 
 def _look_for_address(host: str) -> Presence:
     try:
-        answers = socket.getaddrinfo(host, 0, type=socket.SOCK_DGRAM, flags=socket.AI_NUMERICHOST)
+        answers = socket.getaddrinfo(host.encode("ascii"), 0, type=socket.SOCK_DGRAM, flags=socket.AI_NUMERICHOST)
     except OSError:  # the interface of a link-local address is absent
         answers = []
     for family, _, _, _, sockaddr in answers:
