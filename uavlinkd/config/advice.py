@@ -8,8 +8,7 @@ from itertools import combinations
 from typing import Final
 
 from uavlinkd.config.keys import encode_key, looks_private
-from uavlinkd.config.model import Config, EndpointConfig, PeerAddress, PeerConfig
-from uavlinkd.protocol.settings import PeerSettings
+from uavlinkd.config.model import Config, EndpointConfig, PeerConfig
 
 EXAMPLE_KEYS: Final = frozenset(
     {
@@ -52,23 +51,12 @@ def advice(config: Config) -> Iterator[str]:
 
 def examples(config: Config) -> Iterator[str]:
     """Yield what is left from an example, with which no link comes up."""
-    for what, settings, addresses in _others(config):
+    for what, settings, addresses in config.others():
         if encode_key(settings.public_key) in EXAMPLE_KEYS:
             yield f"{what}: public_key is of an example, not of a machine: write what `uavlinkd pubkey` prints there"
         for address in addresses:
             if _EXAMPLE_HOST.fullmatch(address.address.host):
                 yield f"{what}: {address} is a name for examples: write the address of that machine"
-
-
-def _others(config: Config) -> Iterator[tuple[str, PeerSettings, tuple[PeerAddress, ...]]]:
-    """The other daemons of a file: the section, the settings and the addresses."""
-    for peer in config.peers:
-        yield f'peer "{peer.name}"', peer.settings, peer.addresses
-    for relay in config.relays:
-        if relay.peer is None:
-            yield f'relay "{relay.name}"', relay.settings, relay.addresses
-    for member in config.relay_server.members if config.relay_server else ():
-        yield f'member "{member.name}"', member.peer, ()
 
 
 def _keys(config: Config) -> Iterator[str]:
@@ -78,7 +66,7 @@ def _keys(config: Config) -> Iterator[str]:
             "private_key_file holds a key without the form of a private key, perhaps a public key: make one with"
             " `uavlinkd keygen`, unless software other than `uavlinkd` and `wg` made it"
         )
-    for what, settings, _ in _others(config):
+    for what, settings, _ in config.others():
         if looks_private(settings.public_key):
             yield (
                 f"{what}: public_key has the form of a private key. `uavlinkd keygen` makes no such public key, `wg`"

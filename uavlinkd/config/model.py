@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -290,6 +290,16 @@ class Config:
         """Whether this daemon carries no frames."""
         carries = self.peers or self.endpoints or (self.fleet is not None and self.fleet.policies)
         return self.relay_server is not None and not carries
+
+    def others(self) -> Iterator[tuple[str, PeerSettings, tuple[PeerAddress, ...]]]:
+        """The other daemons of the file: the section as a person knows it, the settings and the addresses."""
+        for peer in self.peers:
+            yield f'peer "{peer.name}"', peer.settings, peer.addresses
+        for relay in self.relays:
+            if relay.peer is None:
+                yield f'relay "{relay.name}"', relay.settings, relay.addresses
+        for member in self.relay_server.members if self.relay_server else ():
+            yield f'member "{member.name}"', member.peer, ()
 
     @property
     def keys_of_others(self) -> set[bytes]:

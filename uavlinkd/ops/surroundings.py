@@ -17,7 +17,6 @@ from pathlib import Path
 from uavlinkd.config.model import Config
 from uavlinkd.io.sockets import family_of, look
 from uavlinkd.io.url import NetworkUrl, SerialUrl
-from uavlinkd.system.addresses import Address
 
 _SERIAL_DEVICES = ("serial/by-id/*", "ttyACM*", "ttyUSB*", "serial0")
 
@@ -34,24 +33,18 @@ def _others(config: Config) -> Iterator[str]:
     The kernel knows the broadcast addresses of the interfaces that are up, and refuses to connect.
     """
     ports = {address.port for address in config.listen}
-    for section, address in _numeric(config):
+    sent_to = [(section, one.address) for section, _, addresses in config.others() for one in addresses]
+    sent_to += [
+        (f'endpoint "{one.name}"', one.url.address) for one in config.endpoints if isinstance(one.url, NetworkUrl)
+    ]
+    for section, address in sent_to:
+        if address.ip is None:
+            continue
         if address.port in ports and look(None, address.host).hosts:
             yield f"{section}: {address} is an address of this daemon itself: write that of the other machine"
         with socket.socket(family_of(address.host), socket.SOCK_DGRAM) as probe, suppress(OSError):
             if probe.connect_ex((address.host, address.port)) == errno.EACCES:
                 yield f"{section}: {address} is a broadcast address: write the address of one machine"
-
-
-def _numeric(config: Config) -> list[tuple[str, Address]]:
-    """The numeric addresses that the daemon sends to, each with its section."""
-    named = [(f'peer "{peer.name}"', one.address) for peer in config.peers for one in peer.addresses]
-    named += [
-        (f'relay "{one.name}"', to.address) for one in config.relays if one.peer is None for to in one.addresses
-    ]
-    named += [
-        (f'endpoint "{one.name}"', one.url.address) for one in config.endpoints if isinstance(one.url, NetworkUrl)
-    ]
-    return [(section, address) for section, address in named if address.ip is not None]
 
 
 def _listening(config: Config) -> Iterator[str]:
