@@ -92,8 +92,8 @@ def _note_signed(before: Fleet, fleet: Fleet, name: str, *, replaces: bool) -> N
 
 def _note_contacts(before: Fleet, after: Fleet) -> None:
     if names := after.with_other_contacts(before):
-        others = f"For {', '.join(names)}, `uavlinkd fleet sign NAME`"
-        _note(f"The contacts changed. {others} prints a line for `uavlinkd enroll --finish`.")
+        others = f"For {', '.join(names)}, run `uavlinkd fleet enroll HOST` again, or `uavlinkd fleet sign NAME`"
+        _note(f"The contacts changed. {others}: it prints a line for `uavlinkd enroll --finish`.")
 
 
 def _identity(options: argparse.Namespace) -> Identity:

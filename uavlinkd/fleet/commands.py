@@ -38,7 +38,7 @@ def add_fleet(fleet: argparse.ArgumentParser) -> None:
     init.add_argument("--suite", default="x25519", metavar="NAME", help="key exchange (default: %(default)s)")
 
     enroll = add("enroll", "make machines members, by ssh: enroll there, sign here, finish there")
-    enroll.add_argument("target", nargs="+", metavar="[USER@]HOST", help="as for ssh; with --here, a member's name")
+    enroll.add_argument("target", nargs="+", metavar="HOST", help="as for ssh: pi@v7; with --here, a member's name")
     enroll.add_argument("--here", action="store_true", help="enroll this machine, without ssh, as an operator")
     enroll.add_argument("--name", metavar="NAME", help="the member's name (default: HOST up to its first dot)")
     enroll.add_argument("--replace", action="store_true", help="a new key for each, and revoke the old one")
@@ -70,8 +70,8 @@ def add_fleet(fleet: argparse.ArgumentParser) -> None:
 
 def _add_identity(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--role", choices=_ROLES, help="(default: vehicle)")
-    text = "MAVLink system id, or a range of them (default: the next free one); of several machines, the first one's"
-    parser.add_argument("--id", metavar="N or A-B", help=text)
+    text = "MAVLink system id, or a range A-B (default: the next free one); of several machines, the first one's"
+    parser.add_argument("--id", metavar="N", help=text)
     text = "where members reach it from the start; a relay's wss:// URL, behind its HOST:PORT, is one more"
     parser.add_argument("--address", action="append", default=[], metavar="HOST:PORT", help=text)
 
