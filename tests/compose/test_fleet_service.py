@@ -38,6 +38,7 @@ def test_one_command_for_each_service(
         for unit in ("uavlinkd-relay", "uavlinkd@gs", "uavlinkd@v7"):
             assert machine.show(unit, "ActiveState") == "active"
             assert machine.show(unit, "UnitFileState") == "enabled"
+            assert machine.show(unit, "NRestarts") == "0"
         before = machine.show("uavlinkd@v7", "MainPID")
         _enroll("root@v7 --id 7")
         assert machine.show("uavlinkd@v7", "MainPID") != before

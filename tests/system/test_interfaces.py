@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import socket
 import sys
 from pathlib import Path
@@ -11,7 +12,7 @@ import pytest
 from tests.needs import need
 from uavlinkd.lab.sim.loopback_ports import has_ipv6
 from uavlinkd.system import interfaces
-from uavlinkd.system.interfaces import find_interface, leads_to, specific_routes
+from uavlinkd.system.interfaces import find_interface, interface_names, leads_to, specific_routes
 
 
 @pytest.fixture(autouse=True)
@@ -27,6 +28,18 @@ def test_loopback_is_read_with_its_addresses() -> None:
     assert loopback.is_up
     assert loopback.hosts[0] == "127.0.0.1"
     assert ("::1" in loopback.hosts) is has_ipv6()
+
+
+def test_names_need_no_netlink(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The service's sandbox refuses such sockets, which the C library opens for the same question."""
+
+    def refuse() -> None:
+        raise OSError(errno.EAFNOSUPPORT, "Address family not supported by protocol")
+
+    monkeypatch.setattr(socket, "if_nameindex", refuse)
+    names = interface_names()
+    assert "lo" in names
+    assert "Inter-|" not in names
 
 
 def test_address_that_the_kernel_still_tests_is_not_usable(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -35,6 +35,7 @@ _MOST_ADDRESSES: Final = 256
 _IFA_F_DADFAILED: Final = 0x08
 _IFA_F_TENTATIVE: Final = 0x40
 # Not /proc/net: the service sees only the folders of processes (ProcSubset=pid).
+_INTERFACES: Final = Path("/proc/self/net/dev")
 _IPV6_TABLE: Final = Path("/proc/self/net/if_inet6")
 _IPV4_ROUTES: Final = Path("/proc/self/net/route")
 _IPV6_ROUTES: Final = Path("/proc/self/net/ipv6_route")
@@ -66,7 +67,8 @@ def find_interface(name: str) -> Interface | None:
 
 
 def interface_names() -> list[str]:
-    return [name for _, name in socket.if_nameindex()]
+    """The names of all interfaces. :func:`socket.if_nameindex` would open a netlink socket."""
+    return [row[0].partition(":")[0] for row in _rows(_INTERFACES)[2:]]
 
 
 def _ipv4(sock: socket.socket, name: str) -> list[str]:
