@@ -19,6 +19,18 @@ HERE = Path(__file__).resolve().parent
 PROJECT = HERE.parents[1]
 BACKEND_LOCK = HERE / "backend.lock"
 """What builds the wheel of uavlinkd, and its shell completions."""
+SBOM_LOCK = HERE / "sbom.lock"
+"""What writes the bill of materials of a release."""
+IMAGE_LOCK = HERE / "image.lock"
+"""What the container image has: the laboratory and the page, on the Python of Debian 12."""
+SBOM = (
+    *("boolean.py", "chardet", "cyclonedx-bom>=7.5,<8", "cyclonedx-python-lib", "defusedxml", "license-expression"),
+    *("packageurl-python", "packaging", "pip-requirements-parser", "py-serializable", "pyparsing"),
+    *("sortedcontainers", "typing-extensions"),
+)
+"""The tool for the bill of materials with what it needs to run, but for what only its checks need."""
+HASHED = ("--require-hashes", "--no-deps", "--only-binary=:all:")
+"""The options of pip that install what a lock file has, and no more."""
 MACHINES = {"amd64": "x86_64", "arm64": "aarch64"}
 """Debian's names of architectures, and those in the names of wheels."""
 
@@ -64,11 +76,21 @@ def pip(*arguments: str | Path) -> None:
     subprocess.run([sys.executable, "-m", "pip", *arguments, "--quiet", "--disable-pip-version-check"], check=True)
 
 
-def requirements() -> list[str]:
-    """What a daemon needs on a vehicle, the faster event loop, and the page for a browser."""
+def download(release: Release, machine: str, folder: Path) -> None:
+    """Download the wheels of a release's lock file for one kind of machine."""
+    pip("download", *HASHED, *release.selection(machine), f"--dest={folder}", "--requirement", release.lock)
+
+
+def install_tools(lock: Path, folder: Path) -> None:
+    """Install tools of the build into a folder, for this Python."""
+    pip("install", *HASHED, f"--target={folder}", "--no-compile", "--requirement", lock)
+
+
+def requirements(*extras: str) -> list[str]:
+    """What a daemon needs, and what some extras of the project add to it."""
     project = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]
-    extras = project["optional-dependencies"]
-    return [*project["dependencies"], *extras["speed"], *extras["web"]]
+    added = (one for extra in extras for one in project["optional-dependencies"][extra])
+    return [*project["dependencies"], *(one for one in added if not one.startswith(project["name"]))]
 
 
 def name_of(requirement: str) -> str:
@@ -96,14 +118,21 @@ def main() -> None:
         folder = Path(name)
         pip("download", "--only-binary=:all:", f"--dest={folder / 'backend'}", *backend)
         write_lock(BACKEND_LOCK, "What builds the wheel of uavlinkd, and its shell completions.", folder / "backend")
+        pure = ("--no-deps", "--only-binary=:all:", "--platform=any", "--abi=none", "--implementation=py")
+        pip("download", *pure, f"--dest={folder / 'sbom'}", *SBOM)
+        write_lock(SBOM_LOCK, "What writes the bill of materials of a release.", folder / "sbom")
         for release in RELEASES.values():
-            folders = [folder / f"{release.number}-{machine}" for machine in MACHINES.values()]
-            for machine, wheels in zip(MACHINES.values(), folders, strict=True):
-                pip("download", f"--dest={wheels}", *release.selection(machine), *requirements())
-            text = (
-                f"Debian {release.number}: wheels for Python {release.python} on {' and '.join(MACHINES.values())}."
-            )
-            write_lock(release.lock, text, *folders)
+            lock(release.lock, release, folder / str(release.number), requirements("speed", "web"))
+        lock(IMAGE_LOCK, RELEASES[12], folder / "image", requirements("lab", "speed", "web"))
+
+
+def lock(path: Path, release: Release, folder: Path, wanted: list[str]) -> None:
+    """Write one lock file: the wheels for all kinds of machines with the Python of a release."""
+    folders = [folder / machine for machine in MACHINES.values()]
+    for machine, wheels in zip(MACHINES.values(), folders, strict=True):
+        pip("download", f"--dest={wheels}", *release.selection(machine), *wanted)
+    machines = " and ".join(MACHINES.values())
+    write_lock(path, f"Debian {release.number}: wheels for Python {release.python} on {machines}.", *folders)
 
 
 if __name__ == "__main__":

@@ -11,9 +11,8 @@ from typing import Any
 
 from tests.compose import images
 from tests.compose.cluster import run, until
-from tests.fleet.folders import create
+from uavlinkd.lab.sim.loopback_ports import free_ports
 from uavlinkd.ops.control import ControlError, ask
-from uavlinkd.system.addresses import Address
 
 USER = 10001
 NETWORK = f"10.{64 + os.getpid() % 128}"
@@ -29,15 +28,15 @@ Status = dict[str, Any]
 class Containers:
     """The services of compose.yaml."""
 
-    def __init__(self, folder: Path, image: str) -> None:
-        self._folder = folder
+    def __init__(self, image: str) -> None:
         self.project = f"uavlinkd-test-{os.getpid()}"
         compose = images.compose_command()
         assert compose is not None
-        self._compose = [*compose, "--project-name", self.project, "--file", str(images.HERE / "compose.yaml")]
+        self._compose = [*compose, "--project-name", self.project, "--file", str(images.CONTAINERS / "compose.yaml")]
+        (self.page_port,) = free_ports(1)
         self.environ = {
             "UAVLINKD_IMAGE": image,
-            "FLEET": str(folder / "fleet"),
+            "PAGE_PORT": str(self.page_port),
             "SUBNET": SUBNET,
             "RESTART": "no",
         }
@@ -45,22 +44,6 @@ class Containers:
         self._logs = ""
 
     async def open(self) -> None:
-        fleet = self._folder / "fleet"
-        create(
-            fleet,
-            drones=3,
-            stations=1,
-            at=[Address("ground-station", 5790)],
-            swarm=True,
-            urls={"stations": "udpin:127.0.0.1:14550"},
-            socket="/run/uavlinkd/control.sock",
-        )
-        for path in (fleet, *fleet.rglob("*")):
-            os.chown(path, USER, USER)
-        for path in (fleet, *fleet.parents):
-            if path == self._folder.parent:
-                break
-            path.chmod(0o755)
         await self.compose("up", "--detach", "--no-build")
         for name in SYSTEM_IDS:
             pid = await run("docker", "inspect", "--format", "{{.State.Pid}}", await self.container(name))

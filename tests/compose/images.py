@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fcntl
-import json
 import os
 import shutil
 import subprocess
@@ -16,7 +15,9 @@ from pathlib import Path
 
 HERE = Path(__file__).parent
 PROJECT = HERE.parent.parent
-PUBLIC_BASE = "python:3.11-slim"
+CONTAINERS = PROJECT / "configs/containers"
+DOCKERFILE = CONTAINERS / "Dockerfile"
+PUBLIC_BASE = "debian:bookworm-slim"
 LOCAL_BASES = "uavlinkd-test-base"
 LOCAL_BASE = f"{LOCAL_BASES}:bookworm"
 IMAGE = "uavlinkd-test"
@@ -67,35 +68,19 @@ def _one_at_a_time(kind: str = "") -> Iterator[None]:
 def _build(base: str) -> str:
     with tempfile.TemporaryDirectory(prefix="uavlinkd-image-") as folder:
         context = Path(folder)
-        for name in ("Dockerfile", ".dockerignore"):
-            shutil.copy(HERE / name, context)
-        # Built in a copy: building leaves nothing in the project's folder.
-        source = context / "source"
-        source.mkdir()
-        for name in ("pyproject.toml", "README.md", "LICENSE"):
-            shutil.copy(PROJECT / name, source)
-        shutil.copytree(PROJECT / "uavlinkd", source / "uavlinkd", ignore=shutil.ignore_patterns("__pycache__"))
-        shutil.copytree(PROJECT / "systemd", source / "systemd", ignore=shutil.ignore_patterns("deb"))
-        version = _python_of(base)
-        _run(sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--wheel-dir", context / "wheels", source)
-        requirements = json.loads(_output(sys.executable, "-c", _REQUIREMENTS, source / "pyproject.toml"))
-        _run(
-            *(sys.executable, "-m", "pip", "download", "-q", "--dest", context / "wheels"),
-            *("--only-binary=:all:", f"--python-version={version}", *requirements),
-        )
-        shutil.rmtree(source)
-        _run("docker", "build", "--quiet", "--build-arg", f"BASE={base}", "--tag", IMAGE, context)
+        for name in (".dockerignore", "pyproject.toml", "README.md", "LICENSE", "uavlinkd", "systemd", "configs"):
+            copy = shutil.copytree if (PROJECT / name).is_dir() else shutil.copy
+            copy(PROJECT / name, context / name)
+        for lock in ("backend", "image"):
+            _run(
+                *(sys.executable, "-m", "pip", "download", "-q", "--dest", context / "wheels", "--no-deps"),
+                *("--only-binary=:all:", "--python-version=3.11", "--require-hashes"),
+                *("--requirement", PROJECT / f"systemd/deb/{lock}.lock"),
+            )
+        offline = ("PIP_NO_INDEX=1", "PIP_FIND_LINKS=/packages", f"BASE={base}")
+        arguments = (argument for value in offline for argument in ("--build-arg", value))
+        _run("docker", "build", "--quiet", *arguments, "--file", DOCKERFILE, "--tag", IMAGE, context)
     return IMAGE
-
-
-_REQUIREMENTS = """
-import json, sys, tomllib
-with open(sys.argv[1], "rb") as file:
-    project = tomllib.load(file)["project"]
-extras = project["optional-dependencies"]
-wanted = [*project["dependencies"], *extras["lab"], *extras["web"]]
-print(json.dumps([one for one in wanted if not one.startswith("uavlinkd[")]))
-"""
 
 
 def base_image() -> str:
@@ -123,7 +108,10 @@ def debian(codename: str) -> str:
 def _make_debian(codename: str, image: str) -> None:
     with tempfile.TemporaryDirectory(prefix="uavlinkd-base-") as folder:
         root = Path(folder) / "root"
-        _run("debootstrap", "--variant=minbase", "--include=python3,python3-venv,systemd", codename, root)
+        # An older debootstrap does not know a newer release, which is made as "sid" is. "" is the usual mirror.
+        as_sid = () if Path("/usr/share/debootstrap/scripts", codename).exists() else ("", "sid")
+        packages = "--include=python3,python3-venv,systemd"
+        _run("debootstrap", "--variant=minbase", packages, codename, root, *as_sid)
         leave_out = [
             f"--exclude=./{pattern}" for pattern in ("var/cache/apt/*", "var/lib/apt/lists/*", "usr/share/doc/*")
         ]
@@ -140,11 +128,6 @@ def pull(name: str) -> bool:
     return not _try("docker", "pull", "--quiet", name)
 
 
-def _python_of(image: str) -> str:
-    code = "import sys; print('%d.%d' % sys.version_info[:2])"
-    return _output("docker", "run", "--rm", "--network", "none", image, "python3", "-c", code).strip()
-
-
 def _try(*command: str) -> int:
     return subprocess.run(command, capture_output=True, check=False).returncode
 
@@ -154,7 +137,3 @@ def _run(*command: str | Path) -> None:
     if done.returncode:
         print(done.stdout)
     done.check_returncode()
-
-
-def _output(*command: str | Path) -> str:
-    return subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncIterator
+from urllib.request import urlopen
 
 import pytest
 import pytest_asyncio
@@ -14,9 +16,9 @@ pytestmark = pytest.mark.asyncio(loop_scope="module")
 
 
 @pytest_asyncio.fixture(scope="module", loop_scope="module")
-async def cluster(image: str, tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Containers]:
+async def cluster(image: str) -> AsyncIterator[Containers]:
     """Three drones and a ground station, for all tests of this file."""
-    async with opened(Containers(tmp_path_factory.mktemp("fleet"), image)) as opened_cluster:
+    async with opened(Containers(image)) as opened_cluster:
         yield opened_cluster
 
 
@@ -32,6 +34,20 @@ async def test_autopilots_fly(cluster: Containers) -> None:
     for name in ("drone1", "drone2", "drone3"):
         before = from_endpoint(name)
         await until(lambda name=name, before=before: from_endpoint(name) > before, f"{name}'s autopilot flies")  # type: ignore[misc]
+
+
+def read(url: str) -> str:
+    """The text at an address of this machine."""
+    with urlopen(url) as answer:
+        return str(answer.read().decode())
+
+
+async def test_page_is_on_the_loopback_of_the_host(cluster: Containers) -> None:
+    """It shows the ground station, by a process without its key."""
+    page = await cluster.container("page")
+    await until(lambda: health(page) == "healthy", "the page is there")
+    assert 'peer="drone3"' in await asyncio.to_thread(read, f"http://127.0.0.1:{cluster.page_port}/metrics")
+    assert (await run("docker", "exec", page, "ls", "/etc/uavlinkd", check=False)).count("No such file") == 1
 
 
 async def test_containers_are_healthy_confined_and_unprivileged(cluster: Containers) -> None:
