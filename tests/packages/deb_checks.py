@@ -47,6 +47,7 @@ class Package:
     """The package of one release, built twice, and one of a later version."""
 
     release: int
+    root: Path
     first: Path
     second: Path
     newer: Path
@@ -64,7 +65,7 @@ def package(request: pytest.FixtureRequest) -> Iterator[Package]:
         export_root(images.debian(CODENAMES[release]), folder / "root")
         first = build(release, folder, "first", umask=0o022, TZ="UTC", LC_ALL="C.UTF-8")
         second = build(release, folder, "second", umask=0o077, TZ="Asia/Tokyo", LC_ALL="C")
-        yield Package(release, first, second, make_newer(first, folder))
+        yield Package(release, folder / "root", first, second, make_newer(first, folder))
 
 
 @pytest.fixture
@@ -87,10 +88,11 @@ def export_root(image: str, root: Path) -> None:
         call("docker", "rm", container)
 
 
-def build(release: int, folder: Path, name: str, *, umask: int, **environ: str) -> Path:
+def build(release: int, folder: Path, name: str, *options: str, umask: int, **environ: str) -> Path:
     """Run the command of the README, in a root that exists."""
+    places = (f"--root={folder / 'root'}", f"--out={folder / name}")
     done = subprocess.run(
-        [sys.executable, SCRIPT, f"--release={release}", f"--root={folder / 'root'}", f"--out={folder / name}"],
+        [sys.executable, SCRIPT, f"--release={release}", *places, *options],
         env={**os.environ, **environ, "SOURCE_DATE_EPOCH": EPOCH},
         capture_output=True,
         text=True,
