@@ -41,18 +41,18 @@ def paths_of(status: Status) -> Iterator[tuple[PathKey, tuple[float | None, floa
 def view(status: Status, past: Sequence[Mapping[str, Any]], peer: str) -> dict[str, Any]:
     """The whole page, or that of one peer. ``past``: the problems of the log."""
     lines, peers = words.problems(status["findings"]), words.peers_of(status)
-    states = dict(_states(peers, lines))
+    states = _states(peers, lines)
     names = [peer] if peer else list(states) if len(states) <= MOST_CARDS else []
     fleet = status["fleet"]
     facts: dict[str, Any] = {
         "daemon": status["name"],
         "fleet": "" if fleet is None else titled("fleet", fleet["fleet"]),
-        "word": _overall(status, list(states.values()), lines),
+        "frames_pass": status["frames_pass"],
+        "worst": next(iter(states.values()), "waiting"),
         "headline": [part._asdict() for part in words.headline(status)],
         "problems": [line._asdict() for line in lines if not peer or not line.peers or peer in line.peers],
         "past": [line for line in past if not peer or line["name"] == peer],
         "cards": [card(name, peers[name], states[name]) for name in names if name in states],
-        "count": len(states),
     }
     if peer:
         return facts
@@ -70,30 +70,16 @@ def view(status: Status, past: Sequence[Mapping[str, Any]], peer: str) -> dict[s
     }
 
 
-def _states(peers: dict[str, Status], lines: Sequence[words.ProblemLine]) -> Iterator[tuple[str, str]]:
+def _states(peers: dict[str, Status], lines: Sequence[words.ProblemLine]) -> dict[str, str]:
     """The word for each peer, the broken ones first."""
-    worst: dict[str, str] = {}
-    for line in lines:  # the most severe first
-        for name in line.peers:
-            worst.setdefault(name, line.severity)
-    found = {}
-    for name, peer in peers.items():
-        severity = worst.get(name)
-        if peer["state"] == "up" or severity == "security":
-            found[name] = _WORDS[severity] if severity else "up"
-        else:
-            found[name] = peer["state"]
-    yield from sorted(found.items(), key=lambda item: (_ORDER.index(item[1]), item[0]))
-
-
-def _overall(status: Status, states: Sequence[str], lines: Sequence[words.ProblemLine]) -> str:
-    """The word for the whole daemon. Members that never came do not count while frames pass."""
-    if any(line.severity == "security" for line in lines):
-        return "attack"
-    if status["frames_pass"]:
-        return "warning" if lines else "up"
-    worst = states[0] if states else "waiting"
-    return "blocked" if worst in ("up", "warning") else worst
+    worst = {name: line.severity for line in reversed(lines) for name in line.peers}  # the most severe of several
+    states = {
+        name: _WORDS.get(worst.get(name, ""), "up")
+        if peer["state"] == "up" or worst.get(name) == "security"
+        else peer["state"]
+        for name, peer in peers.items()
+    }
+    return dict(sorted(states.items(), key=lambda item: (_ORDER.index(item[1]), item[0])))
 
 
 def top(name: str, peer: Status, word: str) -> dict[str, Any]:
@@ -135,7 +121,7 @@ def card(name: str, peer: Status, word: str) -> dict[str, Any]:
         ],
         "refused": sorted(_refused(peer), key=lambda item: -item[3])[:_SHOWN_REFUSALS],
         "dropped": words.ranked(words.peer_drops(peer)),
-        "reported": [_reported(claim) for claim in peer["refused_there"]],
+        "reported": peer["refused_there"],
     }
 
 
@@ -182,11 +168,6 @@ def _refused(peer: Status) -> Iterator[tuple[str, str, str, int]]:
             for message, reasons in messages.items():
                 for reason, count in reasons.items():
                     yield direction, message, words.phrase(reason, Refusal), count
-
-
-def _reported(claim: Mapping[str, Any]) -> str:
-    what = " ".join(filter(None, (claim["message"], claim["command"])))
-    return f"it refused {what} {claim['count']:,} times: {claim['reason'].replace('_', ' ')}"
 
 
 def _endpoint(name: str, endpoint: Status) -> dict[str, Any]:

@@ -217,6 +217,7 @@ function member([name, is]) {
 }
 
 function card(facts) {
+  facts.paths.sort((a, b) => a.number - b.number); // however often the best one changes
   const cells = [flight(facts), battery(facts), commanded(facts)].filter((answer) => answer !== null).map(cell);
   const seen = facts.last_received_s === null ? "never seen here" : `seen ${age(facts.last_received_s)} ago`;
   return el("article", { "data-key": facts.name, class: lost === null ? facts.word : "unknown" },
@@ -235,10 +236,9 @@ function paths(facts) {
       el("th", { scope: "row" }, el("b", {}, path.kind), " ", el("small", {}, lost === null ? path.state : "unknown")),
       el("td", {}, lost === null ? ms(path.rtt) : "-"), el("td", {}, lost === null ? percent(loss) : "-"), el("td", {}, drawing));
   };
-  const inOrder = [...facts.paths].sort((a, b) => a.number - b.number); // however often the best one changes
   return el("table", { class: "paths" },
     el("thead", {}, el("tr", {}, titles.map((title) => el("th", { scope: "col" }, title)))),
-    el("tbody", {}, inOrder.map(one)),
+    el("tbody", {}, facts.paths.map(one)),
     el("tfoot", {}, el("tr", {}, el("td", { colspan: 3 }), el("td", {}, axis()))));
 }
 
@@ -248,10 +248,14 @@ function details(facts) {
   const { dropped, refused, reported } = facts;
   return el("details", { "data-key": "details", open: Boolean(peer) }, el("summary", {}, "Details"),
     facts.paths.map((path) => onePath(facts.name, path)),
-    dropped.length ? [el("h3", {}, "Dropped"), list(dropped.map(([why, times]) => [count(times), why]), ["times", "why"])] : null,
+    dropped.length ? [el("h3", {}, "Dropped"), el("ul", {}, dropped.map(([why, times]) => el("li", {}, `${count(times)} ${why}`)))] : null,
     refused.length ? [el("h3", {}, "Refused by this daemon's policy"), list(refused.map((row) => [...row.slice(0, 3), count(row[3])]), ["direction", "message", "why", "times"])] : null,
-    reported.length ? [el("h3", {}, "Reported by this peer; a captured one can lie"), el("ul", {}, reported.map((text) => el("li", {}, text)))] : null,
+    reported.length ? [el("h3", {}, "Reported by this peer; a captured one can lie"), el("ul", {}, reported.map((claim) => el("li", {}, claimed(claim))))] : null,
     el("h3", {}, "Session"), el("dl", { class: "facts" }, facts.facts.map(([name, text]) => [el("dt", {}, name), el("dd", {}, text)])));
+}
+
+function claimed({ message, command, count: times, reason }) {
+  return `it refused ${[message, command].filter((name) => name).join(" ")} ${count(times)} times: ${reason.replaceAll("_", " ")}`;
 }
 
 function onePath(name, path) {
@@ -323,6 +327,12 @@ function past(lines) {
   return [el("details", { "data-key": "past" }, el("summary", {}, `Problems in the log: ${rows.length}`), list(rows, ["began", "ended", "kind", "of", "what"]))];
 }
 
+function overall() { // members that never came do not count while frames pass
+  if (now.problems.some((line) => line.severity === "security")) return "attack";
+  if (now.frames_pass) return now.problems.length ? "warning" : "up";
+  return ["up", "warning"].includes(now.worst) ? "blocked" : now.worst;
+}
+
 function render() {
   document.body.className = lost === null ? "" : "lost";
   at("back").hidden = !peer;
@@ -333,7 +343,7 @@ function render() {
   const title = peer || now.daemon;
   document.title = `${title} - uavlinkd`;
   at("title").textContent = title;
-  fill(at("state"), peer ? [] : [state(now.word)]);
+  fill(at("state"), peer ? now.cards.map((facts) => state(facts.word)) : [state(overall())]);
   at("fleet").textContent = peer ? now.daemon : now.fleet;
   at("clock").textContent = lost === null ? `live ${now.seen}` : "";
   const missing = peer && !now.cards.length ? [el("span", { class: "bad" }, `${now.daemon} has no peer of this name`)] : [];
