@@ -163,14 +163,18 @@ function commands(text) { // a name with other signs could be more than it seems
   return text.split("`").filter((part, i, all) => i % 2 && i < all.length - 1 && /^[ -~]+ [ -~]+$/.test(part));
 }
 
+function copier(command) {
+  const said = el("span", {}, copied === command ? "Copied" : "Copy");
+  return el("button", { type: "button", class: "copy", "data-copy": command }, said, el("code", {}, command));
+}
+
 function problems(lines) {
   if (!lines.length) return [];
   const one = (line) => el("li", { class: `problem ${line.severity}` },
     el("p", { class: "who" }, state(SEVERITIES[line.severity], line.severity), line.who ? el("b", {}, line.who) : null),
     el("p", { class: "cause" }, quoted(`${line.text}.`)),
     el("p", { class: "remedy" }, el("b", {}, "Remedy: "), quoted(`${line.remedy}.`)),
-    !navigator.clipboard ? null : commands(line.remedy).map((command) => el("button", { type: "button", class: "copy", "data-copy": command },
-      el("span", {}, copied === command ? "Copied" : "Copy"), el("code", {}, command))));
+    navigator.clipboard ? commands(line.remedy).map(copier) : null);
   return [el("h2", {}, lines.length > 1 ? `${lines.length} problems` : "1 problem"), el("ul", {}, lines.map(one))];
 }
 
@@ -189,26 +193,30 @@ function flight({ vehicles: [vehicle, ...others], role, is_up }) {
 
 function battery({ vehicles: [vehicle] }) {
   const { battery_percent: whole = null, battery_v: volts = null } = vehicle || {};
-  const known = [whole === null ? null : charge(whole), volts === null ? null : `${volts.toFixed(1)}\u00a0V`].filter((part) => part !== null);
+  const known = [...(whole === null ? [] : [charge(whole)]), ...(volts === null ? [] : [`${volts.toFixed(1)}\u00a0V`])];
   return known.length ? ["Battery", known[0], known[1] || "", ""] : null;
 }
 
 function commanded(facts) {
   if (!facts.commands.in && !facts.commands.out) return null;
   const title = facts.commands.out ? "Commands pass" : "Its commands pass", unanswered = facts.freshness_unverified_s;
-  const why = !facts.is_up ? "the link is down" : facts.word === "blocked" ? "see the problem" : unanswered !== null ? `no answer for ${age(unanswered)}` : "";
   if (lost !== null) return [title, "unknown", "", ""];
-  return why ? [title, "no", why, "bad"] : [title, "yes", `${age(facts.answered_s ?? facts.last_received_s)} old`, "good"];
+  if (!facts.is_up) return [title, "no", "the link is down", "bad"];
+  if (facts.word === "blocked") return [title, "no", "see the problem", "bad"];
+  if (unanswered !== null) return [title, "no", `no answer for ${age(unanswered)}`, "bad"];
+  return [title, "yes", `${age(facts.answered_s ?? facts.last_received_s)} old`, "good"];
 }
 
 function cell([title, value, more, tone]) {
-  return el("div", { class: (lost === null ? tone : "old") || false }, el("dt", {}, title), el("dd", {}, el("b", {}, value), more ? ` ${more}` : null));
+  const tones = (lost === null ? tone : "old") || false;
+  return el("div", { class: tones }, el("dt", {}, title), el("dd", {}, el("b", {}, value), more ? ` ${more}` : null));
 }
 
 function row(facts) {
   const said = (answer, between) => (answer === null ? "" : answer.slice(1, 3).filter((part) => part).join(between));
   const flying = facts.last_received_s === null ? "never seen" : said(flight(facts), " ");
-  return [facts.name, facts.word, flying, battery(facts)?.[1] ?? "", said(commanded(facts), ", "), facts.path, facts.round_trip_s, facts.loss, ...facts.rates];
+  const asked = [flying, battery(facts)?.[1] ?? "", said(commanded(facts), ", ")];
+  return [facts.name, facts.word, ...asked, facts.path, facts.round_trip_s, facts.loss, ...facts.rates];
 }
 
 function member([name, is]) {
@@ -244,15 +252,17 @@ function paths(facts) {
 
 function linesOf(name, path) { return (plotted[name] || {})[path.number] || [[], [], []]; }
 
-function details(facts) {
-  const { dropped, refused, reported } = facts;
+function details({ name, paths, facts, dropped, refused, reported }) {
   return el("details", { "data-key": "details", open: Boolean(peer) }, el("summary", {}, "Details"),
-    facts.paths.map((path) => onePath(facts.name, path)),
-    dropped.length ? [el("h3", {}, "Dropped"), el("ul", {}, dropped.map(([why, times]) => el("li", {}, `${count(times)} ${why}`)))] : null,
-    refused.length ? [el("h3", {}, "Refused by this daemon's policy"), list(refused.map((row) => [...row.slice(0, 3), count(row[3])]), ["direction", "message", "why", "times"])] : null,
-    reported.length ? [el("h3", {}, "Reported by this peer; a captured one can lie"), el("ul", {}, reported.map((claim) => el("li", {}, claimed(claim))))] : null,
-    el("h3", {}, "Session"), el("dl", { class: "facts" }, facts.facts.map(([name, text]) => [el("dt", {}, name), el("dd", {}, text)])));
+    paths.map((path) => onePath(name, path)),
+    part("Dropped", dropped, () => el("ul", {}, dropped.map(([why, times]) => el("li", {}, `${count(times)} ${why}`)))),
+    part("Refused by this daemon's policy", refused, () => list(refused, ["direction", "message", "why", "times"])),
+    part("Reported by this peer; a captured one can lie", reported,
+      () => el("ul", {}, reported.map((claim) => el("li", {}, claimed(claim))))),
+    el("h3", {}, "Session"), el("dl", { class: "facts" }, facts.map(([fact, text]) => [el("dt", {}, fact), el("dd", {}, text)])));
 }
+
+function part(title, rows, content) { return rows.length ? [el("h3", {}, title), content()] : null; }
 
 function claimed({ message, command, count: times, reason }) {
   return `it refused ${[message, command].filter((name) => name).join(" ")} ${count(times)} times: ${reason.replaceAll("_", " ")}`;
@@ -260,6 +270,7 @@ function claimed({ message, command, count: times, reason }) {
 
 function onePath(name, path) {
   const jitter = path.jitter === null ? "" : ` ± ${ms(path.jitter)}`;
+  const both = (title, format, [into, out]) => `${title} ${format(into)} in, ${format(out)} out`;
   const figure = (title, format, index) => {
     const [said, drawing] = plot(`${title}, ${path.kind}`, format, linesOf(name, path), index);
     return el("figure", {}, el("figcaption", {}, el("b", {}, title), ` ${said}`), drawing, axis());
@@ -267,64 +278,77 @@ function onePath(name, path) {
   return el("section", { "data-key": `path ${path.number}`, class: "one" },
     el("h3", {}, `${path.kind} `, el("code", {}, path.address)),
     el("p", {}, `${lost === null ? path.state : "unknown"}, carries ${path.carries === "-" ? "nothing" : path.carries}`),
-    el("p", {}, `round trip ${ms(path.rtt)}${jitter}, loss ${percent(path.loss[0])} in, ${percent(path.loss[1])} out, ${rate(path.rate[0])} in, ${rate(path.rate[1])} out`),
+    el("p", {}, `round trip ${ms(path.rtt)}${jitter}, ${both("loss", percent, path.loss)}, ${both("bytes", rate, path.rate)}`),
     el("div", { class: "plots" }, figure("loss", percent, 1), figure("bytes", rate, 2)));
 }
 
 // Tables. Roles are written down: a browser forgets those of a table that is shown in another way on a phone.
 
-function list(rows, titles, more = {}) {
-  return el("table", { role: "table", class: "list", ...more },
-    el("thead", { role: "rowgroup" }, el("tr", { role: "row" }, titles.map((title) => el("th", { scope: "col", role: "columnheader" }, title)))),
-    el("tbody", { role: "rowgroup" }, rows.map((row) => el("tr", { role: "row" }, row.map((cell, index) => el("td", { role: "cell", "data-title": titles[index] }, cell))))));
+function rows(tag, ...lines) {
+  return el(tag, { role: "rowgroup" }, lines.map(([cells, more]) => el("tr", { role: "row", ...more }, cells)));
+}
+function heading(more, ...content) { return el("th", { scope: "col", role: "columnheader", ...more }, content); }
+
+function list(lines, titles) {
+  const cell = (text, index) => el("td", { role: "cell", "data-title": titles[index] }, typeof text === "number" ? count(text) : text);
+  return el("table", { role: "table", class: "list" },
+    rows("thead", [titles.map((title) => heading({}, title))]),
+    rows("tbody", ...lines.map((line) => [line.map(cell)])));
 }
 
-const CELLS = {
-  state, since: age, "round trip": ms, loss: percent, in: rate, out: rate, vehicle: link,
-};
+const CELLS = { vehicle: link, state, since: age, "round trip": ms, loss: percent, in: rate, out: rate };
 
 function table(id) {
-  const rows = id === "peers" ? (now.rows || []).map(row) : Object.entries(now.members || {}).map(member);
-  const { order: [column, direction], columns } = TABLES[id];
+  const { order: [column, direction], columns } = TABLES[id], isPeers = id === "peers";
+  const all = isPeers ? (now.rows || []).map(row) : Object.entries(now.members || {}).map(member);
   const section = at(id), wanted = section.querySelector("input").value.toLowerCase();
   const value = (row) => (columns[column] === "state" ? ORDER.indexOf(row[column]) : row[column]);
-  const shown = rows.filter((row) => row.some((cell) => String(cell).toLowerCase().includes(wanted)));
   const unknown = (row) => value(row) === null || value(row) === ""; // last, in either direction
   const compare = (a, b) => (typeof a === "string" ? a.localeCompare(b, "en", { numeric: true }) : a - b);
+  const shown = all.filter((row) => row.some((cell) => String(cell).toLowerCase().includes(wanted)));
   shown.sort((a, b) => unknown(a) - unknown(b) || direction * compare(value(a), value(b)) || compare(a[0], b[0]));
-  const has = id === "peers" && Object.keys(plotted).length > 0;
+  const isPlotted = isPeers && Object.keys(plotted).length > 0;
   const sorted = (index) => (index !== column ? false : direction > 0 ? "ascending" : "descending");
-  const head = columns.map((title, index) => el("th", { scope: "col", role: "columnheader", "aria-sort": sorted(index) },
+  const head = columns.map((title, index) => heading({ "aria-sort": sorted(index) },
     el("button", { type: "button", "data-column": String(index) }, title)));
   const plain = (is) => (is === null || is === "" ? "-" : is);
+  const cell = (text, index) => el("td", { role: "cell", "data-title": columns[index] }, (CELLS[columns[index]] || plain)(text));
   const drawn = (name) => {
     const lines = together(plotted[name]);
     return el("td", { role: "cell", class: "drawn" }, lines === null ? "-" : plot(`round trip of ${name}`, ms, lines, 0)[1]);
   };
-  const body = shown.map((row) => el("tr", { role: "row", "data-key": row[0], class: lost === null ? row[1] : "unknown" },
-    row.map((cell, index) => el("td", { role: "cell", "data-title": columns[index] }, (CELLS[columns[index]] || plain)(cell))),
-    has ? drawn(row[0]) : null));
-  section.hidden = !rows.length;
+  const body = shown.map((row) => [
+    [...row.map(cell), isPlotted ? drawn(row[0]) : null],
+    { "data-key": row[0], class: lost === null ? row[1] : "unknown" },
+  ]);
+  section.hidden = !all.length;
   morph(section.querySelector("table"), el("table", { role: "table" },
-    el("thead", { role: "rowgroup" }, el("tr", { role: "row" }, head, has ? el("th", { scope: "col", role: "columnheader", class: "drawn" }, "last ten minutes", axis()) : null)),
-    el("tbody", { role: "rowgroup" }, body)));
+    rows("thead", [[...head, isPlotted ? heading({ class: "drawn" }, "last ten minutes", axis()) : null]]),
+    rows("tbody", ...body)));
 }
 
-function rest(facts) {
+function rest({ endpoints, networks, lines }) {
   const clients = (endpoint) => endpoint.clients.map(([address, silent]) => `${address} (${age(silent)})`).join(", ") || "no client";
-  const panel = (title, ...parts) => el("section", { class: "panel", "data-key": title }, el("h2", {}, title), parts);
+  const panel = (title, rows, content) => (rows.length ? [el("section", { class: "panel", "data-key": title }, el("h2", {}, title), content)] : []);
   return [
-    facts.endpoints.length ? panel("Local endpoints", list(facts.endpoints.map((e) => [e.name, clients(e), count(e.frames[0]), count(e.frames[1]), e.problems || "-"]), ["endpoint", "clients (silent)", "frames in", "frames out", "problems"])) : null,
-    facts.networks.length ? panel("Networks", list(facts.networks.map((n) => [n.name, n.exit, n.is_metered ? "metered" : "-", n.text]), ["network", "exit", "metered", "addresses"])) : null,
-    facts.lines.length ? panel("This daemon", facts.lines.map((line) => el("p", { class: line.is_good ? false : "warning" }, line.text))) : null,
-  ].filter((part) => part !== null);
+    ...panel("Local endpoints", endpoints, list(
+      endpoints.map((endpoint) => [endpoint.name, clients(endpoint), ...endpoint.frames, endpoint.problems || "-"]),
+      ["endpoint", "clients (silent)", "frames in", "frames out", "problems"])),
+    ...panel("Networks", networks, list(
+      networks.map((network) => [network.name, network.exit, network.is_metered ? "metered" : "-", network.text]),
+      ["network", "exit", "metered", "addresses"])),
+    ...panel("This daemon", lines, lines.map((line) => el("p", { class: line.is_good ? false : "warning" }, line.text))),
+  ];
 }
 
 function past(lines) {
   const newest = [...lines].sort((a, b) => (b.ended_s === null) - (a.ended_s === null) || a.began_s - b.began_s);
-  const rows = newest.map((line) => [clock(line.began_s), line.ended_s === null ? "lasts" : clock(line.ended_s), line.severity, line.name || "-", el("span", {}, quoted(`${line.text}. Remedy: ${line.remedy}.`))]);
-  if (!rows.length) return [];
-  return [el("details", { "data-key": "past" }, el("summary", {}, `Problems in the log: ${rows.length}`), list(rows, ["began", "ended", "kind", "of", "what"]))];
+  if (!newest.length) return [];
+  const ended = (line) => (line.ended_s === null ? "lasts" : clock(line.ended_s));
+  const what = (line) => el("span", {}, quoted(`${line.text}. Remedy: ${line.remedy}.`));
+  const log = newest.map((line) => [clock(line.began_s), ended(line), line.severity, line.name || "-", what(line)]);
+  return [el("details", { "data-key": "past" }, el("summary", {}, `Problems in the log: ${newest.length}`),
+    list(log, ["began", "ended", "kind", "of", "what"]))];
 }
 
 function overall() { // members that never came do not count while frames pass
