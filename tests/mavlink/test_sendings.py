@@ -90,6 +90,16 @@ def test_own_frames_that_return_go_nowhere() -> None:
     assert r.unrouted == {Unrouted.DUPLICATE: 1}
 
 
+def test_circle_has_the_systems_whose_frames_return() -> None:
+    """All components of a vehicle are one system: a second one is the sign of a circle."""
+    r = router("a", "b")
+    for component in (1, 2, 3):
+        frame = Frame(b"%d" % component, Header(HEARTBEAT, 7, component))
+        assert r.route(frame, "a", component) == ("b", "peer")
+        assert r.route(frame, "b", component + 0.1) == ()
+    assert r.sendings.circles["b"].systems == {7}
+
+
 def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """A flood of different frames shortens it."""
     monkeypatch.setattr(sendings, "MAX_FRAMES_REMEMBERED", 16)

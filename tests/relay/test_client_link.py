@@ -112,6 +112,16 @@ def test_peer_that_was_added_before_the_answer_is_bound_at_once(scene: Scene) ->
     assert scene.binds(T) == [(ONE, TWO, ELSE)]
 
 
+def test_path_that_works_again_is_bound_at_once(scene: Scene) -> None:
+    """The relay may have forgotten it meanwhile. Another path has its own time."""
+    assert scene.binds(T)
+    scene.bound(T, (ONE, 5), (TWO, 6))
+    scene.link.on_event(o.PathStateChanged(scene.link.peer, ELSEWHERE, True, "answered"), T)
+    assert scene.link.next_at == T + c.BIND_INTERVAL_S
+    scene.link.on_event(o.PathStateChanged(scene.link.peer, AT_B, True, "answered"), T)
+    assert scene.binds(T)
+
+
 def test_data_with_an_unknown_handle_causes_a_bind(scene: Scene) -> None:
     """A bound record was lost. An attacker that sends such data causes a few binds a second, and only at a relay."""
     assert scene.binds(T)

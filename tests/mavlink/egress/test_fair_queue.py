@@ -56,6 +56,16 @@ def bytes_by_source(gone: list[tuple[Frame, Source]]) -> Counter[Source]:
     return sums
 
 
+def test_urgent_frame_that_waits_longest_goes_first() -> None:
+    """A flow that was sent long ago has no lead over one that has waited."""
+    queue, _ = make()
+    queue.put([heartbeat(0, 2)], HONEST, 0.0)
+    assert popped(queue) == [(heartbeat(0, 2), HONEST)]
+    queue.put([heartbeat(1, 3)], HONEST, 5.0)
+    queue.put([heartbeat(1, 2)], HONEST, 6.0)
+    assert popped(queue, now=6.0) == [(heartbeat(1, 3), HONEST), (heartbeat(1, 2), HONEST)]
+
+
 def test_frame_that_does_not_fit_stays() -> None:
     """The frame whose turn it is goes next, or none does."""
     queue, _ = make()
