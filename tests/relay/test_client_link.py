@@ -154,7 +154,7 @@ def test_data_with_an_unknown_handle_causes_a_bind(scene: Scene) -> None:
 
 
 def test_handles_are_paths_until_the_relay_ends_them(scene: Scene) -> None:
-    """A record replaces the handles of the keys that it names, and of no others."""
+    """A record replaces the handles of the keys that it names, and of no others. A relay that is lost ends all."""
     assert scene.binds(T)
     scene.bound(T, (ONE, 5), (ONE, 6), (TWO, 7))
     assert scene.link.paths_to(ONE) == [[relayed(0, "vps", 5), relayed(0, "vps", 6)]]
@@ -165,6 +165,9 @@ def test_handles_are_paths_until_the_relay_ends_them(scene: Scene) -> None:
     scene.bound(T, (ONE, WAITING))
     assert scene.link.paths_to(ONE) == [[]]
     assert scene.changed == [{ONE, TWO}, {ONE}, {ONE}]
+    scene.link.on_event(o.PeerLost(scene.link.peer, c.BIND_LIFETIME_S), T + c.BIND_LIFETIME_S)
+    assert scene.changed[-1] == {ONE, TWO}
+    assert scene.link.paths_to(TWO) == [[]]
 
 
 def test_older_record_about_a_key_is_dropped(scene: Scene) -> None:

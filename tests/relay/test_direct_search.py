@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
@@ -17,6 +16,7 @@ from uavlinkd.protocol.drops import DropReason
 from uavlinkd.protocol.outputs import Output, PathStateChanged, RecordReceived, SessionEstablished, Transmit
 from uavlinkd.protocol.path import Path, relayed
 from uavlinkd.protocol.relay_records import Candidates
+from uavlinkd.relay import clients
 from uavlinkd.relay.clients import Relays
 from uavlinkd.relay.direct_search import (
     LISTS,
@@ -225,14 +225,15 @@ def test_search_begins_again_when_it_may_help(is_relayed: bool, is_usable: bool,
     assert (network.search["a"].next_at == 3.0) is begins
 
 
-def test_relay_that_ends_handles_renews_no_limit() -> None:
+def test_relay_that_ends_handles_renews_no_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     """It ends the handles and assigns them again ten times a second. The lists are limited, and keep their order."""
     network = Network()
     peer, path = network.pair.a.peer, network.pair.a.peer_at
     link = SimpleNamespace(peer=peer, relayed=[path])
     links: dict[str, Any] = {"bravo": link}
     relays = Relays(network.pair.a.node, Mock(), Mock(spec=PeerSockets), links, {}, get_logger())
-    relays._looked_at, relays._own = math.inf, [OwnSocket(0, is_ipv6=True, places=(HOME_A,), leads_to=bool)]
+    own = [OwnSocket(0, is_ipv6=True, places=(HOME_A,), leads_to=bool)]
+    monkeypatch.setattr(clients, "own_sockets", lambda _: own)
     relays.do_housekeeping(0.0)
     assert relays.on_record(RecordReceived(peer, path, Candidates((HOME_B,)), 5), 0.0) is None
     lists = 0
