@@ -110,6 +110,16 @@ def test_warnings_are_first_and_each_is_a_line(tmp_path: Path) -> None:
     assert printed.startswith('warning: endpoint "tablet": plain MAVLink leaves this machine')
 
 
+def test_a_station_is_behind_its_key(tmp_path: Path) -> None:
+    """It is an endpoint; stations have a port of their own."""
+    keys.write_secret_file(tmp_path / "stations.key", keys.generate_private_key())
+    station = f'name = "tablet"\npublic_key = "{keys.public_key_text(keys.generate_private_key())}"\n'
+    sections = f'[stations]\nprivate_key_file = "stations.key"\n[[station]]\n{station}address = "10.66.0.2"\n'
+    printed = _printed(load(tmp_path, f'{_FILE}{sections}role = "operator"\nsystem_ids = [255]\n'))
+    assert "station:10.66.0.2, open to the holder of its key; operator, system 255" in _line(printed, "endpoint tab")
+    assert "0.0.0.0:51820 (UDP)" in _line(printed, "stations")
+
+
 @pytest.mark.parametrize(
     ("wrong", "left"),
     [

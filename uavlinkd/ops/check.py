@@ -26,7 +26,7 @@ from uavlinkd.config.model import (
     NetworkConfig,
     PeerConfig,
 )
-from uavlinkd.io.url import SerialUrl
+from uavlinkd.io.url import SerialUrl, StationUrl
 from uavlinkd.mavlink import dialect
 from uavlinkd.mavlink.policy.compilation import Policy, PolicyRow
 from uavlinkd.ops import CHECK_SCHEMA
@@ -38,6 +38,7 @@ Row = tuple[str, str]
 Verdict = dict[str, list[str]]
 """Sentences for a person by their kind, which is a key of ``--json``."""
 _LABELS: Final = {"examples": "example", "warnings": "warning", "this_machine": "this machine"}
+_OPEN_TO: Final[dict[type, str]] = {SerialUrl: "the wire", StationUrl: "the holder of its key"}
 _ROOM: Final = 20
 """Rows of a terminal that the facts fill without ``--verbose``: of 24, with what is above and below them."""
 
@@ -112,6 +113,8 @@ def _rows(config: Config, is_verbose: bool) -> Iterator[Row]:
     for peer in config.peers:
         yield f"peer {peer.name}", _peer(peer, config) + key(peer.settings.public_key)
     yield from map(_endpoint, config.endpoints)
+    if config.stations is not None:
+        yield "stations", f"come with WireGuard to {config.stations.listen} (UDP), as endpoints"
     if config.relays_frames:
         yield "routing", "also from peer to peer"
     if config.fleet is not None:
@@ -142,11 +145,7 @@ def _peer(peer: PeerConfig, config: Config) -> str:
 
 
 def _endpoint(endpoint: EndpointConfig) -> Row:
-    exposure = "this machine"
-    if endpoint.url.is_exposed:
-        exposure = "THE NETWORK"
-    elif isinstance(endpoint.url, SerialUrl):
-        exposure = "the wire"
+    exposure = "THE NETWORK" if endpoint.url.is_exposed else _OPEN_TO.get(type(endpoint.url), "this machine")
     rights = endpoint.make_policy() if endpoint.policy else "may send all but SETUP_SIGNING"
     return f"endpoint {endpoint.name}", f"{endpoint.url}, open to {exposure}; {rights}"
 
