@@ -13,42 +13,63 @@ from uavlinkd.daemon.copies import DEBT_S, LEAST_BITS_S, MAX_WAIT_S, MAX_WAITING
 from uavlinkd.daemon.journal import ShellReason
 from uavlinkd.daemon.networks import NetworkBudget, wire_bytes
 from uavlinkd.mavlink.frames import Frame
-from uavlinkd.protocol.outputs import Transmit
 from uavlinkd.protocol.path import Path
+from uavlinkd.protocol.path_state import PathState
 
 SLOW_BITS_S = 8000
 SEAL_BYTES = 23
-FREE, SLOW, OTHER = (Path(number, (f"192.0.{number}.2", 14600)) for number in range(3))
+FREE, SLOW, OTHER = PATHS = tuple(
+    PathState(Path(number, (f"192.0.{number}.2", 14600)), number, 0.0, is_configured=True, is_metered=False)
+    for number in range(3)
+)
 
 
-def envelope(frames: Sequence[Frame], *paths: Path) -> list[Transmit]:
-    """One envelope with these frames along these paths."""
-    datagram = bytes(SEAL_BYTES) + b"".join(raws(frames))
-    return [Transmit(datagram, path, is_copy=number > 0) for number, path in enumerate(paths)]
+def envelope(frames: Sequence[Frame]) -> bytes:
+    """One envelope with these frames."""
+    return bytes(SEAL_BYTES) + b"".join(raws(frames))
+
+
+def size_along(path: PathState, datagram: bytes) -> int:
+    """What a datagram costs the network of a path."""
+    return wire_bytes(datagram, path.path)
 
 
 class Scene:
     """A peer with a free network and a slow one, and a daemon that sends and charges. ``spent``: on the slow one."""
 
     def __init__(self, budgets: dict[int, int] | None = None, spent: int = 0) -> None:
-        limits = {SLOW.socket: SLOW_BITS_S} if budgets is None else budgets
+        limits = {SLOW.number: SLOW_BITS_S} if budgets is None else budgets
         self.budgets = {number: NetworkBudget(bits_s, 0.0) for number, bits_s in limits.items()}
         self.copies = Copies(self.budgets, 0.0)
-        self.sent: list[tuple[float, Transmit]] = []
+        self.sent: list[tuple[float, PathState, bytes]] = []
         self.now = 0.0
         if spent:
             self.spend(SLOW, spent, 0.0)
 
-    def spend(self, path: Path, size: int, now: float) -> None:
+    def spend(self, path: PathState, size: int, now: float) -> None:
         """Something else uses the network."""
-        self.budgets[path.socket].all.spend(size, now)
+        self.budgets[path.number].all.spend(size, now)
 
-    def send(self, frames: Sequence[Frame], now: float, *paths: Path, is_critical: bool = True) -> list[Path]:
+    def send(
+        self,
+        frames: Sequence[Frame],
+        now: float,
+        *paths: PathState,
+        is_critical: bool = True,
+        other: Copies | None = None,
+    ) -> list[PathState]:
         """Send an envelope along these paths, or the free one and the slow one. Returns where it went at once."""
-        self.now = now
-        picked = self.copies.pick(envelope(frames, *(paths or (FREE, SLOW))), frames if is_critical else None, now)
-        self._send(picked, now)
-        return [transmit.path for transmit in picked]
+        self.now, copies, datagram = now, other or self.copies, envelope(frames)
+        along, later = copies.divide(paths or (FREE, SLOW), now)
+        copies.add(datagram, along, later, frames if is_critical else None, 1, now)
+        for path in along:
+            self._send(path, datagram, now)
+        return list(along)
+
+    def release(self, copies: Copies, now: float, usable: Sequence[PathState] = PATHS) -> None:
+        """Send what is due."""
+        for path, datagram, _ in copies.release(usable, (), now):
+            self._send(path, datagram, now)
 
     def run(self, until: float) -> None:
         """Let time pass: copies are released at their deadlines and never else."""
@@ -58,21 +79,24 @@ class Scene:
                 self.now = until
                 return
             self.now = max(self.now, deadline)
-            self._send([transmit for transmit, _ in self.copies.release((), self.now)], self.now)
+            self.release(self.copies, self.now)
         raise AssertionError("deadlines without end")
 
-    def _send(self, transmits: Sequence[Transmit], now: float) -> None:
-        for transmit in transmits:
-            self.sent.append((now, transmit))
-            if transmit.path.socket in self.budgets:
-                self.spend(transmit.path, wire_bytes(transmit.datagram, transmit.path), now)
+    def _send(self, path: PathState, datagram: bytes, now: float) -> None:
+        self.sent.append((now, path, datagram))
+        if path.number in self.budgets:
+            self.spend(path, size_along(path, datagram), now)
 
-    def along(self, path: Path, *frames: Frame) -> list[float]:
+    def datagrams(self, path: PathState) -> list[bytes]:
+        """What went along a path."""
+        return [datagram for _, along, datagram in self.sent if along is path]
+
+    def along(self, path: PathState, *frames: Frame) -> list[float]:
         """When envelopes with one of these frames went along a path."""
         return [
             now
-            for now, transmit in self.sent
-            if transmit.path == path and any(frame.raw in transmit.datagram for frame in frames)
+            for now, along, datagram in self.sent
+            if along is path and any(frame.raw in datagram for frame in frames)
         ]
 
 
@@ -105,6 +129,15 @@ def test_copy_that_waited_too_long_is_dropped() -> None:
     assert scene.copies.dropped == {ShellReason.COPY_OVER_BUDGET: 1}
 
 
+def test_copy_for_a_path_that_is_gone_is_dropped() -> None:
+    """At once: nothing leaves along a slot that is not in use any more."""
+    scene = Scene(spent=1000)
+    scene.send([command(1)], 0.0)
+    scene.release(scene.copies, 0.01, (FREE,))
+    assert scene.along(SLOW, command(1)) == []
+    assert scene.copies.dropped == {ShellReason.COPY_OVER_BUDGET: 1}
+
+
 def test_first_datagram_of_an_envelope_goes_where_there_is_room() -> None:
     """The best path's network is far in debt: its datagram waits as the copy of the other one."""
     scene = Scene(spent=1000)
@@ -115,7 +148,7 @@ def test_first_datagram_of_an_envelope_goes_where_there_is_room() -> None:
 
 def test_envelope_without_room_anywhere_goes_along_the_best_path() -> None:
     """It was sealed when there was room, which something else used up since."""
-    scene = Scene({SLOW.socket: SLOW_BITS_S, OTHER.socket: SLOW_BITS_S})
+    scene = Scene({SLOW.number: SLOW_BITS_S, OTHER.number: SLOW_BITS_S})
     scene.spend(SLOW, 1500, 0.0)
     scene.spend(OTHER, 1500, 0.0)
     assert scene.send([command(1)], 0.0, SLOW, OTHER) == [SLOW]
@@ -161,7 +194,7 @@ def test_commands_and_heartbeats_go_before_other_events_and_states() -> None:
     times = [scene.along(SLOW, frame) for frame in (heartbeat(1), command(1), parameter(1), manual_control(1))]
     assert [len(at) for at in times] == [1, 1, 1, 1]
     expected = raws([heartbeat(1), command(1), parameter(1), manual_control(1)])
-    assert [sent.datagram[SEAL_BYTES:] for _, sent in scene.sent if sent.path == SLOW] == expected
+    assert [datagram[SEAL_BYTES:] for datagram in scene.datagrams(SLOW)] == expected
 
 
 def test_copy_does_not_overtake_those_that_wait() -> None:
@@ -181,10 +214,10 @@ def test_copies_of_all_peers_use_half_of_a_budget() -> None:
     for tick in range(50 * seconds):
         now = tick / 50
         scene.send([command(tick)], now)
-        scene._send(other.pick(envelope([command(-tick)], FREE, SLOW), [command(-tick)], now), now)
+        scene.send([command(-tick)], now, other=other)
         scene.run(now)
-        scene._send([transmit for transmit, _ in other.release((), now)], now)
-    used = sum(wire_bytes(sent.datagram, SLOW) for _, sent in scene.sent if sent.path == SLOW)
+        scene.release(other, now)
+    used = sum(size_along(SLOW, datagram) for datagram in scene.datagrams(SLOW))
     half = SLOW_BITS_S / 8 / 2 * seconds
     assert 0.9 * half < used < half + 600
     assert scene.copies.dropped[ShellReason.COPY_OVER_BUDGET] > 0
@@ -207,7 +240,7 @@ def test_copies_use_at_most_the_rate_of_the_stream_or_64_kbit_s(stream_bytes_s: 
         now = tick / 400
         scene.send([command(tick)], now)
         scene.run(now)
-    used = sum(wire_bytes(sent.datagram, SLOW) for _, sent in scene.sent if sent.path == SLOW)
+    used = sum(size_along(SLOW, datagram) for datagram in scene.datagrams(SLOW))
     assert 0.95 * bytes_s * seconds < used < bytes_s * (seconds + 0.5)
 
 
@@ -251,5 +284,4 @@ def test_every_copy_is_sent_once_or_counted(offers: list[tuple[list[object], flo
         first += FREE in scene.send(frames, now)
     scene.run(now + 5)
     assert first == len(offers)
-    copies = [sent.datagram for _, sent in scene.sent if sent.path == SLOW]
-    assert len(copies) + scene.copies.dropped.total() == len(offers)
+    assert len(scene.datagrams(SLOW)) + scene.copies.dropped.total() == len(offers)

@@ -159,8 +159,8 @@ class Traffic:
 
     def __init__(self) -> None:
         self.history, self.now = History(0.0), 0.0
-        output = SimpleNamespace(egress=None)
-        self.link: Any = SimpleNamespace(name="drone1", counters=SplitCounters(), frames_sent=0, output=output)
+        pacer = SimpleNamespace(egress=None)
+        self.link: Any = SimpleNamespace(name="drone1", counters=SplitCounters(), frames_sent=0, pacer=pacer)
         self.policy({"role": "all", "system_ids": [2]})
 
     def policy(self, rules: dict[str, object]) -> None:

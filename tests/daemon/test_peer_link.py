@@ -207,12 +207,12 @@ def test_reports_leave_room_for_frames(budget: int) -> None:
     sent.clear()
     link.report_refusals(1.0)
     assert len(of(sent, Transmit)) == (0 if budget else 1)
-    if budget and link.output.egress is not None:
-        link.output.egress.clear()
-        before = link.output.egress.demand(30.0)
+    if budget and link.pacer.egress is not None:
+        link.pacer.egress.clear()
+        before = link.pacer.demand(30.0)
         link.report_refusals(30.0)
         assert len(of(sent, Transmit)) == 1
-        assert link.output.egress.demand(30.0) > before
+        assert link.pacer.demand(30.0) > before
 
 
 def test_problem_reports_use_little_of_a_slow_link() -> None:

@@ -12,11 +12,13 @@ from uavlinkd.daemon.copies import AVERAGE_S, HOLD_S, KNOWN_S, LEAST_BITS_S, MAX
 from uavlinkd.daemon.journal import ShellReason
 from uavlinkd.daemon.networks import NetworkBudget
 from uavlinkd.mavlink.frames import Frame
-from uavlinkd.protocol.outputs import Transmit
 from uavlinkd.protocol.path import Path
 from uavlinkd.protocol.path_state import PathCondition, PathState
 
-HERE, THERE = Path(0, ("192.0.2.1", 14600)), Path(1, ("192.0.2.2", 14600))
+HERE, THERE = BOTH = tuple(
+    PathState(Path(number, (f"192.0.{number}.2", 14600)), number, 0.0, is_configured=True, is_metered=False)
+    for number in range(2)
+)
 
 
 class _Lossy:
@@ -125,9 +127,17 @@ class Scene:
         self.copies = Copies(budgets or {}, 0.0)
         self.sent: list[tuple[float, bytes, int]] = []
 
-    def put(self, name: bytes, frames: Sequence[Frame], now: float, times: int = 5, along: Path = HERE) -> None:
-        """An envelope was sent."""
-        self.copies.repeat(name.ljust(100, b"."), [along], frames, times, now)
+    def put(
+        self, name: bytes, frames: Sequence[Frame], now: float, times: int = 5, along: Sequence[PathState] = (HERE,)
+    ) -> None:
+        """An envelope is sent."""
+        self.copies.add(name.ljust(100, b"."), tuple(along), (), frames, times, now)
+
+    def leaves_along(self, size: int, now: float) -> Sequence[PathState]:
+        """An envelope with a command is to be sent along both paths. Where it leaves at once; nothing is repeated."""
+        along, later = self.copies.divide(BOTH, now)
+        self.copies.add(bytes(size), along, later, [command(1)], 1, now)
+        return along
 
     def run(self, now: float, until: float) -> None:
         """Let time pass."""
@@ -135,8 +145,8 @@ class Scene:
             now = max(now, self.copies.next_deadline(now))
             if now > until:
                 return
-            for transmit, number in self.copies.release((HERE, THERE), now):
-                self.sent.append((round(now, 4), transmit.datagram.rstrip(b"."), number))
+            for _, datagram, number in self.copies.release(BOTH, (), now):
+                self.sent.append((round(now, 4), datagram.rstrip(b"."), number))
         raise AssertionError("deadlines without end")
 
 
@@ -154,38 +164,40 @@ def test_copies_that_wait_for_a_path_go_before_its_repeats() -> None:
     """They carry what has not gone there yet."""
     scene = Scene({1: (budget := NetworkBudget(8000, 0.0))})
     budget.all.spend(1000, 0.0)
-    assert len(scene.copies.pick([Transmit(b"x", HERE), Transmit(b"x", THERE, is_copy=True)], [command(1)], 0.0)) == 1
-    scene.put(b"a", [command(1)], 0.0, along=THERE)
-    assert scene.copies.release((HERE, THERE), 0.1) == []
+    assert scene.leaves_along(100, 0.0) == (HERE,)
+    scene.put(b"a", [command(1)], 0.0, along=[THERE])
+    assert scene.copies.release(BOTH, (), 0.1) == []
 
 
 def test_repeats_behind_copies_that_wait_need_no_polling() -> None:
     """The rate of copies is used up, the network's budget is not: the next deadline is that of the copies."""
     scene = Scene()
-    pair = [Transmit(bytes(1000), HERE), Transmit(bytes(1000), THERE, is_copy=True)]
-    for _ in range(3):
-        scene.copies._charge(pair[1], 0.0, scene.copies._rate)
-    assert len(scene.copies.pick(pair, [command(1)], 0.0)) == 1
-    scene.put(b"a", [command(1)], 0.0, along=THERE)
+    scene.copies.add(bytes(3000), BOTH, (), None, 1, 0.0)
+    assert scene.leaves_along(1000, 0.0) == (HERE,)
+    scene.put(b"a", [command(1)], 0.0, along=[THERE])
     now, wakeups = 0.0, 0
     while scene.copies.waiting:
         now = scene.copies.next_deadline(now)
-        scene.sent += [(now, b"a", number) for _, number in scene.copies.release((THERE,), now) if number > 1]
+        released = scene.copies.release((THERE,), (), now)
+        scene.sent += [(now, b"a", number) for _, _, number in released if number > 1]
         wakeups += 1
     assert [number for _, _, number in scene.sent] == [2, 3, 4, 5]
     assert scene.sent[0][0] > 2 * SPACING_S
     assert wakeups <= 7
 
 
-def test_nothing_is_repeated_along_a_path_that_is_gone() -> None:
+@pytest.mark.parametrize(("usable", "unrepeated"), [((HERE,), ()), (BOTH, (THERE,))], ids=["gone", "left out"])
+def test_nothing_is_repeated_along_a_path_that_is_gone_or_left_out(
+    usable: Sequence[PathState], unrepeated: Sequence[PathState]
+) -> None:
     """It is not counted either. An envelope without a path ends."""
     scene = Scene()
-    scene.copies.repeat(b"both", [HERE, THERE], [command(1)], 5, 0.0)
-    scene.copies.repeat(b"there", [THERE], [command(1)], 5, 0.0)
-    ((repeat, _),) = scene.copies.release((HERE,), SPACING_S)
-    assert (repeat.datagram, repeat.path) == (b"both", HERE)
+    scene.put(b"both", [command(1)], 0.0, along=BOTH)
+    scene.put(b"there", [command(1)], 0.0, along=[THERE])
+    ((path, datagram, _),) = scene.copies.release(usable, unrepeated, SPACING_S)
+    assert (datagram.rstrip(b"."), path) == (b"both", HERE)
     assert (scene.copies.repeats_sent, len(scene.copies.waiting)) == (1, 1)
-    assert scene.copies.release((), 1.0) == []
+    assert scene.copies.release((), (), 1.0) == []
     assert not scene.copies.waiting
 
 

@@ -15,8 +15,8 @@ from tests.mavlink.policy.smuggling import SET_MODE, v1, v2
 from uavlinkd.daemon import line as line_module
 from uavlinkd.daemon import switch as switch_module
 from uavlinkd.daemon.journal import DaemonJournal, ShellReason
+from uavlinkd.daemon.pacer import Pacer
 from uavlinkd.daemon.peer_link import PeerLink
-from uavlinkd.daemon.peer_output import PeerOutput
 from uavlinkd.daemon.switch import Switch
 from uavlinkd.io.ports import Endpoint, LocalPort, PortHandler
 from uavlinkd.mavlink.frames import Frame, SplitCounters, split_datagram
@@ -70,7 +70,7 @@ class Peer(PeerLink):
         self.received: list[bytes] = []
         self.vehicles = Vehicles()
         self.peer = cast("CorePeer", SimpleNamespace(paths=SimpleNamespace(is_multiple=True)))
-        self.output = cast("PeerOutput", SimpleNamespace(is_plain=False))
+        self.pacer = cast("Pacer", SimpleNamespace(is_plain=False))
 
     def send(self, frames: Sequence[Frame], source: Source, now: float, waited_s: float) -> None:
         self.received += [raw for raw, _ in frames]

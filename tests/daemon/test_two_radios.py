@@ -9,7 +9,7 @@ import pytest
 
 from tests.daemon.two_radios import End, Network, Radio
 from tests.samples import attitude, command, manual_control
-from uavlinkd.daemon.peer_output import PeerOutput
+from uavlinkd.daemon.pacer import Pacer
 from uavlinkd.mavlink.egress.peer_egress import EgressSettings
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.protocol.path_state import PathCondition
@@ -44,7 +44,7 @@ def test_copies_that_wait_are_not_counted_as_lost_by_their_path() -> None:
         modem = pair.alpha.peer.paths.states[1]
         assert modem.condition is PathCondition.USABLE
         assert modem.loss_out < 0.05
-    assert pair.alpha.link.output.copies.dropped.total() > 100
+    assert pair.alpha.link.pacer.copies.dropped.total() > 100
 
 
 @pytest.mark.parametrize("is_removed", [True, False], ids=["removed", "changed by a reload"])
@@ -53,7 +53,7 @@ def test_peer_that_stops_waiting_lets_others_use_the_network(is_removed: bool) -
     pair = network(TELEMETRY_MODEM)
     budget = pair.alpha.budgets[0]
     alpha = pair.alpha
-    other = PeerOutput(EgressSettings(), alpha.peer, alpha.node, alpha.budgets, lambda *_: None, pair.now)
+    other = Pacer(EgressSettings(), alpha.peer, alpha.node, alpha.budgets, lambda *_: None, pair.now)
     other.follow(pair.now)
     budget.all.spend(1.1 * RADIO_BITS_S / 8, pair.now)
     pair.alpha.send(attitude(1))

@@ -187,10 +187,11 @@ class Insider:
 
     def _take(self, outputs: list[Output], path: Path | None) -> None:
         refused = 0
+        copies = Counter(out.datagram for out in of(outputs, Transmit))
         for out in outputs:
             if type(out) is Transmit:
                 self._charge(out)
-                self._see(out)
+                self._see(out.datagram, copies[out.datagram])
             elif type(out) is Deliver:
                 assert out.peer is self.peer, "delivered for another peer"
                 assert out.payload[0] >= wire.FRAMES_FROM, "a control record was delivered"
@@ -212,21 +213,21 @@ class Insider:
         state = self.peer.paths.find(path)
         return state is not None and state.is_proven
 
-    def _see(self, sent: Transmit) -> None:
-        """Read from the victim's outputs what an honest peer would read."""
-        if sent.datagram[0] not in (wire.SHORT_ENVELOPE, wire.LONG_ENVELOPE):
+    def _see(self, datagram: bytes, copies: int) -> None:
+        """Read from the victim's outputs what an honest peer would read. ``copies``: how often they have it."""
+        if datagram[0] not in (wire.SHORT_ENVELOPE, wire.LONG_ENVELOPE):
             return
-        index, _, _ = wire.parse_envelope_header(sent.datagram)
+        index, _, _ = wire.parse_envelope_header(datagram)
         for session in self.sessions:
             if session.local_index == index:
-                payload = unsealed(session, sent.datagram)
+                payload = unsealed(session, datagram)
                 if payload and payload[0] < wire.FRAMES_FROM:
-                    self.learn(wire.parse_control(payload), sent)
+                    self.learn(wire.parse_control(payload), copies)
 
-    def learn(self, control: wire.Control, sent: Transmit) -> None:
+    def learn(self, control: wire.Control, copies: int) -> None:
         """A record that an honest peer would read."""
         if isinstance(control, wire.ProbeAndFrames):
-            assert not sent.is_copy, "a probe was copied"
+            assert copies == 1, "a probe was copied"
             if control.probe.question:
                 self.questions = [*self.questions[-3:], control.probe.question]
         elif isinstance(control, wire.Echo) and not control.is_reply:

@@ -107,7 +107,7 @@ def mission(radios: Radios, seed: int, *, has_repair: bool = True) -> Transfer:
     vehicle, station = Autopilot(network, network.alpha), Station(network, network.bravo, ITEMS)
     network.radios[:] = radios
     network.run(network.now + SETTLING_S)
-    repeats = [end.link.output.copies for end in (network.alpha, network.bravo)]
+    repeats = [end.link.pacer.copies for end in (network.alpha, network.bravo)]
     before = sum(one.repeats_sent for one in repeats), sum(one.repeat_bytes for one in repeats)
     began_at = network.now
     station.upload()

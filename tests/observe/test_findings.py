@@ -469,7 +469,7 @@ def test_frames_that_were_dropped_here_are_named() -> None:
     """They waited for a budget or a connection by TLS. Newer states that replace older ones are no problem."""
     daemon = Daemon()
     egress = PeerEgress(EgressSettings(), NOW)
-    daemon.set_up(role="all", system_ids="all").output.egress = egress
+    daemon.set_up(role="all", system_ids="all").pacer.egress = egress
     egress.totals[EgressDrop.THINNED] = 1000
     daemon.cross(sent=[heartbeat()])
     assert daemon.findings() == {}

@@ -51,7 +51,6 @@ class Sent(NamedTuple):
     side: Side
     datagram: bytes
     path: Path
-    is_copy: bool
 
 
 class Seen(NamedTuple):
@@ -113,7 +112,7 @@ class Radios:
             if not isinstance(out, Transmit):
                 self.seen.append(Seen(self.now, side, out))
                 continue
-            self.sent.append(Sent(self.now, side, out.datagram, out.path, out.is_copy))
+            self.sent.append(Sent(self.now, side, out.datagram, out.path))
             radio = self.radios[out.path.socket]
             here, there = (at_a, at_b) if side is self.a else (at_b, at_a)
             if out.path != there(out.path.socket) or radio.is_dead or radio.loses(out.datagram):

@@ -71,7 +71,7 @@ def test_copies_of_an_initiation_get_the_same_response_once_along_each_path() ->
         (first,) = radios.b.node.receive(message[0], at_a(0), 0.0)
         copy, counted = radios.b.node.receive(message[1], at_a(1), 0.0)
         assert isinstance(first, Transmit)
-        assert copy == Transmit(first.datagram, at_a(1), is_copy=True)
+        assert copy == Transmit(first.datagram, at_a(1))
         assert reasons([counted]) == [DropReason.DUPLICATE]
         for radio in (0, 1):
             again = radios.b.node.receive(message[radio], at_a(radio), 0.2)

@@ -16,7 +16,7 @@ from uavlinkd.protocol.drops import DropReason
 from uavlinkd.protocol.outputs import Deliver, SessionEstablished, Transmit
 from uavlinkd.protocol.path import Path
 from uavlinkd.protocol.path_state import PathCondition
-from uavlinkd.protocol.send import ask_for_echo
+from uavlinkd.protocol.send import ask_for_echo, send_again
 from uavlinkd.protocol.settings import Class, Redundancy
 
 CRITICAL, STREAM, BULK = Class
@@ -54,12 +54,28 @@ def test_critical_envelope_goes_along_every_path_and_is_delivered_once(radios: R
     radios.send(radios.a, CRITICAL)
     radios.run(0.2)
     sent = radios.envelopes(radios.a, since)[:2]
-    assert [(out.path, out.is_copy) for out in sent] == [(at_b(0), False), (at_b(1), True)]
+    assert [out.path for out in sent] == [at_b(0), at_b(1)]
     assert sent[0].datagram is sent[1].datagram
     assert [out.payload for out in radios.delivered(radios.b, since)] == [FRAME]
     for cls in (STREAM, BULK):
         (out,) = of(radios.a.node.send(radios.a.peer, [FRAME], radios.now, cls), Transmit)
-        assert (out.path, out.is_copy) == (at_b(0), False)
+        assert out.path == at_b(0)
+
+
+def test_copy_for_which_a_path_has_no_room_yet_is_counted_when_it_leaves(radios: Radios) -> None:
+    """The same bytes, which are sealed when the envelope leaves along its first path. Until then it costs nothing."""
+    peer, (first, later) = radios.a.peer, (radios.state(radios.a, radio) for radio in (0, 1))
+
+    def totals() -> tuple[int, ...]:
+        return later.sent, later.datagrams_sent, later.bytes_sent, *peer.paths.totals[:2]
+
+    (sent,) = of(radios.a.node.send(peer, [FRAME], radios.now, CRITICAL, (first,)), Transmit)
+    before, size = totals(), len(sent.datagram)
+    assert sent.path == first.path
+    assert send_again(peer, later, sent.datagram) == Transmit(sent.datagram, later.path)
+    assert [total - was for total, was in zip(totals(), before, strict=True)] == [1, 1, size, 1, size]
+    assert cross(radios, 1, sent.datagram) == [FRAME]
+    assert cross(radios, 0, sent.datagram) == []
 
 
 def test_critical_envelopes_are_short_while_two_paths_work(radios: Radios) -> None:

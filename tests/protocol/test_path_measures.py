@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from tests.protocol.harness import AT_B, ELSEWHERE, Named, of
+from tests.protocol.harness import AT_B, Named, of
 from tests.protocol.radios import Radios
 from uavlinkd.protocol import constants as c
 from uavlinkd.protocol import establish
 from uavlinkd.protocol.constants import NEVER
-from uavlinkd.protocol.outputs import PathChanged
+from uavlinkd.protocol.outputs import PathChanged, Transmit
 from uavlinkd.protocol.path import Path, SocketFacts
 from uavlinkd.protocol.path_measures import (
     FIRST_WAITS_S,
@@ -28,6 +28,7 @@ from uavlinkd.protocol.path_measures import (
 )
 from uavlinkd.protocol.path_state import PathState
 from uavlinkd.protocol.paths import PathSet
+from uavlinkd.protocol.send import send_again
 from uavlinkd.protocol.settings import Redundancy
 
 # Loss.
@@ -91,7 +92,7 @@ def test_reports_are_limited_in_age_and_number() -> None:
 
 
 def test_repeat_is_counted_in_bytes_but_not_as_another_envelope() -> None:
-    """The receiver counts an envelope once too. Repeats on an older session, or along another path, do not count."""
+    """The receiver counts an envelope once too. Repeats of an envelope of an older session do not count."""
     radios = Radios().run(1.0)
     node, peer, state = radios.a.node, radios.a.peer, radios.state(radios.a, 0)
     old = radios.pair.a.envelope(radios.now)
@@ -99,18 +100,13 @@ def test_repeat_is_counted_in_bytes_but_not_as_another_envelope() -> None:
     radios.run(0.5)
     envelope = radios.pair.a.envelope(radios.now)
     sent, datagrams_sent, size = state.sent, state.datagrams_sent, state.bytes_sent
-    for path, number, datagram in (
-        (state.path, 2, envelope),
-        (state.path, 3, envelope),
-        (ELSEWHERE, 2, envelope),
-        (state.path, 2, old),
-    ):
-        peer.note_repeat(path, number, datagram)
+    for number, datagram in ((2, envelope), (3, envelope), (2, old)):
+        assert send_again(peer, state, datagram, number) == Transmit(datagram, state.path)
     assert state.repeats == counts(1, 1)
     assert (state.sent, state.datagrams_sent) == (sent, datagrams_sent + 3)
     assert state.bytes_sent == size + 2 * len(envelope) + len(old)
     node.close(radios.now)
-    peer.note_repeat(state.path, 2, old)
+    send_again(peer, state, old, 2)
     assert state.repeats == counts(1, 1)
     state.note_session()
     assert sum(state.repeats) == 0

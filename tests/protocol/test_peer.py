@@ -212,27 +212,6 @@ def test_traffic_is_counted(pair: Pair) -> None:
     assert ours.traffic.handshakes == theirs.traffic.handshakes == 1
 
 
-def test_copy_that_is_not_sent_is_not_counted_and_one_that_waited_is_counted_later(pair: Pair) -> None:
-    """In the totals of the path and of the peer, for which a budget is charged. They never go below zero."""
-    pair.a.send(1.0)
-    peer = pair.a.peer
-    state = peer.paths.by_path[AT_B]
-
-    def totals() -> tuple[int, ...]:
-        return state.sent, state.datagrams_sent, state.bytes_sent, *peer.paths.totals[:2]
-
-    before, size = totals(), len(FRAME)
-    peer.recount(AT_B, -1, -size)
-    peer.recount(ELSEWHERE, -1, -100)
-    changes = (1, 1, size, 1, size)
-    assert totals() == tuple(total - change for total, change in zip(before, changes, strict=True))
-    peer.recount(AT_B, 1, size)
-    assert totals() == before
-    state.note_session()
-    peer.recount(AT_B, -1, -100)
-    assert state.sent == 0
-
-
 # The age of keys.
 
 

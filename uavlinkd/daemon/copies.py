@@ -25,9 +25,8 @@ from uavlinkd.mavlink.egress.bucket import Bucket
 from uavlinkd.mavlink.flows import FlowKey, flow_key
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.protocol.constants import TRANSMISSIONS
-from uavlinkd.protocol.outputs import Transmit
-from uavlinkd.protocol.path import Path
 from uavlinkd.protocol.path_state import PathCondition, PathState
+from uavlinkd.protocol.paths import Route
 
 MAX_WAIT_S: Final = 0.5
 """What waits longer is dropped."""
@@ -65,7 +64,7 @@ class _Waiting:
     """A sealed datagram that waits: a copy for one path, or an envelope that is sent again along its paths."""
 
     def __init__(
-        self, datagram: bytes, paths: Sequence[Path], frames: Sequence[Frame], last: int, now: float
+        self, datagram: bytes, paths: Sequence[PathState], frames: Sequence[Frame], last: int, now: float
     ) -> None:
         self.datagram = datagram
         self.paths = paths
@@ -119,60 +118,67 @@ class Copies:
         self._average.set_rate(rate, now)
         self._average.set_least_burst(AVERAGE_S * rate if most_bytes_s == inf else LARGEST_BYTES)
 
-    def pick(self, outputs: Sequence[Transmit], frames: Sequence[Frame] | None, now: float) -> list[Transmit]:
-        """Of the datagrams of one envelope, those that are sent now. The others wait, or are dropped.
+    def divide(self, route: Route, now: float) -> tuple[Route, list[PathState]]:
+        """Divide a route: the paths along which the next envelope leaves now, and those for which it has to wait."""
+        leaving: list[PathState] = []
+        later: list[PathState] = []
+        for path in route:
+            is_next = not leaving or not any(one.is_copy and path in one.paths for one in self.waiting)
+            has_room = is_next and self._has_room(path, now, self._rate if leaving else None)
+            (leaving if has_room else later).append(path)
+        # If no network has room, although one had when the frames were taken, the best path pays with debt.
+        return (tuple(leaving), later) if leaving else (route[:1], later[1:])
+
+    def add(
+        self,
+        datagram: bytes,
+        along: Route,
+        later: Sequence[PathState],
+        frames: Sequence[Frame] | None,
+        transmissions: int,
+        now: float,
+    ) -> None:
+        """Charge the copies of an envelope that leaves now. It waits for ``later`` paths, and for its repeats.
 
         ``frames``: those in the envelope, if it is critical; None for another class, whose copies do not wait.
         """
-        picked: list[Transmit] = []
-        waiting: list[Transmit] = []
-        for transmit in outputs:
-            is_next = not picked or not any(one.is_copy and transmit.path in one.paths for one in self.waiting)
-            has_room = is_next and self._has_room(transmit.path, now, self._rate if picked else None)
-            (picked if has_room else waiting).append(transmit)
-        if waiting and not picked:
-            # No network has room, although one had when the envelope was sealed: the best path pays with debt.
-            picked.append(waiting.pop(0))
-        for transmit in picked[1:]:
-            self._charge(transmit, now, self._rate)
-        for transmit in waiting:
-            if frames is None:
-                self.dropped[ShellReason.COPY_OVER_BUDGET] += 1
-            else:
-                self._put(_Waiting(transmit.datagram, (transmit.path,), frames, 1, now))
-        return picked
+        for path in along[1:]:
+            self._charge(datagram, path, now, self._rate)
+        if frames is None:
+            self.dropped[ShellReason.COPY_OVER_BUDGET] += len(later)
+            return
+        for path in later:
+            self._put(_Waiting(datagram, (path,), frames, 1, now))
+        if transmissions > 1:
+            self._put(_Waiting(datagram, along, frames, transmissions, now))
 
-    def repeat(
-        self, datagram: bytes, paths: Sequence[Path], frames: Sequence[Frame], transmissions: int, now: float
-    ) -> None:
-        """An envelope with these frames was sent along these paths; send it up to so many times in all, from 2."""
-        self._put(_Waiting(datagram, paths, frames, transmissions, now))
-
-    def release(self, usable: Container[Path], now: float) -> list[tuple[Transmit, int]]:
+    def release(
+        self, usable: Container[PathState], unrepeated: Container[PathState], now: float
+    ) -> list[tuple[PathState, bytes, int]]:
         """What is due and has room, each with its number along its path: 1 for a copy, from 2 for repeats.
 
-        What waited too long is dropped. Repeats go along ``usable`` paths only.
+        What waited too long is dropped, and copies for a path that is not ``usable`` any more. Repeats do not go
+        along ``unrepeated`` paths.
         """
-        self._drop([one for one in self.waiting if now >= one.put_at + MAX_WAIT_S], ShellReason.COPY_OVER_BUDGET)
         for one in self.waiting:
-            if not one.is_copy:
-                one.paths = [path for path in one.paths if path in usable]
-        released: list[tuple[Transmit, int]] = []
-        blocked: set[Path] = set()  # copies wait for these, and go before repeats
+            one.paths = [path for path in one.paths if path in usable and (one.is_copy or path not in unrepeated)]
+        gone = [one for one in self.waiting if now >= one.put_at + MAX_WAIT_S or (one.is_copy and not one.paths)]
+        self._drop(gone, ShellReason.COPY_OVER_BUDGET)
+        released: list[tuple[PathState, bytes, int]] = []
+        blocked: set[PathState] = set()  # copies wait for these, and go before repeats
         due = [one for one in self.waiting if one.due_at <= now]
         for one in sorted(due, key=lambda one: (not one.is_copy, one.rank, one.number)):
             number, rate = one.number, self._rate if one.is_copy else self._average
             for path in one.paths:
-                transmit = Transmit(one.datagram, path, is_copy=True)
                 if path in blocked or not self._has_room(path, now, rate):
                     if one.is_copy:
                         blocked.add(path)
                     continue
-                self._charge(transmit, now, rate)
+                size = self._charge(one.datagram, path, now, rate)
                 if number > 1:
                     self.repeats_sent += 1
-                    self.repeat_bytes += wire_bytes(transmit.datagram, path)
-                released.append((transmit, number))
+                    self.repeat_bytes += size
+                released.append((path, one.datagram, number))
                 one.number = number + 1
                 one.due_at = now + SPACING_S * 2 ** (number - 1)
         self.waiting = [one for one in self.waiting if one.number <= one.last and one.paths]
@@ -195,28 +201,29 @@ class Copies:
 
     # Room.
 
-    def _wait_s(self, path: Path, now: float, rate: Bucket | None, slack: float = 0.0) -> float:
+    def _wait_s(self, path: PathState, now: float, rate: Bucket | None, slack: float = 0.0) -> float:
         """How long until a datagram may be sent along a path, if nothing else is sent meanwhile.
 
         ``rate``: the limit of copies or repeats; None for a first datagram. ``slack``: bytes that may be missing.
         """
         waits = [] if rate is None else [rate.wait_s(-slack, now)]
-        if (budget := self._budgets.get(path.socket)) is not None:
+        if (budget := self._budgets.get(path.path.socket)) is not None:
             waits.append(budget.all.wait_s(-DEBT_S * budget.all.rate - slack, now))
             if rate is not None:
                 waits.append(budget.copies.wait_s(-slack, now))
         return max(waits, default=0.0)
 
-    def _has_room(self, path: Path, now: float, rate: Bucket | None) -> bool:
+    def _has_room(self, path: PathState, now: float, rate: Bucket | None) -> bool:
         return self._wait_s(path, now, rate, _SLACK_BYTES) == 0.0
 
-    def _charge(self, transmit: Transmit, now: float, rate: Bucket) -> None:
-        size = wire_bytes(transmit.datagram, transmit.path)
+    def _charge(self, datagram: bytes, path: PathState, now: float, rate: Bucket) -> int:
+        size = wire_bytes(datagram, path.path)
         self._average.spend(size, now)
         if rate is not self._average:
             rate.spend(size, now)
-        if (budget := self._budgets.get(transmit.path.socket)) is not None:
+        if (budget := self._budgets.get(path.path.socket)) is not None:
             budget.copies.spend(size, now)
+        return size
 
     # The queue.
 

@@ -14,8 +14,8 @@ from itertools import repeat
 from typing import Final
 
 from uavlinkd.daemon.journal import DaemonJournal, ShellReason
+from uavlinkd.daemon.pacer import RAW
 from uavlinkd.daemon.peer_link import PeerLink
-from uavlinkd.daemon.peer_output import RAW
 from uavlinkd.daemon.peer_sockets import PeerSockets
 from uavlinkd.daemon.switch import Port, Switch, owner_of
 from uavlinkd.daemon.turns import cost_of
@@ -122,7 +122,7 @@ class Line:
         for output in outputs:
             try:
                 if isinstance(output, Transmit):
-                    datagram, (socket, address), _ = output
+                    datagram, (socket, address) = output
                     try:
                         self._senders[socket](datagram, address)
                     except OSError as error:
@@ -224,7 +224,7 @@ class Line:
                     batches[port] = [frame]
         for port, batch in of_one if is_alone else batches.items():
             try:
-                if isinstance(port, PeerLink) and port.output.is_plain and not port.peer.paths.is_multiple:
+                if isinstance(port, PeerLink) and port.pacer.is_plain and not port.peer.paths.is_multiple:
                     peer = port.peer
                     port.frames_sent += len(batch)
                     out = send_frames(peer, [raw] if is_alone else list(map(RAW, batch)), now, STREAM)

@@ -9,7 +9,7 @@ from operator import itemgetter, sub
 
 from uavlinkd.config.model import PeerConfig
 from uavlinkd.daemon.networks import NetworkBudget
-from uavlinkd.daemon.peer_output import PeerOutput
+from uavlinkd.daemon.pacer import Pacer
 from uavlinkd.mavlink.flows import NewestStates
 from uavlinkd.mavlink.frames import Frame, SplitCounters
 from uavlinkd.mavlink.own_frames import LinkFigures, worst
@@ -123,7 +123,7 @@ class PeerLink:
         """Session, expected, missing; the oldest first."""
         self._sample: tuple[int, tuple[int, int, int, int]] | None = None
         # A session, and its counters at one moment: expected and received here, and as the peer reports.
-        self.output = PeerOutput(config.egress, peer, carriage.node, carriage.budgets, self._perform, now)
+        self.pacer = Pacer(config.egress, peer, carriage.node, carriage.budgets, self._perform, now)
         """What waits for it."""
 
     def __repr__(self) -> str:
@@ -137,7 +137,7 @@ class PeerLink:
     def leave(self, now: float, *, closes: bool = True) -> None:
         """Cut the peer off at once. ``closes``: it gets a close."""
         self._perform(self._node.remove_peer(self.peer, now, closes=closes))
-        self.output.clear(now)
+        self.pacer.clear(now)
         self._carriage.waiting.remove(self)
 
     @property
@@ -164,7 +164,7 @@ class PeerLink:
         if config.policy != self.config.policy:
             self.policy = config.make_policy()
         if config.egress != self.config.egress:
-            self.output.change(config.egress, now)
+            self.pacer.change(config.egress, now)
         if config.addresses != self.config.addresses:
             self.expected_since = now
             self.set_paths((), now)  # its new names may have no address: do not connect to the old ones
@@ -179,7 +179,7 @@ class PeerLink:
         ``source``: the port that sent them. ``waited_s``: how long the first of them has waited already.
         """
         self.frames_sent += len(frames)
-        if self.output.send(frames, now, waited_s):
+        if self.pacer.send(frames, now, waited_s):
             self.send_waiting(now)
 
     @property
@@ -191,22 +191,20 @@ class PeerLink:
     def send_waiting(self, now: float) -> None:
         """Send the waiting frames that are due, and schedule the next ones."""
         try:
-            self.output.send_waiting(now)
+            self.pacer.send_waiting(now)
         finally:
             self._set_deadline(now)
 
     def report_refusals(self, now: float) -> None:
         """Report to the peer which of its frames the policy refuses. Call it about once a second."""
-        if not self.peer.is_up or not self.output.has_room(MOST_REPORT_BYTES, now):
+        if not self.peer.is_up or not self.pacer.has_room(MOST_REPORT_BYTES, now):
             return  # totals lose nothing until the next call
         self._perform(self._node.report_refusals(self.peer, self.policy.incoming.changed_totals(), now))
-        self.output.charge(now)
 
     def report_problems(self, codes: Iterable[int], now: float) -> None:
         """Report this daemon's own problems to the peer. Call it about once a second."""
-        if self.peer.is_up and self.output.has_room(MOST_REPORT_BYTES, now):
+        if self.peer.is_up and self.pacer.has_room(MOST_REPORT_BYTES, now):
             self._perform(self._node.report_problems(self.peer, codes, now))
-            self.output.charge(now)
 
     def pick_newest(self, frames: list[Frame], order: int) -> list[Frame]:
         """The frames of an envelope without the states that are superseded. Call it if the peer has several paths.
@@ -218,20 +216,20 @@ class PeerLink:
         return picked
 
     def _set_deadline(self, now: float) -> None:
-        self.timers.next_at = self.output.next_deadline(now)
+        self.timers.next_at = self.pacer.next_deadline(now)
         self._carriage.waiting.update(self)
         self._carriage.settle()
 
     def follow_paths(self, now: float) -> None:
         """A session began, or other paths are used: envelopes may have another size and other budgets."""
-        self.output.follow(now)
+        self.pacer.follow(now)
         self._set_deadline(now)
 
     def on_down(self, now: float, *, is_closed: bool) -> None:
         """The peer is lost, or has closed the link: drop what waits, which would be old when it is back."""
         if is_closed:  # perhaps to start again at once
             self.expected_since = self.closed_at = now
-        self.output.clear(now)
+        self.pacer.clear(now)
         self._set_deadline(now)
 
     @property
@@ -262,14 +260,14 @@ class PeerLink:
             loss_in = _lost(expected, received)
             # The peer reports now and then. Until the next report the last one is valid.
             loss_out = _lost(expected_there, received_there) if expected_there else self.figures.loss_out
-        self.output.measure(now)
+        self.pacer.measure(now)
         self.follow_paths(now)
         self.figures = LinkFigures(
             is_up=peer.is_up,
             loss_in=loss_in,
             loss_out=loss_out,
             round_trip_s=self.round_trip_s,
-            demand=0.0 if self.output.egress is None else self.output.egress.demand(now),
+            demand=self.pacer.demand(now),
             receive_errors=missing,
         )
         return self.figures

@@ -160,8 +160,8 @@ class History:
             if key in before or link.counters.frames or link.frames_sent or link.policy.outgoing.totals:
                 part = self._parts[key] = before.get(key) or PartHistory(now)
                 part.update(link.counters.frames, link.frames_sent, link.policy, now)
-                if link.output.egress is not None:
-                    part.unsent.update(link.output.egress.totals, now)
+                if link.pacer.egress is not None:
+                    part.unsent.update(link.pacer.egress.totals, now)
         for endpoint, policy in endpoints:
             part = self._parts["endpoint", endpoint.name] = before.get(("endpoint", endpoint.name)) or PartHistory(
                 now

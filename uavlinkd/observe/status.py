@@ -215,15 +215,15 @@ def peer_status(link: PeerLink, now: float, way_of: WayOf) -> dict[str, object]:
         **_refusals(link.policy),
         "refused_there": _claims(link, now),
         "problems_there": [name_of_problem(code) for code in codes_there(peer, now)],
-        "waiting_dropped": {} if link.output.egress is None else _counts(link.output.egress.totals),
+        "waiting_dropped": {} if link.pacer.egress is None else _counts(link.pacer.egress.totals),
         "repair": {
-            "is_on": link.output.repair.is_on,
-            "on_s": now - link.output.repair.began_at if link.output.repair.is_on else 0.0,
-            "transmissions": link.output.repair.transmissions,
-            "datagrams": link.output.copies.repeats_sent,
-            "bytes": link.output.copies.repeat_bytes,
+            "is_on": link.pacer.repair.is_on,
+            "on_s": now - link.pacer.repair.began_at if link.pacer.repair.is_on else 0.0,
+            "transmissions": link.pacer.repair.transmissions,
+            "datagrams": link.pacer.copies.repeats_sent,
+            "bytes": link.pacer.copies.repeat_bytes,
         },
-        "copies_dropped": _counts(link.output.copies.dropped),
+        "copies_dropped": _counts(link.pacer.copies.dropped),
         "drops": _counts(traffic.drops),
     }
 

@@ -71,9 +71,10 @@ faster.
 What happens to a frame
 -----------------------
 Out: ``send_frames`` takes the current session and the route of the class, puts frames that are here together into
-envelopes, and seals each once. The same bytes go along each path of the route. A frame without a session is dropped
-and counted: it is never kept for later. Along an only path, all this is decided once: the ``outlet`` stands until a
-path or the session changes.
+envelopes, and seals each once. The same bytes go along each path of the route, or along the part that the shell's
+pacer chooses. ``send_again`` carries them along another path when that has room. A datagram is counted when it
+leaves. A frame without a session is dropped and counted: it is never kept for later. Along an only path, all this is
+decided once: the ``outlet`` stands until a path or the session changes.
 
 In: ``DatagramReceiver.receive`` finds the session by its index, verifies the tag, and only then changes anything.
 Whatever it refuses is a ``Drop`` with a reason, caught and counted in one place.
@@ -93,7 +94,7 @@ Where to add
   relay, or another member, is in :mod:`.relay_records`, and arrives in the shell as ``RecordReceived``.
 * A rule about which path carries what: ``PathSet._set_routes``.
 * A rule about when a frame leaves: the shell, because a frame leaves as soon as the shell calls ``send``:
-  ``PeerOutput`` and ``PeerEgress``, see the README of :mod:`uavlinkd.daemon`.
+  ``Pacer`` and ``PeerEgress``, see the README of :mod:`uavlinkd.daemon`.
 * A rule about when this end asks or tries: the handler of its timer, with its pace in ``PathSet.interval_s`` or
   ``Initiator.begin_try``.
 * A reason to drop something: the table in :mod:`.drops`, and section 13.

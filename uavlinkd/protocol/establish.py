@@ -47,7 +47,7 @@ def initiate(peer: Peer, now: float) -> list[Output]:
     pending, datagrams = initiator.initiate(index, paths, peer.sessions.generation, shown, now)
     peer.indices.owners[index] = peer, pending
     peer.set_expiry()
-    return [sent for datagram, path in datagrams for sent in transmit(peer, datagram, path, is_copy=path != paths[0])]
+    return [transmit(peer, datagram, path) for datagram, path in datagrams]
 
 
 def receive_response(peer: Peer, pending: Pending, response: wire.Response, path: Path, now: float) -> list[Output]:
@@ -122,7 +122,7 @@ def _transmit_answer(peer: Peer, datagram: bytes, waiting: Unconfirmed, path: Pa
     if (state := peer.paths.find(path)) is not None:
         state.datagrams_received += 1
         state.bytes_received += waiting.initiation_bytes  # that came there: the response is no amplification
-    return transmit(peer, datagram, path, is_copy=path != waiting.paths[0])
+    return [transmit(peer, datagram, path)]
 
 
 # Both sides.

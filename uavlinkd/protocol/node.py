@@ -20,6 +20,7 @@ from uavlinkd.protocol.drops import Drop, DropReason
 from uavlinkd.protocol.initiator import Pending
 from uavlinkd.protocol.outputs import CertificateShown, Deliver, Dropped, Output, PeerExpired
 from uavlinkd.protocol.path import Path, SocketAddress, SocketFacts
+from uavlinkd.protocol.paths import Route
 from uavlinkd.protocol.peer import Peer, Shared
 from uavlinkd.protocol.probing import ask_candidates
 from uavlinkd.protocol.receive import DatagramReceiver
@@ -238,9 +239,11 @@ class Node(DatagramReceiver):
 
     # Inputs.
 
-    def send(self, peer: Peer, frames: Sequence[bytes], now: float, cls: Class = Class.STREAM) -> list[Output]:
-        """Send frames of one class that are here together to a peer, in as few envelopes as hold them."""
-        out = send_frames(peer, frames, now, cls)
+    def send(
+        self, peer: Peer, frames: Sequence[bytes], now: float, cls: Class = Class.STREAM, along: Route = ()
+    ) -> list[Output]:
+        """Send frames of one class that are here together to a peer, as :func:`.send_frames`."""
+        out = send_frames(peer, frames, now, cls, along)
         if peer.timers.next_at < peer.timers.scheduled_at:
             self.schedule.update(peer)
         return out

@@ -27,8 +27,6 @@ class Transmit(NamedTuple):
 
     datagram: bytes
     path: Path
-    is_copy: bool = False
-    """Whether the same datagram goes along another path too, and this is not the first."""
 
 
 class Deliver(NamedTuple):

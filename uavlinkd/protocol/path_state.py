@@ -198,8 +198,16 @@ class PathState:
         self._loss_in, self._loss_out, self.loss_by_echo = PathLoss(), PathLoss(), PathLoss()
         self._waiting = {token: asked._replace(sent=0) for token, asked in self._waiting.items()}
 
-    def note_repeat(self, number: int) -> None:
-        """An envelope was sent along this path again: its transmission with this number, from 2."""
+    def note_sent(self, size: int) -> None:
+        """Count a datagram of so many bytes that leaves along this path."""
+        self.datagrams_sent += 1
+        self.bytes_sent += size
+
+    def note_transmission(self, number: int) -> None:
+        """Count an envelope of the current session that leaves along this path for the time with this number."""
+        if number == 1:
+            self.sent += 1
+            return
         at = number - 2
         self.repeats = (*self.repeats[:at], self.repeats[at] + 1, *self.repeats[at + 1 :])
 

@@ -328,6 +328,14 @@ class PathSet(PathSlots):
         is_due = self.shares_envelopes and state.condition is PathCondition.USABLE
         return state.envelope_limit.due_at if is_due else c.NEVER
 
+    def carrying(self, route: Route, size: int) -> Route:
+        """The paths of a route along which an envelope of so many bytes may go: the first one, and its copies."""
+        return tuple(
+            state
+            for state in route
+            if (state.is_proven or state.allows(size)) and (state is route[0] or self.carries(state, size))
+        )
+
     def carries(self, state: PathState, size: int) -> bool:
         """Whether a copy of so many bytes may go along a path. Each path carries the longest frame."""
         return size <= min(state.envelope_limit.limit, max(self.network_limit(state), c.MIN_ENVELOPE_LIMIT))

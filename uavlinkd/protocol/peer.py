@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from uavlinkd.protocol import constants as c
-from uavlinkd.protocol import wire
 from uavlinkd.protocol.crypto import Entropy, KeyPair
 from uavlinkd.protocol.drops import Detail, DropReason
 from uavlinkd.protocol.early import EarlyFrames
@@ -20,7 +19,6 @@ from uavlinkd.protocol.limits import TokenBucket
 from uavlinkd.protocol.outputs import Dropped, Output, PeerLost, PeerUp
 from uavlinkd.protocol.path import Path, SocketAddress, SocketFacts
 from uavlinkd.protocol.path_measures import MissingEnvelopes
-from uavlinkd.protocol.path_state import PathState
 from uavlinkd.protocol.paths import PathSet
 from uavlinkd.protocol.reports import Claims, OwnReports
 from uavlinkd.protocol.session import Session
@@ -185,34 +183,6 @@ class Peer:
         if session is None or not session.is_usable(now) or not session.parameters.features & feature:
             return None
         return session
-
-    # What was sent.
-
-    def count_sent(self, state: PathState, datagrams: int, size: int) -> None:
-        """Datagrams with so many bytes together were sent along a path."""
-        state.datagrams_sent += datagrams
-        state.bytes_sent += size
-
-    def recount(self, path: Path, datagrams: int, size: int) -> None:
-        """A copy that :meth:`Node.send` returned waits or is dropped (-1 datagram), or is sent after it waited (1).
-
-        Otherwise the path would seem to lose what was never sent along it. ``size``: in bytes, with the same sign.
-        """
-        if (state := self.paths.find(path)) is not None:
-            state.sent = max(0, state.sent + datagrams)
-            self.count_sent(state, datagrams, size)
-
-    def note_repeat(self, path: Path, number: int, datagram: bytes) -> None:
-        """An envelope that :meth:`Node.send` returned is sent along this path again.
-
-        ``number``: which transmission it is along this path, 2 to :data:`c.TRANSMISSIONS`. The loss of a path is that
-        of the current session.
-        """
-        if (state := self.paths.find(path)) is not None:
-            session = self.sessions.current
-            if session is not None and wire.claimed_receiver_index(datagram) == session.remote_index:
-                state.note_repeat(number)
-            self.count_sent(state, 1, len(datagram))
 
     # Outputs.
 

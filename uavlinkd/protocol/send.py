@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Final
+from collections.abc import Callable, Iterable, Sequence
+from typing import Final, TypeVar
 
 from uavlinkd.protocol import constants as c
 from uavlinkd.protocol import wire
@@ -23,18 +23,25 @@ from uavlinkd.protocol.wire import QUESTION_BYTES
 
 _NEARLY_WORN_OUT: Final = c.REKEY_AFTER_ENVELOPES - 2**20
 """From this counter on each call looks whether the keys may seal all its payloads, which are fewer than the rest."""
+T = TypeVar("T")
 STREAM, CRITICAL, PROBE, SILENCE = Class.STREAM, Class.CRITICAL, Timer.PROBE, Timer.SILENCE
 """Members that each frame needs. The class of an enumeration looks them up by a Python function."""
 
 
-def send_frames(peer: Peer, frames: Sequence[bytes], now: float, cls: Class) -> list[Output]:
-    """Put frames that are here together into as few envelopes as hold them, in their order."""
+def send_frames(peer: Peer, frames: Sequence[bytes], now: float, cls: Class, along: Route = ()) -> list[Output]:
+    """Put frames that are here together into as few envelopes as hold them, in their order.
+
+    ``along``: the part of the route of this class along which they leave now. By default the whole route.
+    """
     session, paths = peer.sessions.current, peer.paths
     outlet = paths.outlet
-    if outlet is not None and cls is STREAM and len(frames) == 1:
-        of_session, route, longest, until = outlet
-        if of_session is session and len(frames[0]) <= longest and now < until:
-            return send_payloads(peer, session, frames, route, now)
+    if outlet is not None and cls is STREAM:
+        of_session, route, limit, until = outlet
+        if of_session is session and now < until:
+            if len(frames) == 1 and len(frames[0]) <= limit:
+                return send_payloads(peer, session, frames, route, now)
+            if paths.shares_envelopes:
+                return _send_shared(peer, frames, outlet, now)
     paths.outlet = None
     route = paths.routes[cls]
     keeps = cls is CRITICAL and paths.has_relayed  # also without a route
@@ -47,7 +54,7 @@ def send_frames(peer: Peer, frames: Sequence[bytes], now: float, cls: Class) -> 
         least_s = (1 + c.VERIFY_REPEAT_SHARE) * paths.pace.interval_s
         peer.timers.set(PROBE, now + max(peer.durations.probe_interval_s, least_s))
     limit = session.payload_limit - max(0, session.max_envelope - paths.longest[cls])
-    asks_at = NEVER
+    outlet, asks = Outlet(session, along or route, limit, session.reject_at), False
     if len(frames) > 1 and not paths.shares_envelopes:
         paths.shares_envelopes = True
         paths.schedule(now)
@@ -55,48 +62,43 @@ def send_frames(peer: Peer, frames: Sequence[bytes], now: float, cls: Class) -> 
     if len(paths.by_path) > 1:
         _note_activity(peer, now)
     elif cls is STREAM and not paths.is_multiple:
-        paths.outlet = Outlet(session, route, limit, session.reject_at)
+        paths.outlet = outlet
     if paths.is_multiple and cls is not CRITICAL and len(route) == 1:
-        asks_at = route[0].question_at - c.QUESTION_EARLY_S
-    if len(frames) == 1 and len(frames[0]) <= limit:
-        payloads, too_large = [frames[0]], 0
-    else:
-        payloads, too_large = _payloads(frames, limit, session.payload_limit)
-    if now >= asks_at and payloads:
-        out = send_payloads(peer, session, payloads[:-1], route, now)  # the question counts them
-        payloads = [_ask_too(peer, session, route[0], payloads[-1], limit, now)]
-        out += send_payloads(peer, session, payloads, route, now)
-    else:
-        out = send_payloads(peer, session, payloads, route, now)
-    if too_large:
-        out += peer.drop(DropReason.TOO_LARGE, too_large)
+        asks = now >= route[0].question_at - c.QUESTION_EARLY_S
+    out = _send_shared(peer, frames, outlet, now, asks=asks)
     if keeps:
         sent = (output.datagram for output in out if isinstance(output, Transmit))
         _remember(peer, dict.fromkeys(sent), now)
     return out
 
 
-def _payloads(frames: Sequence[bytes], limit: int, longest: int) -> tuple[list[bytes], int]:
-    """Frames in as few payloads of at most ``limit`` bytes as hold them; a longer frame has one of its own.
+def _send_shared(
+    peer: Peer, frames: Sequence[bytes], outlet: Outlet, now: float, *, asks: bool = False
+) -> list[Output]:
+    """Send frames that share envelopes. ``asks``: with a question along the only path."""
+    session, route, limit, _ = outlet
+    fitting = [frame for frame in frames if len(frame) <= session.payload_limit]
+    payloads = list(map(b"".join, batches(fitting, len, limit)))
+    out: list[Output] = []
+    if asks and payloads:
+        out = send_payloads(peer, session, payloads[:-1], route, now)  # the question counts them
+        payloads = [_ask_too(peer, session, route[0], payloads[-1], limit, now)]
+    out += send_payloads(peer, session, payloads, route, now)
+    return out + peer.drop(DropReason.TOO_LARGE, len(frames) - len(fitting))
 
-    Returns also how many frames are too large for any.
-    """
-    payloads: list[bytes] = []
-    batch: list[bytes] = []
-    size = too_large = 0
+
+def batches(frames: Iterable[T], size_of: Callable[[T], int], limit: float) -> list[list[T]]:
+    """Frames in as few batches of at most ``limit`` bytes as hold them; a longer frame has one of its own."""
+    made: list[list[T]] = []
+    room = -1.0
     for frame in frames:
-        if size + len(frame) > limit:
-            if batch:
-                payloads.append(b"".join(batch))
-                batch, size = [], 0
-            if len(frame) > longest:
-                too_large += 1
-                continue
-        batch.append(frame)
-        size += len(frame)
-    if batch:
-        payloads.append(b"".join(batch))
-    return payloads, too_large
+        size = size_of(frame)
+        if size > room:
+            made.append([])
+            room = limit
+        made[-1].append(frame)
+        room -= size
+    return made
 
 
 def _remember(peer: Peer, datagrams: Iterable[bytes], now: float) -> None:
@@ -119,11 +121,21 @@ def resend(peer: Peer, state: PathState, now: float) -> list[Output]:
     for sent_at, datagram in peer.recent:
         is_current = session is not None and wire.claimed_receiver_index(datagram) == session.remote_index
         if now <= sent_at + c.RESENT_S and is_current and peer.paths.carries(state, len(datagram)):
-            state.sent += 1
-            peer.count_sent(state, 1, len(datagram))
-            out.append(Transmit(datagram, state.path, is_copy=True))
+            out.append(send_again(peer, state, datagram))
     peer.recent = []
     return out
+
+
+def send_again(peer: Peer, state: PathState, datagram: bytes, number: int = 1) -> Transmit:
+    """Send a sealed envelope along one path more (``number`` 1), or again along one that has carried it (from 2).
+
+    It is counted now, when it leaves. The loss of a path is that of the current session.
+    """
+    session = peer.sessions.current
+    if session is not None and wire.claimed_receiver_index(datagram) == session.remote_index:
+        state.note_transmission(number)
+    state.note_sent(len(datagram))
+    return Transmit(datagram, state.path)
 
 
 def _note_activity(peer: Peer, now: float) -> None:
@@ -177,17 +189,15 @@ def send_payloads(
     is_counted = session is peer.sessions.current
     if session.send_counter > _NEARLY_WORN_OUT:
         payloads = _limited(peer, session, payloads, now, out)
+    is_alone = len(route) == 1 and route[0].is_proven
     for payload in payloads:
         datagram = session.seal(payload, now)
-        size, is_copy = len(datagram), False
-        for state in route:
-            if (is_copy and not peer.paths.carries(state, size)) or not (state.is_proven or state.allows(size)):
-                continue
+        size = len(datagram)
+        for state in route if is_alone else peer.paths.carrying(route, size):
             state.sent += is_counted
             state.datagrams_sent += 1
             state.bytes_sent += size
-            out.append(new_tuple(Transmit, (datagram, state.path, is_copy)))
-            is_copy = True
+            out.append(new_tuple(Transmit, (datagram, state.path)))
     if not payloads:
         return out
     peer.sent_at = now
@@ -210,14 +220,14 @@ def _limited(
     return payloads[:left]
 
 
-def transmit(peer: Peer, datagram: bytes, path: Path, *, is_copy: bool = False) -> list[Output]:
+def transmit(peer: Peer, datagram: bytes, path: Path) -> Transmit:
     """Send a handshake message. Only what goes where the peer may be counts towards the budget of its link."""
     state = peer.paths.find(path)
     if state is None:
         peer.traffic.bytes_elsewhere += len(datagram)
     else:
-        peer.count_sent(state, 1, len(datagram))
-    return [Transmit(datagram, path, is_copy)]
+        state.note_sent(len(datagram))
+    return Transmit(datagram, path)
 
 
 def send_echo(peer: Peer, session: Session, echo: wire.Echo, route: Route, now: float) -> list[Output]:

@@ -1,12 +1,15 @@
-"""Frames that leave for one peer with a budget, a delay, or several paths. Without these, :class:`.PeerLink` sends.
+"""The pacer of one peer: which frame or sealed datagram leaves now, along which path, at whose cost.
 
-Frames wait unsealed for the peer's own budget and those of networks (:mod:`uavlinkd.mavlink.egress`). Copies for
-other paths wait sealed (:mod:`.copies`). Times are monotonic seconds.
+Frames wait unsealed for the peer's own budget and those of networks (:mod:`uavlinkd.mavlink.egress`). An envelope is
+sealed when it leaves along its first path. Copies have the same bytes, so those for which a path has no room wait
+sealed, as repeats do (:mod:`.copies`). A datagram is charged and counted when it leaves. Without a budget, a delay,
+several paths and repeats nothing is to be decided, and :class:`.Line` sends. Times are monotonic seconds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from itertools import groupby
 from math import inf
 from operator import itemgetter, sub
 from typing import Final
@@ -20,8 +23,10 @@ from uavlinkd.mavlink.frames import Frame
 from uavlinkd.protocol.constants import CRITICAL_ENVELOPE_LIMIT, NEVER
 from uavlinkd.protocol.node import Node
 from uavlinkd.protocol.outputs import Output, Transmit
+from uavlinkd.protocol.path_state import PathState
 from uavlinkd.protocol.paths import Route
 from uavlinkd.protocol.peer import Peer
+from uavlinkd.protocol.send import batches, send_again
 from uavlinkd.protocol.settings import Class, Redundancy
 
 RAW = itemgetter(0)
@@ -29,8 +34,11 @@ RAW = itemgetter(0)
 _STICKS: Final = frozenset(IDS[name] for name in ("MANUAL_CONTROL", "RC_CHANNELS_OVERRIDE"))
 
 
-class PeerOutput:
-    """What waits for one peer. ``budgets``: of networks, by the number of the socket."""
+class Pacer:
+    """Decides when and along which paths frames, copies and repeats leave for one peer.
+
+    ``budgets``: of networks, by the number of the socket.
+    """
 
     def __init__(
         self,
@@ -55,7 +63,6 @@ class PeerOutput:
         """Whether frames leave at once, none is repeated, and no budget is charged."""
         self._charged = 0, 0  # datagrams and bytes that the budget was charged for
         self._networks: list[Bucket | None] = []
-        self._critical_limit = CRITICAL_ENVELOPE_LIMIT  # of the payload; set for each session
         self._stream_bytes = 0
         self._measured_at = now
 
@@ -67,28 +74,21 @@ class PeerOutput:
         if self.egress is not None:
             self.egress.put(frames, now - waited_s)
             return True
-        self._send_runs(frames, now)
+        self._send_frames(frames, now)
         return bool(self.copies.waiting)
 
     def send_waiting(self, now: float) -> None:
         """Send the waiting frames and copies that are due."""
         peer = self._peer
         if self.egress is not None:
-            self.charge(now)
+            self._charge(now)
             while batch := self.egress.take(now):
-                self._send_runs(batch, now)
-                self.charge(now)
+                self._send_frames(batch, now)
+                self._charge(now)
         if self.copies.waiting:
-            usable = {
-                state.path for state in peer.paths.states if not state.is_off and state not in self.repair.left_out
-            }
-            released = self.copies.release(usable, now)
-            for (datagram, path, _), number in released:
-                if number == 1:
-                    peer.recount(path, 1, len(datagram))
-                else:
-                    peer.note_repeat(path, number, datagram)
-            self._perform([transmit for transmit, _ in released])
+            usable = [state for state in peer.paths.states if not state.is_off]
+            released = self.copies.release(usable, self.repair.left_out, now)
+            self._perform([send_again(peer, state, datagram, number) for state, datagram, number in released])
 
     def next_deadline(self, now: float) -> float:
         """When :meth:`send_waiting` is due."""
@@ -97,19 +97,22 @@ class PeerOutput:
 
     def has_room(self, payload_bytes: int, now: float) -> bool:
         """Whether an envelope with this payload may go out now."""
+        self._charge(now)
         return self.egress is None or self.egress.has_room(payload_bytes, now)
 
-    def charge(self, now: float) -> None:
-        """Charge the peer's own budget for all datagrams to it, handshakes and echoes too."""
+    def demand(self, now: float) -> float:
+        """The bytes sent and dropped over the last seconds, as a share of the tightest budget; 0 without one."""
+        self._charge(now)
+        return 0.0 if self.egress is None else self.egress.demand(now)
+
+    def _charge(self, now: float) -> None:
+        """Charge the peer's own budget for all datagrams that left since the last call, handshakes and echoes too."""
         if self.egress is None:
             return
-        charged, self._charged = self._charged, self._sent()
+        charged, self._charged = self._charged, self._peer.paths.totals[:2]
         if self._charged != charged:
             datagrams, size = map(sub, self._charged, charged)
             self.egress.spend(size, now, datagrams=datagrams)
-
-    def _sent(self) -> tuple[int, int]:
-        return self._peer.paths.totals[:2]
 
     # Changes.
 
@@ -120,7 +123,7 @@ class PeerOutput:
         self._settings = settings
         self.egress = PeerEgress(settings, now) if settings.is_needed else None
         self._networks = []
-        self._charged = self._sent()
+        self._charged = self._peer.paths.totals[:2]
         self._note_plain()
 
     def _note_plain(self) -> None:
@@ -132,12 +135,7 @@ class PeerOutput:
         if self._budgets:
             self._follow_networks(now)
         session, path = peer.sessions.current, peer.path
-        if session is None or path is None:
-            return
-        self._critical_limit = session.payload_limit_of(
-            min(CRITICAL_ENVELOPE_LIMIT, peer.paths.longest[Class.CRITICAL])
-        )
-        if self.egress is not None:
+        if self.egress is not None and session is not None and path is not None:
             limit = min(session.payload_limit, session.payload_limit_of(peer.paths.longest[Class.STREAM]))
             seal = session.parameters.max_envelope - session.payload_limit
             self.egress.set_shape(EnvelopeShape(limit, seal, carrier_bytes(path)))
@@ -178,70 +176,53 @@ class PeerOutput:
 
     # Envelopes.
 
-    def _send_runs(self, frames: Sequence[Frame], now: float) -> None:
+    def _send_frames(self, frames: Sequence[Frame], now: float) -> None:
         """Send frames in their order. Consecutive ones that go along the same paths, a run, share envelopes.
 
         Critical frames that are copied or repeated have envelopes of their own.
         """
-        routes, repeats = self._peer.paths.routes, self.repair.is_on
-        is_apart = repeats or len(routes[Class.CRITICAL]) > 1
-        runs: list[tuple[bool | Route, set[Class], list[Frame]]] = []
-        for frame in frames:
+        paths, repeats = self._peer.paths, self.repair.is_on
+        is_apart = repeats or len(paths.routes[Class.CRITICAL]) > 1
+
+        def run_of(frame: Frame) -> bool | Route:
             kind = frame.header.kind
-            cls = kind.cls
-            # Newer states replace repeats of older ones, which must not contain events then.
-            run: bool | Route = (repeats and kind.is_state) if is_apart and cls is Class.CRITICAL else routes[cls]
-            if not runs or run != runs[-1][0]:
-                runs.append((run, set(), []))
-            runs[-1][1].add(cls)
-            runs[-1][2].append(frame)
-        for run, classes, part in runs:
+            if is_apart and kind.cls is Class.CRITICAL:
+                return repeats and kind.is_state  # newer states replace repeats of older ones, but no events
+            return paths.routes[kind.cls]
+
+        for run, together in groupby(frames, run_of):
+            part = list(together)
+            classes = {frame.header.kind.cls for frame in part}
             cls = next(cls for cls in Class if cls in classes)  # the most important one
-            for envelope in self._envelopes(part) if isinstance(run, bool) else (part,):
-                self._send_part(envelope, cls, now)
+            is_copied = isinstance(run, bool) or len(run) > 1
+            for envelope in self._envelopes(part, cls) if is_copied else (part,):
+                self._send_together(envelope, cls, now)
 
-    def _envelopes(self, frames: Sequence[Frame]) -> Iterator[Sequence[Frame]]:
+    def _envelopes(self, frames: list[Frame], cls: Class) -> list[list[Frame]]:
         """Frames that share an envelope, so that it is known which of them are in a copy that waits."""
-        part: list[Frame] = []
-        size = 0
-        for frame in frames:
-            size += len(frame.raw)
-            if size > self._critical_limit and part:
-                yield part
-                part, size = [], len(frame.raw)
-            part.append(frame)
-        yield part
+        session, longest = self._peer.sessions.current, self._peer.paths.longest[cls]
+        if session is None:
+            return [frames]
+        most = CRITICAL_ENVELOPE_LIMIT if cls is Class.CRITICAL else session.max_envelope
+        return batches(frames, lambda frame: len(frame.raw), session.payload_limit_of(min(most, longest)))
 
-    def _send_part(self, frames: Sequence[Frame], cls: Class, now: float) -> None:
-        raws = list(map(RAW, frames))
-        if self._peer.paths.best is None and all(frame.header.msgid in _STICKS for frame in frames):
+    def _send_together(self, frames: Sequence[Frame], cls: Class, now: float) -> None:
+        """Send frames in one envelope along the paths with room. Its copies for others and its repeats wait.
+
+        Along a single path, if none is repeated, the frames may need several envelopes.
+        """
+        peer, raws = self._peer, list(map(RAW, frames))
+        if peer.paths.best is None and all(frame.header.msgid in _STICKS for frame in frames):
             cls = Class.STREAM  # the core keeps critical frames for the next path, and these would be old then
-        outputs = self._node.send(self._peer, raws, now, cls)
         if cls is not Class.CRITICAL:
             self._stream_bytes += sum(map(len, raws))
-        if len(outputs) > 1:
-            outputs = self._pick_copies(outputs, frames if cls is Class.CRITICAL else None, now)
-        if cls is Class.CRITICAL and self.repair.is_on:
-            for datagram, sent in _by_datagram(outputs).items():  # along the same paths
-                paths = [transmit.path for transmit in sent]
-                self.copies.repeat(datagram, paths, frames, self.repair.transmissions, now)
+        route, later, session = peer.paths.routes[cls], list[PathState](), peer.sessions.current
+        if session is not None and len(route) > 1:
+            size = session.envelope_bytes(sum(map(len, raws)))
+            route, later = self.copies.divide(peer.paths.carrying(route, size), now)
+        outputs = self._node.send(peer, raws, now, cls, route)
+        datagram = next((output.datagram for output in outputs if isinstance(output, Transmit)), None)
+        if datagram is not None:
+            critical = frames if cls is Class.CRITICAL else None
+            self.copies.add(datagram, route, later, critical, self.repair.transmissions, now)
         self._perform(outputs)
-
-    def _pick_copies(self, outputs: Sequence[Output], frames: Sequence[Frame] | None, now: float) -> list[Output]:
-        """The outputs without the datagrams that have to wait or are dropped."""
-        left_out = set[Transmit]()
-        for envelope in _by_datagram(outputs).values():
-            if len(envelope) > 1:
-                left_out |= {*envelope} - {*self.copies.pick(envelope, frames, now)}
-        for transmit in left_out:
-            self._peer.recount(transmit.path, -1, -len(transmit.datagram))
-        return [output for output in outputs if not isinstance(output, Transmit) or output not in left_out]
-
-
-def _by_datagram(outputs: Sequence[Output]) -> dict[bytes, list[Transmit]]:
-    """What is sent, with all copies of an envelope together."""
-    transmits: dict[bytes, list[Transmit]] = {}
-    for output in outputs:
-        if isinstance(output, Transmit):
-            transmits.setdefault(output.datagram, []).append(output)
-    return transmits
