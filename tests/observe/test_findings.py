@@ -29,11 +29,10 @@ from uavlinkd.mavlink.frames import SplitCounters, split_payload
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.mavlink.routing import Router
-from uavlinkd.observe.facts import ICMP_S
+from uavlinkd.observe.facts import ICMP_S, SECURITY_S, is_contested
 from uavlinkd.observe.finding import Finding, Severity, Subject
 from uavlinkd.observe.findings import find, has_no_client, own_codes, stop_frames
 from uavlinkd.observe.history import HIDDEN_LEAST, History
-from uavlinkd.observe.signs import SECURITY_S, is_contested
 from uavlinkd.observe.table import ROWS, Exit
 from uavlinkd.observe.traffic_signs import PROBLEMS
 from uavlinkd.protocol import constants as c

@@ -22,7 +22,6 @@ PATH: dict[str, Any] = {
     "is_configured": True,
     "state": "usable",
     "reason": "answered",
-    "state_s": 60.0,
     "role": "best",
     "carries": ["critical", "stream", "bulk"],
     "answered_s": 0.1,

@@ -78,6 +78,17 @@ def test_copy_for_which_a_path_has_no_room_yet_is_counted_when_it_leaves(radios:
     assert cross(radios, 0, sent.datagram) == []
 
 
+def test_nothing_leaves_along_a_slot_that_was_removed_a_moment_ago(radios: Radios) -> None:
+    """The totals of the peer, which its budget pays for, would miss it. The other path carries critical frames."""
+    peer, path = radios.a.peer, radios.state(radios.a, 0).path
+    before = peer.paths.totals
+    radios.a.node.remove_path(path, radios.now)
+    assert [targets(radios, cls) for cls in (STREAM, CRITICAL)] == [[], [at_b(1)]]
+    assert peer.paths.totals.datagrams_sent == before.datagrams_sent + 1
+    radios.act(radios.a, radios.a.timeout(radios.now))
+    assert targets(radios, STREAM) == [at_b(1)]
+
+
 def test_critical_envelopes_are_short_while_two_paths_work(radios: Radios) -> None:
     """At most 320 bytes, which each path carries; a longer frame goes alone. Others may be longer."""
     radios.measure_lengths()

@@ -25,8 +25,8 @@ from uavlinkd.mavlink.egress.bucket import Bucket
 from uavlinkd.mavlink.flows import FlowKey, flow_key
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.protocol.constants import TRANSMISSIONS
+from uavlinkd.protocol.path_slots import Route
 from uavlinkd.protocol.path_state import PathCondition, PathState
-from uavlinkd.protocol.paths import Route
 
 MAX_WAIT_S: Final = 0.5
 """What waits longer is dropped."""

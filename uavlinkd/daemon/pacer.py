@@ -23,8 +23,8 @@ from uavlinkd.mavlink.frames import Frame
 from uavlinkd.protocol.constants import CRITICAL_ENVELOPE_LIMIT, NEVER
 from uavlinkd.protocol.node import Node
 from uavlinkd.protocol.outputs import Output, Transmit
+from uavlinkd.protocol.path_slots import Route
 from uavlinkd.protocol.path_state import PathState
-from uavlinkd.protocol.paths import Route
 from uavlinkd.protocol.peer import Peer
 from uavlinkd.protocol.send import batches, send_again
 from uavlinkd.protocol.settings import Class, Redundancy

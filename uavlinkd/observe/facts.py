@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from uavlinkd.config.keys import encode_key
 from uavlinkd.config.model import EndpointConfig
-from uavlinkd.daemon.evidence import ELSEWHERE, REPORTED, Sighting
+from uavlinkd.daemon.evidence import ELSEWHERE, EVIDENCE_S, REPORTED, Sighting
 from uavlinkd.daemon.parts import DaemonParts
 from uavlinkd.daemon.peer_link import NOT_ANSWERING_S, PeerLink
 from uavlinkd.io.ports import Endpoint
@@ -18,6 +18,8 @@ from uavlinkd.observe.history import History
 from uavlinkd.ops.log import shown
 from uavlinkd.protocol.drops import Detail, DropReason
 from uavlinkd.protocol.path import Path, SocketAddress
+from uavlinkd.protocol.peer import Peer
+from uavlinkd.protocol.sessions import Twin
 from uavlinkd.system.error_meanings import meaning_of
 
 if TYPE_CHECKING:
@@ -26,6 +28,8 @@ if TYPE_CHECKING:
 Fields = dict[str, Any]
 """The values of a finding that its sentences name."""
 
+SECURITY_S: Final = 600.0
+"""A finding about an attack stays for this time after the last evidence."""
 ICMP_S: Final = 1.0
 """Hosts send an ICMP message about our datagrams at most once in this time."""
 REPORTED_S: Final = 5.0
@@ -222,3 +226,19 @@ def listed(names: Iterable[str], most: int = 4) -> str:
     """The first names of a list that an attacker may make long."""
     first = list(names)
     return ", ".join(first[:most]) + (f" and {len(first) - most} more" if len(first) > most else "")
+
+
+def has_twin(peer: Peer, twin: Twin, now: float, within_s: float = SECURITY_S) -> bool:
+    """Whether the sessions with a peer showed a second process with a private key."""
+    return twin in peer.sessions.twins and now - peer.sessions.twins[twin] < within_s
+
+
+def is_contested(peer: Peer, now: float) -> bool:
+    """Whether two processes with one key displace each other now: each loses about half of the frames."""
+    return any(has_twin(peer, twin, now, EVIDENCE_S) for twin in Twin)
+
+
+def places_of(peer: Peer) -> str:
+    """Where a peer answered."""
+    answered = (state for state in peer.paths.states if state.is_validated or state.is_known)
+    return listed(dict.fromkeys(shown(state.path.address) for state in answered)) or "an unknown address"

@@ -15,20 +15,29 @@ from uavlinkd.config.keys import encode_key
 from uavlinkd.daemon.evidence import ELSEWHERE, EVIDENCE_S, REPORTED
 from uavlinkd.daemon.peer_link import PeerLink
 from uavlinkd.daemon.switch import Port
-from uavlinkd.observe.facts import UNROUTED, Fields, Moment, PeerFacts, at, details_at, hosts_of, listed
+from uavlinkd.observe.facts import (
+    SECURITY_S,
+    UNROUTED,
+    Fields,
+    Moment,
+    PeerFacts,
+    at,
+    details_at,
+    has_twin,
+    hosts_of,
+    listed,
+    places_of,
+)
 from uavlinkd.ops.log import shown, titled
 from uavlinkd.protocol import constants as c
 from uavlinkd.protocol.drops import Detail, DropReason
 from uavlinkd.protocol.path import RELAY_HOST, SocketAddress
-from uavlinkd.protocol.peer import Peer
 from uavlinkd.protocol.sessions import Twin
 from uavlinkd.system.error_meanings import CONNECTED, meaning_of, web_problem
 
 if TYPE_CHECKING:
     from uavlinkd.relay.client_link import RelayLink
 
-SECURITY_S: Final = 600.0
-"""A finding about an attack stays for this time after the last evidence."""
 CONFIRM_S: Final = 2.0
 """A handshake that is not complete after this time is reported."""
 
@@ -44,22 +53,6 @@ def own_key_elsewhere(moment: Moment) -> Signs:
         yield {"at": "an unknown address" if stolen[1] is None else shown(stolen[1])}
 
 
-def has_twin(peer: Peer, twin: Twin, now: float, within_s: float = SECURITY_S) -> bool:
-    """Whether the sessions with a peer showed a second process with a private key."""
-    return twin in peer.sessions.twins and now - peer.sessions.twins[twin] < within_s
-
-
-def is_contested(peer: Peer, now: float) -> bool:
-    """Whether two processes with one key displace each other now: each loses about half of the frames."""
-    return any(has_twin(peer, twin, now, EVIDENCE_S) for twin in Twin)
-
-
-def _places(peer: Peer) -> str:
-    """Where a peer answered."""
-    answered = (state for state in peer.paths.states if state.is_validated or state.is_known)
-    return listed(dict.fromkeys(shown(state.path.address) for state in answered)) or "an unknown address"
-
-
 def own_key_twice(moment: Moment) -> Signs:
     """This daemon's key, as its peers state, and at a relay the keys of its members."""
     peers = moment.daemon.node.peers.items()
@@ -68,14 +61,14 @@ def own_key_twice(moment: Moment) -> Signs:
     relay = moment.daemon.relay
     members = [] if relay is None else [one for one in relay.members.values() if one.is_own]
     if twins := [one for one in members if has_twin(one.peer, Twin.PEERS, moment.now)]:
-        names = [f"{one.settings.name}, from {_places(one.peer)}" for one in twins]
+        names = [f"{one.settings.name}, from {places_of(one.peer)}" for one in twins]
         yield {"facts": f"the private key of a member: {listed(names)}"}
 
 
 def peers_key_twice(peer: PeerFacts) -> Signs:
     core = peer.link.peer
     if has_twin(core, Twin.PEERS, peer.now):
-        yield {"facts": f"{peer.name}'s private key: sessions came from {_places(core)}"}
+        yield {"facts": f"{peer.name}'s private key: sessions came from {places_of(core)}"}
 
 
 # The daemon.

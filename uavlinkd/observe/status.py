@@ -18,10 +18,10 @@ from uavlinkd.io.ports import Endpoint
 from uavlinkd.mavlink.dialect import command_name, name_of
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import ANY_OTHER, REFUSALS, Refusal
+from uavlinkd.observe.facts import is_contested
 from uavlinkd.observe.finding import Finding
 from uavlinkd.observe.findings import find, has_no_client, stop_frames
 from uavlinkd.observe.observer import Observer
-from uavlinkd.observe.signs import is_contested
 from uavlinkd.observe.traffic_signs import codes_there, name_of_problem, stops_frames
 from uavlinkd.ops import LOG_SCHEMA, STATUS_SCHEMA
 from uavlinkd.ops.log import shown
@@ -183,7 +183,6 @@ def peer_status(link: PeerLink, now: float, way_of: WayOf) -> dict[str, object]:
     peer = link.peer
     session = peer.sessions.current
     traffic, totals = peer.traffic, peer.paths.totals
-    expected_there, received_there = traffic.reported
     return _peer_now(link, now) | {
         "public_key": encode_key(peer.settings.public_key),
         "handshake_s": _age(peer.established_at, now),
@@ -198,7 +197,6 @@ def peer_status(link: PeerLink, now: float, way_of: WayOf) -> dict[str, object]:
             "sent": session.send_counter,
             "received": session.received,
             "lost_in": session.expected - session.received,
-            "lost_out": expected_there - received_there,
         },
         "handshakes": traffic.handshakes,
         "envelopes_sent": peer.envelopes_sent,
@@ -369,9 +367,7 @@ def _path_status(link: PeerLink | RelayLink, state: PathState, way_of: WayOf, no
     return _path_now(link, state, way_of, now) | {
         "relay_address": None if relay_address is None else str(Address.of(relay_address)),
         "envelope_bytes": state.envelope_limit.limit,
-        "own_address": own if isinstance(own := state.path.address[-1], str) else None,
         "is_configured": state.is_configured,
-        "state_s": now - state.since,
         "carries": [cls.value for cls, route in peer.paths.routes.items() if peer.is_up and state in route],
         "jitter_s": state.rttvar_s,
         "bytes_received": state.bytes_received,

@@ -13,8 +13,17 @@ from uavlinkd.io.url import EndpointKind
 from uavlinkd.mavlink.dialect import command_name, name_of
 from uavlinkd.mavlink.egress.lanes import EgressDrop
 from uavlinkd.mavlink.policy.gate import ANY_OTHER, REFUSALS, Refusal
-from uavlinkd.observe.facts import KERNEL_ERRORS, NOT_LISTENING, SILENT_S, EndpointFacts, PartFacts, PeerFacts, listed
-from uavlinkd.observe.signs import SECURITY_S, Signs
+from uavlinkd.observe.facts import (
+    KERNEL_ERRORS,
+    NOT_LISTENING,
+    SECURITY_S,
+    SILENT_S,
+    EndpointFacts,
+    PartFacts,
+    PeerFacts,
+    listed,
+)
+from uavlinkd.observe.signs import Signs
 from uavlinkd.ops.log import shown
 from uavlinkd.protocol import constants as c
 from uavlinkd.protocol.drops import DropReason

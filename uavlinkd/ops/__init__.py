@@ -6,7 +6,7 @@ type or meaning. An addition leaves it as it is. ``tests/ops/schema/`` has what 
 
 from typing import Final
 
-STATUS_SCHEMA: Final = 5
+STATUS_SCHEMA: Final = 6
 LOG_SCHEMA: Final = 5
 METRICS_SCHEMA: Final = 4
 CHECK_SCHEMA: Final = 1

@@ -11,7 +11,7 @@ from uavlinkd.protocol.initiator import Pending
 from uavlinkd.protocol.outputs import Output, PeerAdmitted, PeerClosed, SessionEstablished
 from uavlinkd.protocol.path import Path
 from uavlinkd.protocol.peer import Peer
-from uavlinkd.protocol.send import ask_for_echo, seal, transmit
+from uavlinkd.protocol.send import ask_for_echo, send_payloads, transmit
 from uavlinkd.protocol.session import Session
 from uavlinkd.protocol.sessions import Unconfirmed
 from uavlinkd.protocol.settings import Class
@@ -181,7 +181,7 @@ def close(peer: Peer, now: float, *, sends: bool = True) -> list[Output]:
     session, out = peer.sessions.current, list[Output]()
     try:
         if sends and session is not None and now < session.reject_at:
-            out += seal(peer, session, wire.Close().encode(), peer.paths.routes[Class.CRITICAL], now)
+            out += send_payloads(peer, session, (wire.Close().encode(),), peer.paths.routes[Class.CRITICAL], now)
     finally:  # also if no close can be sent
         ended = peer.sessions.clear(now)
     out += freshness.end(peer, ended)

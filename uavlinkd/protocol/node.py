@@ -20,13 +20,13 @@ from uavlinkd.protocol.drops import Drop, DropReason
 from uavlinkd.protocol.initiator import Pending
 from uavlinkd.protocol.outputs import CertificateShown, Deliver, Dropped, Output, PeerExpired
 from uavlinkd.protocol.path import Path, SocketAddress, SocketFacts
-from uavlinkd.protocol.paths import Route
+from uavlinkd.protocol.path_slots import Route
 from uavlinkd.protocol.peer import Peer, Shared
 from uavlinkd.protocol.probing import ask_candidates
 from uavlinkd.protocol.receive import DatagramReceiver
 from uavlinkd.protocol.receive_handshake import HandshakeReceiver, ShownInitiation
 from uavlinkd.protocol.relay_records import FleetRecord, Record
-from uavlinkd.protocol.send import ask_for_echo, seal, send_frames
+from uavlinkd.protocol.send import ask_for_echo, send_frames, send_payloads
 from uavlinkd.protocol.session import Session
 from uavlinkd.protocol.sessions import Indices
 from uavlinkd.protocol.settings import Class, PeerSettings, Screen, hold_all
@@ -257,7 +257,7 @@ class Node(DatagramReceiver):
         session, route = peer.session_with(c.FEATURE_REFUSALS, now), peer.paths.routes[Class.BULK]
         if session is None or not route or (report := peer.reports.next_refusals(now)) is None:
             return []
-        return seal(peer, session, report.encode(), route, now, is_answer=True)
+        return send_payloads(peer, session, (report.encode(),), route, now, is_answer=True)
 
     def report_problems(self, peer: Peer, codes: Iterable[int], now: float) -> list[Output]:
         """Report this end's own problems to the peer, if that is due and it understands such reports."""
@@ -265,7 +265,7 @@ class Node(DatagramReceiver):
         if session is None or not route:
             return []
         report = peer.reports.next_problems(codes, session.order_base, now)
-        return [] if report is None else seal(peer, session, report.encode(), route, now, is_answer=True)
+        return [] if report is None else send_payloads(peer, session, (report.encode(),), route, now, is_answer=True)
 
     def send_record(self, peer: Peer, path: Path | None, record: Record, now: float) -> list[Output]:
         """Send a record to a relay or to a member along one path, encrypted. It expects no answer from the session.
@@ -278,7 +278,7 @@ class Node(DatagramReceiver):
         state = peer.paths.best if path is None else peer.paths.find(path)
         if session is None or state is None or not (state.works or state is peer.paths.best):
             return []
-        return seal(peer, session, session.sealed_record(record.encode()), (state,), now, is_answer=True)
+        return send_payloads(peer, session, (session.sealed_record(record.encode()),), (state,), now, is_answer=True)
 
     def ask_candidates(self, peer: Peer, now: float) -> list[Output]:
         """Send a question to each candidate without a slot; to fewer of them if that was done often.

@@ -21,11 +21,15 @@ class Totals(NamedTuple):
     bytes_received: int
 
 
+Route = tuple[PathState, ...]
+"""The paths along which one envelope goes, the best first."""
+
+
 class Outlet(NamedTuple):
     """How the next frame of a stream leaves along the only path: decided once, for as long as nothing changes."""
 
     session: Session
-    route: tuple[PathState, ...]
+    route: Route
     limit: int
     """The longest payload, in bytes."""
     until: float
@@ -192,6 +196,23 @@ class PathSlots:
         self._known[place] -= 1
         if not self._known[place]:
             del self._known[place]
+
+    def carrying(self, route: Route, size: int) -> Route:
+        """The paths of a route along which an envelope of so many bytes may go: the first one, and its copies."""
+        return tuple(
+            state
+            for state in route
+            if (state.is_proven or state.allows(size)) and (state is route[0] or self.carries(state, size))
+        )
+
+    def carries(self, state: PathState, size: int) -> bool:
+        """Whether a copy of so many bytes may go along a path. Each path carries the longest frame."""
+        return size <= min(state.envelope_limit.limit, max(self.network_limit(state), c.MIN_ENVELOPE_LIMIT))
+
+    def network_limit(self, state: PathState) -> int:
+        """The longest envelope that the network or the relay of a path carries, in bytes."""
+        limit = self.facts.envelope_limits.get(state.path.socket, c.MAX_ENVELOPE_LIMIT)
+        return min(limit, c.RELAYED_ENVELOPE_LIMIT) if state.path.is_relayed else limit
 
     def set_metered(self) -> None:
         """The metered sockets have changed."""

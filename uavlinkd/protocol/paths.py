@@ -13,7 +13,7 @@ from uavlinkd.protocol import constants as c
 from uavlinkd.protocol.outputs import LinkedPeer, PathChanged, PathEvent, PathStateChanged, PathSuspected
 from uavlinkd.protocol.path import FREE, Pace, Path, SocketAddress, SocketFacts
 from uavlinkd.protocol.path_measures import Repeats
-from uavlinkd.protocol.path_slots import PathSlots
+from uavlinkd.protocol.path_slots import PathSlots, Route
 from uavlinkd.protocol.path_state import PathCondition, PathState
 from uavlinkd.protocol.settings import Class, Redundancy
 
@@ -88,9 +88,6 @@ def _cost(state: PathState) -> float:
     return (state.srtt_s or 0.0) / 2 + c.LOSS_PENALTY_S * state.loss_out
 
 
-Route = tuple[PathState, ...]
-"""The paths along which one envelope goes, the best first."""
-
 _NO_ROUTES: Final[Mapping[Class, Route]] = dict.fromkeys(Class, ())
 
 
@@ -125,8 +122,6 @@ class PathSet(PathSlots):
         """Whether several frames were ever sent together. Before that no long envelope is needed."""
         self.longest: Mapping[Class, int] = dict.fromkeys(Class, c.MIN_ENVELOPE_LIMIT)
         """The longest envelope that frames of each class share, in bytes. A longer one holds a single frame."""
-        self.echo_route: Route = ()
-        """Of echo requests that are repeated if they are lost, and of their replies."""
         self.due_at = c.NEVER
         """When :meth:`update` has something to do, or a question is due."""
         self.active_at = -c.NEVER
@@ -154,6 +149,12 @@ class PathSet(PathSlots):
         return 0.0 if best is None or best.srtt_s is None or not best.works else min(best.srtt_s, c.LATE_AFTER_S)
 
     @property
+    def echo_route(self) -> Route:
+        """Of echo requests that are repeated if they are lost, and of their replies."""
+        is_usable = self.best is not None and self.best.condition is PathCondition.USABLE
+        return self.routes[Class.BULK if is_usable else Class.CRITICAL]
+
+    @property
     def pace(self) -> Pace:
         """That of the best path's network."""
         return FREE if self.best is None else self.facts.pace(self.best.path)
@@ -177,6 +178,11 @@ class PathSet(PathSlots):
             and not (works and state.is_metered)
         ]
         return [state.path for state in sorted(states, key=lambda state: (state is not self.best, state.is_metered))]
+
+    def _drop(self, state: PathState) -> None:
+        """A slot is free: frames that are sent before the next :meth:`update` do not go there any more."""
+        super()._drop(state)
+        self.routes = {cls: tuple(one for one in route if one is not state) for cls, route in self.routes.items()}
 
     # Answers.
 
@@ -265,7 +271,7 @@ class PathSet(PathSlots):
     def _set_routes(self, now: float) -> None:
         best, self.outlet = self.best, None
         if best is None:
-            self.routes, self.is_multiple, self.echo_route = _NO_ROUTES, self.has_relayed, ()
+            self.routes, self.is_multiple = _NO_ROUTES, self.has_relayed
             return
         others = [
             state for state in self.by_path.values() if state is not best and state.is_validated and not state.is_off
@@ -285,7 +291,6 @@ class PathSet(PathSlots):
             is_late = best.reason != "loss"
             answering = [state for state in others if state.works or state.is_recovering]
             stream = (best, *(state for state in answering if is_late or not state.is_metered))
-        self.echo_route = alone if best.condition is PathCondition.USABLE else critical
         self.routes = {Class.CRITICAL: critical, Class.STREAM: stream, Class.BULK: alone}
         self.longest = {cls: self._longest(route, cls) for cls, route in self.routes.items()}
 
@@ -327,23 +332,6 @@ class PathSet(PathSlots):
         """When to test how long the envelopes of a path may be."""
         is_due = self.shares_envelopes and state.condition is PathCondition.USABLE
         return state.envelope_limit.due_at if is_due else c.NEVER
-
-    def carrying(self, route: Route, size: int) -> Route:
-        """The paths of a route along which an envelope of so many bytes may go: the first one, and its copies."""
-        return tuple(
-            state
-            for state in route
-            if (state.is_proven or state.allows(size)) and (state is route[0] or self.carries(state, size))
-        )
-
-    def carries(self, state: PathState, size: int) -> bool:
-        """Whether a copy of so many bytes may go along a path. Each path carries the longest frame."""
-        return size <= min(state.envelope_limit.limit, max(self.network_limit(state), c.MIN_ENVELOPE_LIMIT))
-
-    def network_limit(self, state: PathState) -> int:
-        """The longest envelope that the network or the relay of a path carries, in bytes."""
-        limit = self.facts.envelope_limits.get(state.path.socket, c.MAX_ENVELOPE_LIMIT)
-        return min(limit, c.RELAYED_ENVELOPE_LIMIT) if state.path.is_relayed else limit
 
     # Deadlines.
 

@@ -10,7 +10,7 @@ from uavlinkd.protocol.outputs import Output
 from uavlinkd.protocol.path import Path
 from uavlinkd.protocol.path_state import PathState
 from uavlinkd.protocol.peer import Peer
-from uavlinkd.protocol.send import resend, seal
+from uavlinkd.protocol.send import resend, send_payloads
 from uavlinkd.protocol.session import Session
 from uavlinkd.protocol.sessions import Unconfirmed
 from uavlinkd.protocol.wire import ANSWER_BYTES, MACS_BYTES, QUESTION_BYTES, Probe
@@ -160,7 +160,7 @@ def _test_limit(peer: Peer, session: Session, state: PathState, now: float) -> l
     for length in (size, 0) if size else ():
         record = state.make_test(peer.new_question(), length, now)
         padding = max(0, length - session.envelope_bytes(QUESTION_BYTES))
-        out += seal(peer, session, record.encode(padding=padding), (state,), now, is_answer=True)
+        out += send_payloads(peer, session, (record.encode(padding=padding),), (state,), now, is_answer=True)
         if length:
             session.uncounted += 1
             state.sent -= 1
@@ -170,4 +170,4 @@ def _test_limit(peer: Peer, session: Session, state: PathState, now: float) -> l
 def _send(peer: Peer, session: Session, state: PathState, question: int, answer: int, now: float) -> list[Output]:
     record = state.make_probe(question, answer, now)
     # Along one path, so its silence says nothing about the peer: it starts no count of silence.
-    return seal(peer, session, record.encode(), (state,), now, is_answer=True)
+    return send_payloads(peer, session, (record.encode(),), (state,), now, is_answer=True)

@@ -16,8 +16,8 @@ from uavlinkd.protocol.establish import adopt, receive_close, receive_hint
 from uavlinkd.protocol.initiator import Pending
 from uavlinkd.protocol.outputs import Deliver, Dropped, Output, RecordReceived, new_tuple
 from uavlinkd.protocol.path import Path, SocketAddress, SocketFacts
+from uavlinkd.protocol.path_slots import Route
 from uavlinkd.protocol.path_state import PathCondition, PathState
-from uavlinkd.protocol.paths import Route
 from uavlinkd.protocol.peer import Peer
 from uavlinkd.protocol.receive_handshake import HandshakeReceiver
 from uavlinkd.protocol.relay_records import FleetRecord, parse_record

@@ -12,9 +12,8 @@ from uavlinkd.protocol.drops import DropReason
 from uavlinkd.protocol.outputs import Output, Transmit, new_tuple
 from uavlinkd.protocol.path import FREE, Path
 from uavlinkd.protocol.path_measures import NO_REPEATS
-from uavlinkd.protocol.path_slots import Outlet
+from uavlinkd.protocol.path_slots import Outlet, Route
 from uavlinkd.protocol.path_state import PathState
-from uavlinkd.protocol.paths import Route
 from uavlinkd.protocol.peer import Peer
 from uavlinkd.protocol.session import Session
 from uavlinkd.protocol.settings import Class
@@ -159,19 +158,6 @@ def _ask_too(peer: Peer, session: Session, state: PathState, frames: bytes, limi
     return record.encode(frames)
 
 
-def seal(
-    peer: Peer,
-    session: Session,
-    payload: bytes,
-    route: Route,
-    now: float,
-    *,
-    is_answer: bool = False,
-) -> list[Output]:
-    """Send one envelope, as :func:`send_payloads`."""
-    return send_payloads(peer, session, (payload,), route, now, is_answer=is_answer)
-
-
 def send_payloads(
     peer: Peer,
     session: Session,
@@ -234,7 +220,7 @@ def send_echo(peer: Peer, session: Session, echo: wire.Echo, route: Route, now: 
     """Send an echo request or a reply."""
     if len(route) > 1:
         route = (route[0], *(state for state in route[1:] if may_echo(peer, state, now, is_reply=echo.is_reply)))
-    return seal(peer, session, echo.encode(), route, now, is_answer=echo.is_reply)
+    return send_payloads(peer, session, (echo.encode(),), route, now, is_answer=echo.is_reply)
 
 
 def may_echo(peer: Peer, state: PathState, now: float, *, is_reply: bool) -> bool:

@@ -32,7 +32,7 @@ from uavlinkd.protocol.outputs import Deliver, Output, SessionEstablished, Trans
 from uavlinkd.protocol.path import Path
 from uavlinkd.protocol.peer import Peer
 from uavlinkd.protocol.relay_records import FleetRecord
-from uavlinkd.protocol.send import seal
+from uavlinkd.protocol.send import send_payloads
 from uavlinkd.protocol.session import Session
 from uavlinkd.protocol.settings import Class, Link, PeerSettings, Timers
 from uavlinkd.protocol.suites import X25519
@@ -173,8 +173,8 @@ class Impostor(PassiveAttack):
             self._claimed += 1
             entries = (Refused(self._claimed % 2**24, 400, place, 2**32 - 1) for place in range(REFUSALS_PER_REPORT))
             problems = ProblemReport(tuple(range(self._claimed % 249, self._claimed % 249 + PROBLEMS_PER_REPORT)))
-            for report in (RefusalReport(tuple(entries)), problems):
-                out += seal(peer, session, report.encode(), peer.paths.routes[Class.BULK], now, is_answer=True)
+            payloads = RefusalReport(tuple(entries)).encode(), problems.encode()
+            out += send_payloads(peer, session, payloads, peer.paths.routes[Class.BULK], now, is_answer=True)
         return out
 
     def next_deadline(self) -> float:
