@@ -37,8 +37,8 @@ from uavlinkd.system.addresses import Address
 
 MOST = {
     "one path": [(8, 6), (8, 6)],
-    "two paths": [(22, 11), (29, 11)],
-    "a relay": [(25, 15), (6, 4), (34, 15)],
+    "two paths": [(16, 10), (29, 11)],
+    "a relay": [(19, 14), (6, 4), (32, 14)],
 }
 """Functions and files at the sending end, at the relay and at the receiving end. The aim is 8 functions in 6 files on
 one path, and 12 on several."""

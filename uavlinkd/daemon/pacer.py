@@ -9,7 +9,6 @@ several paths and repeats nothing is to be decided, and :class:`.Line` sends. Ti
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from itertools import groupby
 from math import inf
 from operator import itemgetter, sub
 from typing import Final
@@ -31,6 +30,8 @@ from uavlinkd.protocol.settings import Class, Redundancy
 
 RAW = itemgetter(0)
 """The bytes of a frame."""
+CRITICAL, STREAM = Class.CRITICAL, Class.STREAM
+"""Members that each frame needs. The class of an enumeration looks them up by a Python function."""
 _STICKS: Final = frozenset(IDS[name] for name in ("MANUAL_CONTROL", "RC_CHANNELS_OVERRIDE"))
 
 
@@ -181,19 +182,20 @@ class Pacer:
 
         Critical frames that are copied or repeated have envelopes of their own.
         """
-        paths, repeats = self._peer.paths, self.repair.is_on
-        is_apart = repeats or len(paths.routes[Class.CRITICAL]) > 1
-
-        def run_of(frame: Frame) -> bool | Route:
+        routes, repeats = self._peer.paths.routes, self.repair.is_on
+        is_apart = repeats or len(routes[CRITICAL]) > 1
+        runs: list[tuple[bool | Route, set[Class], list[Frame]]] = []
+        for frame in frames:
             kind = frame.header.kind
-            if is_apart and kind.cls is Class.CRITICAL:
-                return repeats and kind.is_state  # newer states replace repeats of older ones, but no events
-            return paths.routes[kind.cls]
-
-        for run, together in groupby(frames, run_of):
-            part = list(together)
-            classes = {frame.header.kind.cls for frame in part}
-            cls = next(cls for cls in Class if cls in classes)  # the most important one
+            cls = kind.cls
+            # Newer states replace repeats of older ones, which must not contain events then.
+            run: bool | Route = (repeats and kind.is_state) if is_apart and cls is CRITICAL else routes[cls]
+            if not runs or run != runs[-1][0]:
+                runs.append((run, set(), []))
+            runs[-1][1].add(cls)
+            runs[-1][2].append(frame)
+        for run, classes, part in runs:
+            cls = CRITICAL if CRITICAL in classes else STREAM if STREAM in classes else Class.BULK
             is_copied = isinstance(run, bool) or len(run) > 1
             for envelope in self._envelopes(part, cls) if is_copied else (part,):
                 self._send_together(envelope, cls, now)
@@ -203,7 +205,7 @@ class Pacer:
         session, longest = self._peer.sessions.current, self._peer.paths.longest[cls]
         if session is None:
             return [frames]
-        most = CRITICAL_ENVELOPE_LIMIT if cls is Class.CRITICAL else session.max_envelope
+        most = CRITICAL_ENVELOPE_LIMIT if cls is CRITICAL else session.max_envelope
         return batches(frames, lambda frame: len(frame.raw), session.payload_limit_of(min(most, longest)))
 
     def _send_together(self, frames: Sequence[Frame], cls: Class, now: float) -> None:
@@ -213,16 +215,18 @@ class Pacer:
         """
         peer, raws = self._peer, list(map(RAW, frames))
         if peer.paths.best is None and all(frame.header.msgid in _STICKS for frame in frames):
-            cls = Class.STREAM  # the core keeps critical frames for the next path, and these would be old then
-        if cls is not Class.CRITICAL:
+            cls = STREAM  # the core keeps critical frames for the next path, and these would be old then
+        if cls is not CRITICAL:
             self._stream_bytes += sum(map(len, raws))
         route, later, session = peer.paths.routes[cls], list[PathState](), peer.sessions.current
         if session is not None and len(route) > 1:
             size = session.envelope_bytes(sum(map(len, raws)))
             route, later = self.copies.divide(peer.paths.carrying(route, size), now)
         outputs = self._node.send(peer, raws, now, cls, route)
-        datagram = next((output.datagram for output in outputs if isinstance(output, Transmit)), None)
-        if datagram is not None:
-            critical = frames if cls is Class.CRITICAL else None
-            self.copies.add(datagram, route, later, critical, self.repair.transmissions, now)
+        if later or len(route) > 1 or self.repair.is_on:
+            critical, transmissions = frames if cls is CRITICAL else None, self.repair.transmissions
+            for output in outputs:
+                if isinstance(output, Transmit):  # of the one envelope
+                    self.copies.add(output.datagram, route, later, critical, transmissions, now)
+                    break
         self._perform(outputs)

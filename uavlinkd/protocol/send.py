@@ -53,7 +53,7 @@ def send_frames(peer: Peer, frames: Sequence[bytes], now: float, cls: Class, alo
         least_s = (1 + c.VERIFY_REPEAT_SHARE) * paths.pace.interval_s
         peer.timers.set(PROBE, now + max(peer.durations.probe_interval_s, least_s))
     limit = session.payload_limit - max(0, session.max_envelope - paths.longest[cls])
-    outlet, asks = Outlet(session, along or route, limit, session.reject_at), False
+    outlet, asks = new_tuple(Outlet, (session, along or route, limit, session.reject_at)), False
     if len(frames) > 1 and not paths.shares_envelopes:
         paths.shares_envelopes = True
         paths.schedule(now)
@@ -64,7 +64,10 @@ def send_frames(peer: Peer, frames: Sequence[bytes], now: float, cls: Class, alo
         paths.outlet = outlet
     if paths.is_multiple and cls is not CRITICAL and len(route) == 1:
         asks = now >= route[0].question_at - c.QUESTION_EARLY_S
-    out = _send_shared(peer, frames, outlet, now, asks=asks)
+    if len(frames) == 1 and len(frames[0]) <= limit and not asks:
+        out = send_payloads(peer, session, frames, outlet.route, now)
+    else:
+        out = _send_shared(peer, frames, outlet, now, asks=asks)
     if keeps:
         sent = (output.datagram for output in out if isinstance(output, Transmit))
         _remember(peer, dict.fromkeys(sent), now)
