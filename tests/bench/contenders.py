@@ -68,11 +68,12 @@ class Relay(Contender):
         return needs_module("uvloop")
 
     def start(self, cable: Cable, folder: Path) -> Running:
-        right = self._start(cable.right, LINK_PORT, ("127.0.0.1", SINK_PORT), folder)
-        left = self._start(cable.left, INTO_PORT, (cable.right.address, LINK_PORT), folder)
+        right = self.start_one(cable.right, LINK_PORT, ("127.0.0.1", SINK_PORT), folder)
+        left = self.start_one(cable.left, INTO_PORT, (cable.right.address, LINK_PORT), folder)
         return Running([left], [right])
 
-    def _start(self, host: Host, port: int, to: tuple[str, int], folder: Path) -> subprocess.Popen[bytes]:
+    def start_one(self, host: Host, port: int, to: tuple[str, int], folder: Path) -> subprocess.Popen[bytes]:
+        """A relay from a port of a host to an address."""
         command = [sys.executable, "-m", "tests.bench.relays", str(port), to[0], str(to[1])]
         return host.start(command, folder=REPOSITORY, log=folder / f"{host.name}.log")
 

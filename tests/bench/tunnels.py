@@ -10,34 +10,40 @@ from typing import Final
 
 from tests.bench.cable import Cable, Host
 from tests.bench.contenders import (
+    INTO,
+    INTO_PORT,
     LINK_PORT,
     Contender,
     NotMeasuredError,
+    Relay,
     Running,
     command_version,
     needs_command,
     until,
 )
+from tests.bench.daemons import configuration, start_daemon
 from tests.bench.traffic import SINK_PORT
+from uavlinkd.config import keys
 
 LEFT_TUNNEL: Final = "10.214.0.1"
 RIGHT_TUNNEL: Final = "10.214.0.2"
+NETWORK: Final = "10.214.0.0/24"
 TUN: Final = Path("/dev/net/tun")
 
 
 class Tunnel(Contender):
     """A VPN between the two hosts."""
 
-    def __init__(self, command: str, *others: str, version_option: str = "--version") -> None:
-        super().__init__(command)
-        self._commands = (command, *others)
+    def __init__(self, name: str, *commands: str, version_option: str = "--version") -> None:
+        super().__init__(name)
+        self._commands = commands
         self._version_option = version_option
 
     def why_not(self) -> str | None:
         return needs_command(*self._commands) or _why_no_tun()
 
     def version(self) -> str | None:
-        return command_version(self.name, self._version_option)
+        return command_version(self._commands[0], self._version_option)
 
     def start(self, cable: Cable, folder: Path) -> Running:
         try:
@@ -72,22 +78,67 @@ class WireguardGo(Tunnel):
     def _side(
         self, host: Host, folder: Path, private: str, public: str, other: str, endpoint: str
     ) -> subprocess.Popen[bytes]:
-        is_left = other == RIGHT_TUNNEL
-        side = "left" if is_left else "right"
-        device = f"wg{os.getpid() % 10**8}{side[0]}"  # its control socket is the machine's, so the name is too
-        process = host.start(["wireguard-go", "-f", device], log=folder / f"{side}.log")
-        config = folder / f"{side}.conf"
-        config.touch(0o600)
-        config.write_text(
-            f"[Interface]\nPrivateKey = {private}\nListenPort = {LINK_PORT}\n"
-            f"[Peer]\nPublicKey = {public}\nAllowedIPs = {other}/32\nEndpoint = {endpoint}:{LINK_PORT}\n"
+        address = LEFT_TUNNEL if other == RIGHT_TUNNEL else RIGHT_TUNNEL
+        return start_wireguard(
+            host, folder, private, public, (address, other), f"Endpoint = {endpoint}:{LINK_PORT}\n"
         )
-        _until_device(host, device, process)
-        host.run("wg", "setconf", device, str(config))
-        address = LEFT_TUNNEL if is_left else RIGHT_TUNNEL
-        host.run("ip", "address", "add", f"{address}/24", "dev", device)
-        host.run("ip", "link", "set", device, "up", "mtu", "1420")
-        return process
+
+
+class WireguardGoBehindRelay(WireguardGo):
+    """The same with the empty relay before it, which receives frames on loopback as a daemon does."""
+
+    def why_not(self) -> str | None:
+        return super().why_not() or Relay("relay").why_not()
+
+    def start(self, cable: Cable, folder: Path) -> Running:
+        running = super().start(cable, folder)
+        relay = Relay("relay").start_one(cable.left, INTO_PORT, running.target, folder)
+        return Running([*running.left, relay], running.right, INTO)
+
+
+class Station(Tunnel):
+    """The vehicle's daemon with a station: WireGuard in its own process, wireguard-go at the other end."""
+
+    def start(self, cable: Cable, folder: Path) -> Running:
+        running = super().start(cable, folder)
+        return Running(running.left, running.right, INTO)
+
+    def _start(self, cable: Cable, folder: Path) -> tuple[subprocess.Popen[bytes], subprocess.Popen[bytes]]:
+        for name in ("left", "stations"):
+            keys.write_secret_file(folder / f"{name}.key", _output("wg", "genkey") + "\n")
+        own = keys.public_key_text((folder / "stations.key").read_text().strip())
+        private = _output("wg", "genkey")
+        station = (
+            f'\n[stations]\nlisten = "0.0.0.0:{LINK_PORT + 1}"\nprivate_key_file = "stations.key"\nnetwork ='
+            f' "{NETWORK}"\n\n[[station]]\nname = "right"\npublic_key = "{keys.public_key_text(private)}"\n'
+            f'address = "{RIGHT_TUNNEL}"\nrole = "operator"\nsystem_ids = [255]\nports = [{SINK_PORT}]\n'
+        )
+        endpoint = f"udpin:127.0.0.1:{INTO_PORT}"
+        (folder / "left.toml").write_text(configuration("left", peers=[station], endpoint=endpoint))
+        left = start_daemon(cable.left, folder / "left.toml")
+        until((folder / "left.sock").exists, "the daemon answers")
+        place = f"Endpoint = {cable.left.address}:{LINK_PORT + 1}\nPersistentKeepalive = 15\n"
+        return left, start_wireguard(cable.right, folder, private, own, (RIGHT_TUNNEL, LEFT_TUNNEL), place)
+
+
+def start_wireguard(
+    host: Host, folder: Path, private: str, public: str, addresses: tuple[str, str], more: str
+) -> subprocess.Popen[bytes]:
+    """An interface of wireguard-go with one peer; ``addresses``: its own one and the peer's inside the tunnel."""
+    own, other = addresses
+    device = f"wg{os.getpid() % 10**8}{host.name[-1]}"  # its control socket is the machine's, so the name is too
+    process = host.start(["wireguard-go", "-f", device], log=folder / f"{device}.log")
+    config = folder / f"{device}.conf"
+    config.touch(0o600)
+    config.write_text(
+        f"[Interface]\nPrivateKey = {private}\nListenPort = {LINK_PORT}\n"
+        f"[Peer]\nPublicKey = {public}\nAllowedIPs = {other}/32\n{more}"
+    )
+    _until_device(host, device, process)
+    host.run("wg", "setconf", device, str(config))
+    host.run("ip", "address", "add", f"{own}/24", "dev", device)
+    host.run("ip", "link", "set", device, "up", "mtu", "1420")
+    return process
 
 
 class Nebula(Tunnel):
@@ -135,6 +186,8 @@ def _output(*command: str, given: str = "") -> str:
 
 
 TUNNELS: Final = (
-    WireguardGo("wireguard-go", "wg"),
-    Nebula("nebula", "nebula-cert", version_option="-version"),
+    WireguardGo("wireguard-go", "wireguard-go", "wg"),
+    WireguardGoBehindRelay("wireguard-go-relay", "wireguard-go", "wg"),
+    Station("uavlinkd-station", "wireguard-go", "wg"),
+    Nebula("nebula", "nebula", "nebula-cert", version_option="-version"),
 )

@@ -74,7 +74,7 @@ NOT_CONFIGURED = (
         "starlette",
     ),
     *("uvicorn", "websockets", "cryptography.hazmat.primitives.serialization"),
-    *(f"uavlinkd.{room}" for room in ("fleet", "lab", "relay", "serial", "tls", "web")),
+    *(f"uavlinkd.{room}" for room in ("fleet", "lab", "relay", "serial", "stations", "tls", "web")),
     *(f"uavlinkd.authority.{module}" for module in ("enrolment", "exchange", "state_file", "trust")),
     *(f"uavlinkd.io.{module}" for module in ("send_window", "serial", "tcp")),
 )

@@ -1,6 +1,8 @@
 """MAVSDK as a process: it flies the vehicle at a URL, and prints its observations as JSON in the last line.
 
-Usage: python clients.py URL
+Usage: python clients.py URL [ITEMS]
+
+ITEMS: the least number of items of the mission.
 
 It imports no module of the project, so any interpreter with the client library can run it, and a crash of the library
 does not stop the tests. It uses only the library's public functions, as a user does.
@@ -29,7 +31,7 @@ PLAN = [
 ]
 
 
-async def fly_with_mavsdk(url: str) -> dict[str, Any]:
+async def fly_with_mavsdk(url: str, least: int = 0) -> dict[str, Any]:
     """Connect, read and set parameters, exchange a mission, fly up and down: MAVSDK 4 or later."""
     from mavsdk.asyncio import Configuration, Mavsdk
     from mavsdk.asyncio.plugins.action import ActionAsync
@@ -60,7 +62,7 @@ async def fly_with_mavsdk(url: str) -> dict[str, Any]:
 
         items = [
             MissionItem(sequence, frame, command, int(sequence == 0), 1, *four, x, y, z, 0)
-            for sequence, (command, frame, four, x, y, z) in enumerate(PLAN)
+            for sequence, (command, frame, four, x, y, z) in enumerate(PLAN + [PLAN[2]] * (least - len(PLAN)))
         ]
         await missions.upload_mission(items)
         back = await missions.download_mission()
@@ -90,4 +92,4 @@ async def fly_with_mavsdk(url: str) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    print("\n" + json.dumps(asyncio.run(fly_with_mavsdk(sys.argv[1]))))
+    print("\n" + json.dumps(asyncio.run(fly_with_mavsdk(sys.argv[1], *map(int, sys.argv[2:])))))
