@@ -75,6 +75,12 @@ class Client:
         """Whether it has keys."""
         return self._send is not None
 
+    def restart(self) -> None:
+        """Forget all sessions."""
+        self._send = None
+        self._receivers.clear()
+        self._unconfirmed.clear()
+
     def initiation(self) -> bytes:
         """The next initiation of the station."""
         self._ephemeral, self._index = X25519PrivateKey.generate(), next(self._indices)
@@ -92,6 +98,14 @@ class Client:
         message = struct.pack("<II", 1, self._index) + public + static + stamp
         message += _mac(_hash(b"mac1----", s), message)
         return message + bytes(16)
+
+    def awaits(self, message: bytes) -> bool:
+        """Whether a response is to the newest initiation."""
+        return message[8:12] == struct.pack("<I", self._index)
+
+    def knows(self, message: bytes) -> bool:
+        """Whether a data message is of a session that was not forgotten."""
+        return int.from_bytes(message[4:8], "little") in self._receivers
 
     def on_response(self, message: bytes) -> None:
         """The daemon answered: use the keys from now on."""

@@ -28,7 +28,10 @@ class World:
         self.numbers = count(1)
         self.indices = TunnelIndices(entropy)
         ends = inner.Ends.of(host, daemon_host)
-        self.tunnel = Tunnel(self.own, self.client.key, ends, entropy, self.indices, self.timestamp)
+        self._new_tunnel = lambda: Tunnel(self.own, self.client.key, ends, entropy, self.indices, self.timestamp)
+        self.tunnel = self._new_tunnel()
+        self.there = THERE
+        """Where the client is. What the daemon sends elsewhere is lost."""
         self.to_daemon: Callable[[bytes], float | None] = lambda datagram: 0.02
         self.to_client: Callable[[bytes], float | None] = lambda datagram: 0.02
         self._events: list[tuple[float, int, Callable[[], None]]] = []
@@ -41,6 +44,14 @@ class World:
     def timestamp(self) -> bytes:
         return (2**62 + next(self.numbers)).to_bytes(8, "big") + bytes(4)
 
+    def restart_daemon(self) -> None:
+        """The daemon ends and starts: it knows where the station was, and initiates there."""
+        at = self.tunnel.address
+        self.indices = TunnelIndices(self.random.randbytes)
+        self.tunnel = self._new_tunnel()
+        self.tunnel.address = at
+        self.from_daemon(self.tunnel.initiate(self.now))
+
     # The network.
 
     def at(self, seconds: float, action: Callable[[], None]) -> None:
@@ -50,8 +61,8 @@ class World:
         if (delay := self.to_daemon(datagram)) is not None:
             self.at(self.now + delay, partial(self.receive, datagram))
 
-    def from_daemon(self, datagrams: list[bytes]) -> None:
-        for datagram in datagrams:
+    def from_daemon(self, datagrams: list[bytes], to: tuple[str, int] | None = None) -> None:
+        for datagram in datagrams if (to or self.tunnel.address) == self.there else ():
             if (delay := self.to_client(datagram)) is not None:
                 self.at(self.now + delay, partial(self._at_client, datagram))
 
@@ -61,7 +72,7 @@ class World:
             match datagram[0]:
                 case 1:
                     initiation = handshake.read_initiation(self.own, datagram)
-                    self.from_daemon([self.tunnel.on_initiation(initiation, self.now)])
+                    self.from_daemon([self.tunnel.on_initiation(initiation, self.now)], self.there)
                 case 2:
                     index = int.from_bytes(datagram[8:12], "little")
                     self.indices.get(index)
@@ -69,7 +80,7 @@ class World:
                 case 4:
                     index = int.from_bytes(datagram[4:8], "little")
                     self.indices.get(index)
-                    opened = self.tunnel.open(datagram, index, THERE, self.now)
+                    opened = self.tunnel.open(datagram, index, self.there, self.now)
                     content = inner.parse(opened.packet, self.tunnel.ends) if opened.packet else None
                     if isinstance(content, inner.Datagram):
                         is_new = opened.is_new(self.now)
@@ -84,10 +95,10 @@ class World:
         match datagram[0]:
             case 1:
                 self.from_client(self.client.on_initiation(datagram))
-            case 2:
+            case 2 if self.client.awaits(datagram):
                 self.client.on_response(datagram)
                 self.from_client(self.client.data(b""))
-            case 4:
+            case 4 if self.client.knows(datagram):
                 payload, answers = self.client.on_data(datagram)
                 if payload:
                     self.at_client.append(payload)

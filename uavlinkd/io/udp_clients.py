@@ -24,8 +24,7 @@ MAX_HOLD_S = 2.0  # A frame in pieces may take this long: a frame of 280 bytes f
 MOST_STREAMS = 64
 """Most senders without a client's place whose unfinished frames are held. A new one displaces the oldest of these."""
 LOCAL_DATAGRAM_BYTES = 296
-"""Frames for one client share a datagram up to this size: MAVROS reads no more of a datagram and loses the rest
-(libmavconn, MsgBuffer::MAX_SIZE)."""
+"""MAVROS reads no more of a datagram, and loses the rest (libmavconn, MsgBuffer::MAX_SIZE)."""
 
 
 class UdpPort(LocalPort):
@@ -51,10 +50,10 @@ class UdpPort(LocalPort):
                 data = delivered.admit(frame, source, now)
                 if not data:
                     continue
-            if count and len(batch) + len(data) > LOCAL_DATAGRAM_BYTES:
+            if count and len(batch) + len(data) > endpoint.datagram_bytes:
                 endpoint.send(batch, self.address, count)
                 batch, count = b"", 0
-            if len(data) > LOCAL_DATAGRAM_BYTES:  # a separator and the frame
+            if len(data) > endpoint.datagram_bytes:  # a separator and the frame
                 cut = len(data) - len(frame.raw)
                 endpoint.send(data[:cut], self.address, 0)
                 data = data[cut:]
@@ -76,6 +75,8 @@ class DatagramEndpoint(Endpoint):
 
     sendto: Callable[[bytes, SocketAddress], object]
     """Sends a datagram to a client. Raises OSError."""
+    datagram_bytes = LOCAL_DATAGRAM_BYTES
+    """Frames for one client share a datagram up to this size."""
 
     def __init__(self, name: str, handler: PortHandler) -> None:
         super().__init__(name, handler)

@@ -12,6 +12,7 @@ from uavlinkd.mavlink.frames import split_payload
 from uavlinkd.mavlink.payloads import may_be_old
 from uavlinkd.protocol.drops import DropReason
 from uavlinkd.protocol.path import SocketAddress
+from uavlinkd.stations.inner import MOST_PAYLOAD_BYTES
 
 CLIENT_IDLE_S: Final = 60.0
 """A client at a port that the file does not name is forgotten after this silence."""
@@ -23,6 +24,8 @@ class StationEndpoint(DatagramEndpoint):
     ``send`` sends a payload to a port of the station, and raises OSError. ``begin`` and ``finish`` start and end the
     tunnel.
     """
+
+    datagram_bytes = MOST_PAYLOAD_BYTES
 
     def __init__(
         self,

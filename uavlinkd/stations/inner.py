@@ -13,6 +13,8 @@ from typing import Final, NamedTuple
 
 MTU: Final = 1280
 """What the file for a station says: with WireGuard's 60 bytes around it a packet passes where 1,340 bytes pass."""
+MOST_PAYLOAD_BYTES: Final = MTU - 48
+"""Of a UDP datagram over IPv6, in one packet."""
 TOKEN_BYTES: Final = 16
 """Random bytes in an echo request of this daemon."""
 _UDP, _ICMP, _ICMP6 = 17, 1, 58

@@ -1,0 +1,98 @@
+"""A man in the middle between the real wireguard-go and the daemon delays, holds and replays its datagrams."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from time import monotonic
+
+import pytest
+
+from tests.stations.middle import INITIATION, Arrival, Middle
+from tests.stations.scene import Scene, need_wireguard, until
+from tests.waiting import Stopwatch
+
+pytestmark = pytest.mark.long
+OLDEST_S = 5.5
+"""The bound of the age of a command, as for peers."""
+BACK_S = 0.5
+BACK_BY_KEYS_S = 3.5
+"""Without answers: the daemon initiates every 2 s, and asks again for a second before."""
+REFUSING = "table inet tablet { chain in { type filter hook input priority 0; icmp type echo-request drop; }; }"
+
+
+@pytest.fixture
+def middle() -> Iterator[Middle]:
+    need_wireguard()
+    with Scene() as scene:
+        middle = Middle(scene)
+        yield middle
+        middle.close()
+
+
+def begin(middle: Middle, rules: str = "") -> None:
+    """Connect, until commands pass or for some seconds."""
+    printed = middle.scene.add("tablet")
+    if rules:
+        middle.scene.tablet.nft(rules)
+    middle.scene.start_daemon()
+    middle.open(printed)
+
+
+def until_commands(middle: Middle) -> None:
+    """Run until a command arrives that is sent from now on."""
+    first = len(middle.sent)
+
+    def arrives() -> bool:
+        middle.run(0.05)
+        return any(arrival.number >= first for arrival in middle.arrivals)
+
+    until(arrives, "commands pass")
+
+
+@pytest.mark.parametrize("delay_s", [1.0, 4.0, 8.0, 30.0])
+@pytest.mark.parametrize("answers", [True, False])
+def test_delayed_commands_are_new_or_dropped(middle: Middle, delay_s: float, *, answers: bool) -> None:
+    """None is older than the bound, none comes twice, and they are back soon after the delay ends."""
+    begin(middle, "" if answers else REFUSING)
+    until_commands(middle)
+    middle.run(3.0)
+    middle.delay_s = delay_s
+    middle.run(delay_s + 4.0)
+    middle.delay_s, released_at, released = 0.0, monotonic(), Stopwatch()
+    first = len(middle.sent)
+    until_commands(middle)
+    back_s = next(arrival.at for arrival in middle.arrivals if arrival.number >= first) - released_at
+    calm_s = released.calm_s
+    middle.run(2.0)
+    middle.replay()
+    middle.run(2.0)
+    oldest = max(middle.arrivals, key=lambda arrival: arrival.age_s)
+    print(f"answers {answers}, delay {delay_s} s: oldest {oldest.age_s:.2f} s, back after {back_s:.2f} s")
+    assert max(arrival.calm_s for arrival in middle.arrivals) <= OLDEST_S
+    assert no_duplicate(middle.arrivals)
+    assert calm_s <= (BACK_S if answers else BACK_BY_KEYS_S)
+
+
+def test_commands_of_a_station_that_answers_nothing_never_pass(middle: Middle) -> None:
+    """Neither pings nor initiations are answered: reports of the vehicle pass, and `status` names the rule."""
+    middle.passes = lambda datagram: datagram[0] != INITIATION
+    begin(middle, REFUSING)
+    middle.run(5.0)
+    first = len(middle.sent)
+    causes: list[str] = []
+
+    def is_named() -> bool:
+        middle.run(0.5)
+        findings = middle.scene.status()["findings"]
+        causes[:] = [finding["remedy"] for finding in findings if finding["cause"] == "station_unverified"]
+        return bool(causes)
+
+    until(is_named, "status names the firewall")
+    assert "10.66.0.1" in causes[0]
+    assert middle.heartbeats > 0
+    assert not any(arrival.number >= first for arrival in middle.arrivals)
+
+
+def no_duplicate(arrivals: list[Arrival]) -> bool:
+    """Whether each command arrived once."""
+    return len({arrival.number for arrival in arrivals}) == len(arrivals)
