@@ -27,8 +27,7 @@ class World:
         self.client = Client(self.own.key.public, host, daemon_host)
         self.numbers = count(1)
         self.indices = TunnelIndices(entropy)
-        ends = inner.Ends.of(host, daemon_host)
-        self._new_tunnel = lambda: Tunnel(self.own, self.client.key, ends, entropy, self.indices, self.timestamp)
+        self._ends = inner.Ends.of(host, daemon_host)
         self.tunnel = self._new_tunnel()
         self.there = THERE
         """Where the client is. What the daemon sends elsewhere is lost."""
@@ -43,6 +42,10 @@ class World:
 
     def timestamp(self) -> bytes:
         return (2**62 + next(self.numbers)).to_bytes(8, "big") + bytes(4)
+
+    def _new_tunnel(self) -> Tunnel:
+        arguments = self.client.key, self._ends, self.random.randbytes, self.indices, self.timestamp
+        return Tunnel(self.own, *arguments)
 
     def restart_daemon(self) -> None:
         """The daemon ends and starts: it knows where the station was, and initiates there."""
