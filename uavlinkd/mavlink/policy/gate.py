@@ -137,6 +137,7 @@ class Gate:
         self._rates = settings.rates[direction]
         self._is_incoming = direction == "in"
         self.systems = settings.systems if self._is_incoming else None  # whose frames are let pass; None: any
+        self.passes_commands = self._rules.allows_command(ARM)  # which stands for the commands that fly a vehicle
         self._mavlink1 = settings.mavlink1
         self._ground_station = settings.ground_station or not self._is_incoming
         self._decisions: dict[int, Refusal | Condition | None] = {}
@@ -231,11 +232,6 @@ class Gate:
         return not any(
             (rules.allows_all, rules.allowed, rules.allowed_numbers, rules.allowed_commands, rules.opcodes)
         )
-
-    @property
-    def passes_commands(self) -> bool:
-        """Whether the rules allow the command to arm, which stands for those that fly a vehicle."""
-        return self._rules.allows_command(ARM)
 
     def may_speak_as(self, system: int) -> bool:
         """Whether frames of this system are let pass at all."""

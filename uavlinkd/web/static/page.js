@@ -138,7 +138,7 @@ function plot(name, format, lines, index) {
 }
 
 function axis() {
-  return el("div", { class: "axis", "aria-hidden": "true" }, ["10 min ago", "5", "now"].map((text) => el("span", {}, text)));
+  return el("div", { class: "axis", "aria-hidden": "true" }, ["10 min", "5 min", "now"].map((text) => el("span", {}, text)));
 }
 
 // The plots of a peer's best path at each moment.
@@ -244,10 +244,10 @@ function paths(facts) {
       el("th", { scope: "row" }, el("b", {}, path.kind), " ", el("small", {}, lost === null ? path.state : "unknown")),
       el("td", {}, lost === null ? ms(path.rtt) : "-"), el("td", {}, lost === null ? percent(loss) : "-"), el("td", {}, drawing));
   };
-  return el("table", { class: "paths" },
+  return el("table", { class: "paths", "aria-label": `paths to ${facts.name}` },
     el("thead", {}, el("tr", {}, titles.map((title) => el("th", { scope: "col" }, title)))),
     el("tbody", {}, facts.paths.map(one)),
-    el("tfoot", {}, el("tr", {}, el("td", { colspan: 3 }), el("td", {}, axis()))));
+    el("tfoot", { "aria-hidden": "true" }, el("tr", {}, el("td", { colspan: 3 }), el("td", {}, axis()))));
 }
 
 function linesOf(name, path) { return (plotted[name] || {})[path.number] || [[], [], []]; }
