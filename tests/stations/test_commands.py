@@ -66,6 +66,7 @@ def test_key_of_a_tunnel_that_the_app_made(config: Path, capsys: pytest.CaptureF
 @pytest.mark.parametrize(
     ("more", "says"),
     [
+        (("--public-key", 'x"\nrole = "vehicle'), "station[0].public_key (tablet)"),
         (("--system-id", "1"), "has the system id of endpoint[0] (autopilot) too"),
         (("--public-key", "short"), "station[0].public_key (tablet)"),
         (("--public-key", base64.b64encode(bytes(32)).decode()), "point of low order"),
@@ -80,6 +81,34 @@ def test_invalid_station_changes_nothing(
     assert f"{config}: " in said
     assert ".trial" not in said
     assert config.read_text() == CONFIG
+
+
+@pytest.mark.parametrize("name", ['a"\n[log]\nlevel = "debug', "a\\", "a\x7f", "\u202ea", "", "a\0b"])
+def test_name_is_no_part_of_the_file(config: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
+    """No section or key can be written by a name."""
+    assert main(("station", "add", name, "--config", str(config), "--at", "h")) == 2
+    said = capsys.readouterr().err
+    assert "station[0].name" in said or "TOML" in said
+    assert config.read_text() == CONFIG
+
+
+@pytest.mark.parametrize("at", ["a b", "h\nAllowedIPs = 0.0.0.0/0", "[::1]", "h:1"])
+def test_place_that_is_none_is_refused(config: Path, capsys: pytest.CaptureFixture[str], at: str) -> None:
+    assert main(("station", "add", "tablet", "--config", str(config), "--at", at)) == 2
+    assert "--at " in capsys.readouterr().err
+    assert config.read_text() == CONFIG
+
+
+def test_address_of_ipv6_has_brackets(config: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(("station", "add", "tablet", "--config", str(config), "--at", "2001:db8::1")) == 0
+    assert "Endpoint = [2001:db8::1]:51820" in capsys.readouterr().out
+
+
+def test_invalid_file_is_named_before_anything_is_made(config: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config.write_text(CONFIG + '[stations]\nnetwork = "any"\nprivate_key_file = "stations.key"\n')
+    assert main(("station", "add", "tablet", "--config", str(config), "--at", "h")) == 2
+    assert "stations.network" in capsys.readouterr().err
+    assert not (config.parent / "stations.key").exists()
 
 
 def test_names_that_are_taken_or_absent(config: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,6 @@ import pytest
 from tests import waiting
 from uavlinkd.io.sockets import BindError
 from uavlinkd.protocol.crypto import x25519_public_key
-from uavlinkd.protocol.drops import Drop
 from uavlinkd.protocol.path import SocketAddress
 from uavlinkd.stations.state import BLOCK, StationDisk
 
@@ -42,12 +42,18 @@ def test_timestamps_grow_over_restarts(tmp_path: Path) -> None:
     assert all(len(stamp) == 12 and stamp[0] == 0x40 and stamp[8:] == bytes(4) for stamp in stamps)
 
 
-def test_no_timestamp_beyond_what_is_on_the_disk(tmp_path: Path) -> None:
-    disk = opened(tmp_path / "state")
-    for _ in range(BLOCK):
-        disk.timestamp()
-    with pytest.raises(Drop):
-        disk.timestamp()
+async def test_disk_that_takes_nothing_stops_no_handshake(tmp_path: Path) -> None:
+    """The numbers go on, and are written when the disk takes them again."""
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    disk = opened(folder / "state")
+    folder.rename(tmp_path / "away")
+    stamps = [disk.timestamp() for _ in range(BLOCK + 10)]
+    assert stamps == sorted(set(stamps))
+    (tmp_path / "away").rename(folder)
+    disk.follow({})
+    await waiting.until(lambda: disk.left > 0)
+    assert opened(folder / "state").timestamp() > stamps[-1]
 
 
 async def test_numbers_are_reserved_before_they_run_out(tmp_path: Path) -> None:
@@ -60,14 +66,25 @@ async def test_numbers_are_reserved_before_they_run_out(tmp_path: Path) -> None:
         disk.timestamp()
 
 
-@pytest.mark.parametrize("content", ["", "other\n5\n", "uavlinkd stations 1\nmany\n", "\0" * 100])
+@pytest.mark.parametrize(
+    "content",
+    [
+        "",
+        "other\n5\n",
+        *(f"uavlinkd stations 1\n{number}\n" for number in ("many", "9" * 19, "9" * 9999)),
+        "\0" * 100,
+    ],
+    ids=["empty", "another title", "text", "19 digits", "9,999 digits", "zeros"],
+)
 def test_file_of_another_kind_begins_anew(tmp_path: Path, content: str) -> None:
     (tmp_path / "state").write_text(content)
     assert StationDisk(tmp_path / "state").open() == {}
 
 
 def test_lines_that_are_wrong_are_left_out(tmp_path: Path) -> None:
-    lines = ["uavlinkd stations 1", "7", "short 1.2.3.4 5", "x y", f"{'A' * 43}= 1.2.3.4 5", ""]
+    places = ("1.2.3.4 65536", "1.2.3.4 0", "1.2.3.4 -1", "1.2.3.4 x", "host.example 5", "1.2.3 5")
+    lines = ["uavlinkd stations 1", "7", "short 1.2.3.4 5", "x y", f"{'A' * 43}= 1.2.3.4 5"]
+    lines += [f"{base64.b64encode(KEY).decode()} {place}" for place in places]
     (tmp_path / "state").write_text("\n".join(lines))
     disk = StationDisk(tmp_path / "state")
     assert disk.open() == {}

@@ -90,7 +90,7 @@ class World:
                         self.delivered.append((content.payload, is_new, self.now))
                         self.tunnel.on_frames(self.now, is_new=is_new, has_commands=True)
                     elif isinstance(content, inner.Ping):
-                        self.tunnel.on_answer(opened, content.token, self.now)
+                        self.tunnel.on_answer(opened, content.token)
         except Drop as drop:
             self.drops.append(drop.reason)
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import re
 import shutil
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from ipaddress import ip_network
 from pathlib import Path
@@ -18,6 +19,7 @@ from uavlinkd.config.load import load_config, read_toml
 from uavlinkd.config.model import ConfigError
 from uavlinkd.config.schema import SECTIONS
 from uavlinkd.stations.inner import MTU
+from uavlinkd.system.addresses import Address, AddressError, parse_address
 from uavlinkd.system.folders import replace_file
 from uavlinkd.system.terminal import OK, CommandError, UsageError
 
@@ -54,6 +56,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _add(options: argparse.Namespace) -> int:
     path, name = options.config, options.name
+    try:
+        parse_address(str(Address(options.at or _ANYWHERE[0], _ANYWHERE[1])), allow_names=True)
+    except AddressError as error:
+        raise UsageError(f"--at {error}") from None
+    load_config(path, _environ(options.keys))  # it is valid before
     table = read_toml(path)
     stations, settings = table.get("station", []), table.get("stations", {})
     if any(station.get("name") == name for station in stations):
@@ -72,14 +79,15 @@ def _add(options: argparse.Namespace) -> int:
         if not os.path.lexists(key_file):
             keys.write_secret_file(key_file, keys.generate_private_key())
     text += (
-        f'\n[[station]]\nname = "{name}"\npublic_key = "{public}"\naddress = "{address}"\n'
+        f'\n[[station]]\nname = {json.dumps(name)}\npublic_key = {json.dumps(public)}\naddress = "{address}"\n'
         f'role = "{options.role}"\nsystem_ids = [{options.system_id}]\n'
     )
     config = _replace(path, path.read_text().rstrip("\n") + "\n" + text, options.keys)
     assert config.stations is not None
     own = keys.public_key_text(keys.encode_key(config.stations.private_key.reveal()))
-    host, port = options.at or _own_address(), config.stations.listen.port
-    _print_code(name, private, own, (address, config.stations.address), f"{host}:{port}")
+    port = config.stations.listen.port
+    place = str(Address(options.at or _own_address(), port))
+    _print_code(name, private, own, (address, config.stations.address), place)
     print(
         f"Restart the daemon of {path}; UDP port {port} must be open. Compare: the tunnel's peer has the key\n  {own}"
     )
@@ -122,11 +130,10 @@ def _is_station(block: str, name: str) -> bool:
 
 def _replace(path: Path, text: str, folder: Path | None) -> Any:
     """Replace the file, if the text is a valid one. Returns its configuration. Raises ConfigError."""
-    environ = os.environ if folder is None else {keys.CREDENTIALS: str(folder.absolute())}
     trial = path.with_name(f".{path.name}.trial")
     try:
         trial.write_text(text)
-        config = load_config(trial, environ)
+        config = load_config(trial, _environ(folder))
         shutil.copystat(path, trial)
         replace_file(path, text.encode())
         shutil.copystat(trial, path)
@@ -138,6 +145,10 @@ def _replace(path: Path, text: str, folder: Path | None) -> Any:
         with suppress(OSError):
             trial.unlink()
     return config
+
+
+def _environ(folder: Path | None) -> Mapping[str, str]:
+    return os.environ if folder is None else {keys.CREDENTIALS: str(folder.absolute())}
 
 
 def _own_address() -> str:

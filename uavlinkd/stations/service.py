@@ -23,7 +23,7 @@ from uavlinkd.stations import handshake, inner
 from uavlinkd.stations.endpoint import StationEndpoint
 from uavlinkd.stations.session import DATA, HEADER_BYTES, TAG_BYTES
 from uavlinkd.stations.state import StationDisk
-from uavlinkd.stations.tunnel import Tunnel, TunnelIndices
+from uavlinkd.stations.tunnel import Opened, Tunnel, TunnelIndices
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.guard import report, run
 from uavlinkd.system.stall import StallWatch
@@ -62,7 +62,7 @@ class Stations(Feature):
         self._stations: dict[Tunnel, Station] = {}
         self._by_key: dict[bytes, Station] = {}
         self._disk = StationDisk(config.state_file)
-        self._armed_at = NEVER
+        self._places: set[SocketAddress] = set()  # where stations are, or were before a restart
         self._is_started = False
 
     # Life.
@@ -86,6 +86,7 @@ class Stations(Feature):
         ends = inner.Ends.of(url.host, self._config.address)
         tunnel = Tunnel(self._own, url.key, ends, os.urandom, self._indices, self._disk.timestamp)
         tunnel.address = self._was_at.get(url.key)
+        self._places.update([] if tunnel.address is None else [tunnel.address])
         send = partial(self._send_frames, tunnel)
         endpoint = StationEndpoint(config.name, url, handler, send, partial(self._start, tunnel), self._close)
         station = Station(config.name, tunnel, endpoint, monotonic())
@@ -99,7 +100,7 @@ class Stations(Feature):
             self._is_started = True
             self._reader.start()
         self._send_all(tunnel, tunnel.initiate(monotonic()))
-        self._settle()
+        self._settle(tunnel)
 
     def _close(self) -> None:
         self._reader.stop()
@@ -115,12 +116,11 @@ class Stations(Feature):
                 self._line.drop_datagram(drop.reason, path=Path(_SOCKET, address))
             except Exception as error:  # a fault costs this datagram
                 report(error)
-        self._settle()
 
     def _receive_one(self, datagram: bytes, address: SocketAddress, now: float, epoch: int) -> None:
         """Handle one datagram. Raises Drop."""
         kind, size = datagram[:4], len(datagram)
-        if kind == DATA and size >= HEADER_BYTES + TAG_BYTES and not size % 16:
+        if kind == DATA and size >= HEADER_BYTES + TAG_BYTES:
             self._receive_data(datagram, address, now, epoch)
         elif kind == handshake.INITIATION and size == handshake.INITIATION_BYTES:
             self._admit(datagram, Path(_SOCKET, address), now, is_response=False)
@@ -129,10 +129,11 @@ class Stations(Feature):
             if station is None:
                 raise Drop(DropReason.UNKNOWN_PEER, initiation.static)
             self._send(station, station.tunnel.on_initiation(initiation, now), address)
+            self._settle(station.tunnel)
         elif kind == handshake.RESPONSE and size == handshake.RESPONSE_BYTES:
-            self._admit(datagram, Path(_SOCKET, address), now, is_response=True)
             index = _index(datagram, 8)
-            tunnel = self._indices.get(index)
+            tunnel = self._indices.get(index)  # first, so that a response to nothing takes no budget
+            self._admit(datagram, Path(_SOCKET, address), now, is_response=True)
             self._send_all(tunnel, tunnel.on_response(datagram, index, now), address)
             self._follow(tunnel)
         elif kind == handshake.COOKIE_REPLY and size == handshake.COOKIE_REPLY_BYTES:
@@ -158,14 +159,18 @@ class Stations(Feature):
         station = self._stations[tunnel]
         opened = tunnel.open(datagram, index, address, now)
         self._follow(tunnel)
-        if not opened.packet:
-            return
+        if opened.packet:
+            self._receive_packet(station, opened, now, epoch)
+            self._settle(tunnel)
+
+    def _receive_packet(self, station: Station, opened: Opened, now: float, epoch: int) -> None:
+        tunnel = station.tunnel
         match inner.parse(opened.packet, tunnel.ends):
             case inner.Datagram(source_port, port, payload) if port == MAVLINK_PORT:
                 is_new = opened.is_new(now)
                 commands = station.endpoint.receive(payload, source_port, now, epoch, is_new=is_new)
                 tunnel.on_frames(now, is_new=is_new, has_commands=commands)
-            case inner.Ping(is_answer=True, token=token) if tunnel.on_answer(opened, token, now):
+            case inner.Ping(is_answer=True, token=token) if tunnel.on_answer(opened, token):
                 pass
             case inner.Ping(is_answer=False) as echo if station.answers.take(now):
                 self._send_packet(station, inner.answer(tunnel.ends, echo), now)
@@ -184,7 +189,7 @@ class Stations(Feature):
             endpoint.end()
 
     def _is_known(self, place: SocketAddress) -> bool:
-        return any(tunnel.address is not None and remote_of(tunnel.address) == place for tunnel in self._stations)
+        return place in self._places
 
     # Datagrams out.
 
@@ -195,8 +200,7 @@ class Stations(Feature):
         if datagram is None or tunnel.address is None:
             raise OSError(0, "no session")
         self._sock.sendto(datagram, tunnel.address)
-        if tunnel.next_at < self._armed_at:
-            self._settle()
+        self._settle(tunnel)
 
     def _send_packet(self, station: Station, packet: bytes, now: float) -> None:
         datagram = station.tunnel.seal(packet, now)
@@ -227,18 +231,15 @@ class Stations(Feature):
         """When :meth:`do_due` has something to do."""
         return min((tunnel.next_at for tunnel in self._stations), default=NEVER)
 
-    def _settle(self) -> None:
-        if self.next_at < self._armed_at:
-            self._armed_at = self.next_at
+    def _settle(self, tunnel: Tunnel) -> None:
+        if tunnel.next_at < self._line.timer_at:
             self._line.arm()
 
     def do_due(self, now: float) -> None:
         """Ask, renew keys, and end what is over."""
-        self._armed_at = NEVER
         for tunnel in self._stations:
             if now >= tunnel.next_at:
                 run(self._do_due_of, tunnel, now)
-        self._armed_at = self.next_at
 
     def _do_due_of(self, tunnel: Tunnel, now: float) -> None:
         self._send_all(tunnel, tunnel.do_due(now))
@@ -247,8 +248,9 @@ class Stations(Feature):
     def do_housekeeping(self, now: float) -> None:
         """Once a second."""
         self._reports.renew()
-        places = {tunnel.key: tunnel.address for tunnel in self._stations}
-        self._disk.follow({key: remote_of(at) for key, at in places.items() if at is not None})
+        places = {tunnel.key: remote_of(at) for tunnel in self._stations if (at := tunnel.address) is not None}
+        self._places = set(places.values())
+        self._disk.follow(places)
 
 
 def _index(datagram: bytes, at: int) -> int:

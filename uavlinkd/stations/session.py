@@ -28,21 +28,23 @@ _PADDING: Final = bytes(15)
 class TunnelSession:
     """TunnelKeys of one handshake. All times are monotonic seconds."""
 
-    __slots__ = ("_proofs", "_sent", "_window", "born_at", "index", "is_initiator", "keys")
+    __slots__ = ("_proofs", "_sent", "_window", "born_at", "ends_at", "index", "is_initiator", "keys")
 
-    def __init__(self, index: int, keys: TunnelKeys, born_at: float, *, is_initiator: bool) -> None:
+    def __init__(self, index: int, keys: TunnelKeys, born_at: float, since: float, *, is_initiator: bool) -> None:
+        """``since``: what comes with these keys was sent by the station's software after this time."""
         self.index = index
         self.keys = keys
         self.born_at = born_at
         """When this daemon sent its message of the handshake: the station has the keys only since then."""
+        self.ends_at = born_at + REJECT_AFTER_S
         self.is_initiator = is_initiator
         self._sent = 0
         self._window = ReplayWindow()
-        self._proofs: list[tuple[int, float]] = []
+        self._proofs = [(-1, since)]
 
     def is_over(self, now: float) -> bool:
         """Whether its keys are too old to send and to receive."""
-        return now - self.born_at >= REJECT_AFTER_S or self._sent >= MOST_MESSAGES
+        return now >= self.ends_at or self._sent >= MOST_MESSAGES
 
     @property
     def highest(self) -> int:
@@ -58,7 +60,7 @@ class TunnelSession:
 
     def open(self, datagram: bytes, now: float) -> tuple[int, bytes]:
         """Counter and inner packet of a data message. Raises ``SESSION_EXPIRED``, ``REPLAYED`` or ``BAD_TAG``."""
-        if now - self.born_at >= REJECT_AFTER_S:
+        if now >= self.ends_at:
             raise Drop(DropReason.SESSION_EXPIRED)
         counter = int.from_bytes(datagram[8:HEADER_BYTES], "little")
         window = self._window
@@ -72,7 +74,7 @@ class TunnelSession:
 
     def prove(self, counter: int, asked_at: float) -> None:
         """The station sent what has a higher counter after ``asked_at``."""
-        if not self._proofs or asked_at > self._proofs[-1][1]:
+        if asked_at > self._proofs[-1][1]:
             self._proofs.append((counter, asked_at))
             del self._proofs[:-PROOFS]
 

@@ -14,16 +14,19 @@ The file has the end of a block of numbers, so that it is written before the fir
 from __future__ import annotations
 
 import asyncio
+import re
 from base64 import b64decode, b64encode
 from collections.abc import Mapping
+from contextlib import suppress
+from ipaddress import ip_address
 from pathlib import Path
 from struct import Struct
 from typing import Final
 
 from uavlinkd.io.sockets import BindError
 from uavlinkd.protocol.crypto import is_usable_public_key
-from uavlinkd.protocol.drops import Drop, DropReason
 from uavlinkd.protocol.path import SocketAddress
+from uavlinkd.system.addresses import numeric_host
 from uavlinkd.system.folders import replace_file
 from uavlinkd.system.guard import report
 from uavlinkd.system.tasks import Threads
@@ -35,7 +38,7 @@ _THREAD: Final = Threads(1, "stations state")
 _TIMESTAMP: Final = Struct(">QI")
 _TAI64: Final = 2**62
 """The first second of a TAI64N label (whitepaper, section 5.1)."""
-_MOST_BYTES: Final = 65536
+_NUMBER: Final = re.compile(r"[0-9]{1,18}")
 
 
 class StationDisk:
@@ -53,7 +56,7 @@ class StationDisk:
         Raises BindError: without the file, stations would refuse what this daemon sends after a restart.
         """
         try:
-            text = self._path.read_bytes()[:_MOST_BYTES].decode("ascii", "replace") if self._path.exists() else ""
+            text = self._path.read_bytes().decode("ascii", "replace") if self._path.exists() else ""
             self._number, self._written = _parse(text)
             self._end = self._number + BLOCK
             replace_file(self._path, self._encode(self._written))
@@ -66,13 +69,14 @@ class StationDisk:
 
     @property
     def left(self) -> int:
-        """How many timestamps may be used before the next write."""
+        """How many timestamps are reserved."""
         return self._end - self._number
 
     def timestamp(self) -> bytes:
-        """A greater one than all before. Raises ``NO_FREE_INDEX`` while the disk takes no more."""
-        if not self.left:
-            raise Drop(DropReason.NO_FREE_INDEX)
+        """A greater one than all before.
+
+        If the disk takes none for hours, a restart repeats some: then only stations themselves make new keys a while.
+        """
         self._number += 1
         return _TIMESTAMP.pack(_TAI64 + self._number, 0)
 
@@ -95,7 +99,7 @@ class StationDisk:
             self._writing = None
 
     def _encode(self, addresses: Mapping[bytes, SocketAddress], end: int | None = None) -> bytes:
-        lines = [f"{b64encode(key).decode()} {address[0]} {address[1]}" for key, address in addresses.items()]
+        lines = [f"{b64encode(key).decode()} {numeric_host(at)} {at[1]}" for key, at in addresses.items()]
         return "\n".join([_TITLE, str(self._end if end is None else end), *lines, ""]).encode()
 
 
@@ -103,17 +107,12 @@ def _parse(text: str) -> tuple[int, dict[bytes, SocketAddress]]:
     """The number and the addresses; none of a file that this daemon did not write."""
     title, _, rest = text.partition("\n")
     number, *lines = rest.split("\n")
-    if title != _TITLE or not number.isdigit():
+    if title != _TITLE or not _NUMBER.fullmatch(number):
         return 0, {}
     addresses: dict[bytes, SocketAddress] = {}
     for key, host, port in (fields for line in lines if len(fields := line.split(" ")) == 3):
-        if port.isdigit() and is_usable_public_key(decoded := _decoded(key)):
-            addresses[decoded] = (host, int(port), 0, 0) if ":" in host else (host, int(port))
+        with suppress(ValueError):
+            decoded, numeric, at = b64decode(key, validate=True), str(ip_address(host)), int(port)
+            if is_usable_public_key(decoded) and 0 < at < 65536:
+                addresses[decoded] = (numeric, at, 0, 0) if ":" in numeric else (numeric, at)
     return int(number), addresses
-
-
-def _decoded(key: str) -> bytes:
-    try:
-        return b64decode(key, validate=True)
-    except ValueError:
-        return b""

@@ -48,7 +48,7 @@ ACTIVE_S: Final = 3.0
 """A station that sent no frame for this time is not asked."""
 DOUBT_S: Final = 2.0
 """How long a dropped command causes more questions, and how long a command is a reason to make new keys."""
-RENEW_S: Final = 2.0
+RENEW_S: Final = 1.5
 """Between two handshakes that take the place of answers, which a firewall of the station drops."""
 UNANSWERED_S: Final = 1.0
 """Questions without an answer for this time: the station answers none, or the link is cut."""
@@ -121,18 +121,6 @@ class Tunnel:
         """Where its newest authentic packet came from; None before the first."""
         self.next_at = NEVER
         """When :meth:`do_due` has something to do."""
-        self.answered_at = -NEVER
-        """When the station last answered a question."""
-        self.renewed_at = -NEVER
-        """When it last made new keys that show that its commands are new."""
-        self.received_at = -NEVER
-        """When its last frames came."""
-        self.responded_at = -NEVER
-        """When this daemon answered its last initiation."""
-        self.commanded_at = -NEVER
-        """When a command of it last came, whether it is new or not."""
-        self.doubted_at = -NEVER
-        """When one was last dropped because nothing showed that it is new."""
         self._own = own
         self._entropy = entropy
         self._indices = indices
@@ -141,7 +129,12 @@ class Tunnel:
         self._previous: TunnelSession | None = None
         self._next: TunnelSession | None = None  # answered by this daemon, and not used by the station yet
         self._pending: Initiating | None = None
-        self._initiated_at = self._trying_since = -NEVER
+        self._initiated_at = self._trying_since = self._responded_at = -NEVER
+        self._received_at = -NEVER  # its last frames
+        self._commanded_at = -NEVER  # the last frame that must be new, whether it was or not
+        self._doubted_at = -NEVER  # the last one that was dropped because nothing showed that it is new
+        self._used_at = -NEVER  # when the newest session began with which the station sent something
+        self._sent_after = -NEVER  # the newest time of which is known that the station sent something later
         self._newest_timestamp = b""  # of the station, since this daemon started
         self._questions: dict[bytes, float] = {}  # when each was asked, by its token
         self._ask_at = NEVER
@@ -163,13 +156,13 @@ class Tunnel:
 
         After a restart it may be a recorded one: it changes nothing until the station uses the session.
         """
-        if initiation.timestamp <= self._newest_timestamp or now - self.responded_at < INITIATIONS_S:
+        if initiation.timestamp <= self._newest_timestamp or now - self._responded_at < INITIATIONS_S:
             raise Drop(DropReason.REPLAYED_INITIATION)
-        self._newest_timestamp, self.responded_at = initiation.timestamp, now
+        self._newest_timestamp, self._responded_at = initiation.timestamp, now
         index = self._indices.add(self)
         datagram, keys = respond(initiation, KeyPair(self._entropy(KEY_BYTES)), index)
         self._forget(self._next)
-        self._next = TunnelSession(index, keys, now, is_initiator=False)
+        self._next = TunnelSession(index, keys, now, self._sent_after, is_initiator=False)
         self._set_next(now)
         return datagram
 
@@ -196,16 +189,9 @@ class Tunnel:
         pending = self._pending
         if pending is None or pending.number != index:
             raise Drop(DropReason.UNEXPECTED_RESPONSE)
-        session = TunnelSession(
-            index, read_response(self._own, pending, datagram), self._initiated_at, is_initiator=True
-        )
+        keys = read_response(self._own, pending, datagram)
         self._pending = None
-        # While it has valid keys, a station's system keeps no packets back for the next ones. So what comes with
-        # these keys was sent after the initiation. README.md, "A command is new".
-        if self._current is not None and not self._current.is_over(now):
-            session.prove(-1, self._initiated_at)
-            self.renewed_at = now
-        self._use(session)
+        self._use(TunnelSession(index, keys, self._initiated_at, self._sent_after, is_initiator=True))
         return self._ask(now)
 
     def on_cookie(self, reply: bytes, index: int, now: float) -> None:
@@ -236,39 +222,45 @@ class Tunnel:
         if session is self._next:
             self._next = None
             self._use(session)
-        if session is self._current and counter == session.highest:
+        # A station that has keys sends at once what its system kept until then, in order. So what comes with later
+        # keys was sent by its software after this. README.md, "A command is new".
+        self._sent_after = max(self._sent_after, session.born_at)
+        self._used_at = max(self._used_at, session.born_at)
+        if session.born_at == self._used_at and counter == session.highest:
             self.address = address
         self._silent_at = NEVER
-        self._keepalive_at = min(self._keepalive_at, now + KEEPALIVE_S)
+        if packet:
+            self._keepalive_at = min(self._keepalive_at, now + KEEPALIVE_S)
         self._set_next(now)
         return Opened(packet, session, counter)
 
     # A command is new, or it is not delivered.
 
-    def on_answer(self, opened: Opened, token: bytes, now: float) -> bool:
+    def on_answer(self, opened: Opened, token: bytes) -> bool:
         """The station answered a question in this packet. Returns False if it is no question of the last seconds."""
         asked_at = self._questions.pop(token, None)
         if asked_at is None:
             return False
         opened.session.prove(opened.counter, asked_at)
-        self.answered_at, self._unanswered_since = now, NEVER
+        self._sent_after = max(self._sent_after, asked_at)
+        self._unanswered_since = NEVER
         return True
 
     def on_frames(self, now: float, *, is_new: bool, has_commands: bool) -> None:
         """Frames came. If nothing shows that they are new, the commands among them were dropped."""
-        if now - self.received_at > ACTIVE_S:
+        if now - self._received_at > ACTIVE_S:
             self._ask_at = now
-        self.received_at = now
+        self._received_at = now
         if has_commands:
-            self.commanded_at = now
+            self._commanded_at = now
             if not is_new:
-                self.doubted_at = now
+                self._doubted_at = now
                 self._ask_at = min(self._ask_at, max(now, self._asked_at + ASK_AGAIN_S))
         self._set_next(now)
 
     def _ask(self, now: float) -> list[bytes]:
         """A question, and when the next one is due."""
-        self._ask_at = now + (ASK_AGAIN_S if now - self.doubted_at < DOUBT_S else ASK_S)
+        self._ask_at = now + (ASK_AGAIN_S if now - self._doubted_at < DOUBT_S else ASK_S)
         token = self._entropy(inner.TOKEN_BYTES)
         if len(self._questions) >= QUESTIONS:
             del self._questions[next(iter(self._questions))]
@@ -293,7 +285,7 @@ class Tunnel:
             self._forget(self._next)
             self._next = None
         if now >= self._ask_at:
-            if now - self.received_at <= ACTIVE_S:
+            if now - self._received_at <= ACTIVE_S:
                 out += self._ask(now)
             else:
                 self._ask_at = NEVER
@@ -320,16 +312,15 @@ class Tunnel:
 
     def _needs_handshakes(self, now: float) -> bool:
         """Whether commands come, and the station answers no questions."""
-        return now - self.commanded_at < DOUBT_S and now - self._unanswered_since >= UNANSWERED_S
+        return now - self._commanded_at < DOUBT_S and now - self._unanswered_since >= UNANSWERED_S
 
     @property
     def _gives_up_at(self) -> float:
         return NEVER if self._pending is None else self._trying_since + REKEY_ATTEMPT_S
 
     def _set_next(self, now: float) -> None:
-        ends = [one.born_at + REJECT_AFTER_S for one in self._sessions()]
-        begins_at = self._initiate_at(now)
-        self.next_at = min(self._ask_at, self._keepalive_at, begins_at, self._gives_up_at, *ends)
+        ends = (session.ends_at for session in self._sessions())
+        self.next_at = min(self._ask_at, self._keepalive_at, self._initiate_at(now), self._gives_up_at, *ends)
 
     def _sessions(self) -> Iterator[TunnelSession]:
         return (one for one in (self._current, self._previous, self._next) if one is not None)
