@@ -69,7 +69,7 @@ def write_bill(lock: Path, path: Path, folder: Path) -> None:
     if not tools.exists():
         install_tools(SBOM_LOCK, tools)
     environ = {**os.environ, "PYTHONPATH": str(tools), "PYTHONWARNINGS": "ignore"}
-    # Its checks need packages in C. The tests validate the result.
+    # Its checks need packages in C. The tests compare the result with the lock file.
     command = [sys.executable, "-m", "cyclonedx_py", "requirements", "--no-validate", "--output-reproducible"]
     described = ("--pyproject", PROJECT / "pyproject.toml", "--output-file", path, lock)
     subprocess.run([*command, *described], env=environ, stderr=subprocess.DEVNULL, check=True)

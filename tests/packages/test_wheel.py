@@ -117,6 +117,7 @@ CONFIGURATION = """
 name = "{name}"
 private_key_file = "{name}.key"
 listen = ["127.0.0.1:{port}"]
+control_socket = "{name}.sock"
 [[endpoint]]
 name = "autopilot"
 url = "{url}"
@@ -131,7 +132,7 @@ HEARTBEATS = [mavlink_frame(0, bytes((0, 0, 0, 0, 2, 3, 81, 4, 3)), 50, system=n
 
 
 def test_daemons_carry_frames_between_udp_and_a_serial_port(folder: Path, tmp_path: Path) -> None:
-    """Two daemons of the environment without extras: one has a UDP endpoint, the other one a serial endpoint."""
+    """Two daemons of the environment without extras, `check` and `status`: one endpoint is UDP, the other serial."""
     command = str(folder / "venv/bin/uavlinkd")
     ports = dict(zip("ab", free_ports(2), strict=True))
     (udp_port,) = free_ports(1)
@@ -147,6 +148,7 @@ def test_daemons_carry_frames_between_udp_and_a_serial_port(folder: Path, tmp_pa
             file = tmp_path / f"{name}.toml"
             keys = {"public_key": public[peer], "port": ports[name], "peer_port": ports[peer]}
             file.write_text(CONFIGURATION.format(name=name, peer=peer, url=urls[name], **keys))
+            run(command, "check", "--config", file)
             log = stack.enter_context((tmp_path / f"{name}.log").open("wb"))
             daemon = stack.enter_context(
                 subprocess.Popen(end_with_parent(command, "run", "--config", str(file)), stdout=log, stderr=log)
@@ -164,3 +166,4 @@ def test_daemons_carry_frames_between_udp_and_a_serial_port(folder: Path, tmp_pa
                 over_udp += autopilot.recv(2048)
             with suppress(BlockingIOError):
                 over_serial += os.read(master, 4096)
+        assert "1 of 1 peers up" in run(command, "status", "--config", tmp_path / "a.toml")
