@@ -221,14 +221,17 @@ def run(*command: str | Path) -> None:
     done.check_returncode()
 
 
-def inside(root: Path, *command: str, check: bool = True) -> str:
+def inside(root: Path, *command: str) -> str:
     """The output of a command in the root, in the same environment on every machine."""
     environ = {name: value for name, value in os.environ.items() if name == "SOURCE_DATE_EPOCH"}
     environ |= {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "LC_ALL": "C.UTF-8", "PYTHONHASHSEED": "0", "HOME": "/root"}
     environ |= {"PIP_DISABLE_PIP_VERSION_CHECK": "1", "PIP_NO_CACHE_DIR": "1", "PIP_ROOT_USER_ACTION": "ignore"}
     done = subprocess.run(
-        ["chroot", str(root), *command], env=environ, stdout=subprocess.PIPE, text=True, check=check, umask=0o022
+        ["chroot", str(root), *command], env=environ, stdout=subprocess.PIPE, text=True, check=False, umask=0o022
     )
+    if done.returncode:
+        print(done.stdout, file=sys.stderr)
+    done.check_returncode()
     return done.stdout
 
 

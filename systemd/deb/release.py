@@ -17,6 +17,7 @@ import tempfile
 from pathlib import Path
 
 import make_deb
+import make_image
 from wheels import IMAGE_LOCK, MACHINES, PROJECT, RELEASES, SBOM_LOCK, install_tools
 
 
@@ -84,9 +85,7 @@ def save_image(base: str, path: Path) -> bool:
         print(f"release.py: no image: the Docker engine cannot get {base}; --base names another one", file=sys.stderr)
         return False
     name = f"uavlinkd:{make_deb.version()}"
-    dockerfile = PROJECT / "configs/containers/Dockerfile"
-    command = ("docker", "build", "--quiet", "--build-arg", f"BASE={base}", "--tag", name, "--file", dockerfile)
-    make_deb.run(*command, PROJECT)
+    make_image.build(base, name, make_deb.output("dpkg", "--print-architecture"))
     with subprocess.Popen(["docker", "save", name], stdout=subprocess.PIPE) as save:
         assert save.stdout is not None
         with gzip.GzipFile(path, "wb", mtime=0) as file:

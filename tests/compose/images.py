@@ -16,7 +16,6 @@ from pathlib import Path
 HERE = Path(__file__).parent
 PROJECT = HERE.parent.parent
 CONTAINERS = PROJECT / "configs/containers"
-DOCKERFILE = CONTAINERS / "Dockerfile"
 PUBLIC_BASE = "debian:bookworm-slim"
 LOCAL_BASES = "uavlinkd-test-base"
 LOCAL_BASE = f"{LOCAL_BASES}:bookworm"
@@ -54,7 +53,8 @@ def build() -> str:
         subprocess.CalledProcessError: a step failed; its output was printed.
     """
     with _one_at_a_time():
-        return _build(base_image())
+        _run(sys.executable, PROJECT / "systemd/deb/make_image.py", f"--base={base_image()}", f"--tag={IMAGE}")
+        return IMAGE
 
 
 @contextmanager
@@ -63,24 +63,6 @@ def _one_at_a_time(kind: str = "") -> Iterator[None]:
     with (Path(tempfile.gettempdir()) / f"uavlinkd-test-images{kind}.lock").open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         yield
-
-
-def _build(base: str) -> str:
-    with tempfile.TemporaryDirectory(prefix="uavlinkd-image-") as folder:
-        context = Path(folder)
-        for name in (".dockerignore", "pyproject.toml", "README.md", "LICENSE", "uavlinkd", "systemd", "configs"):
-            copy = shutil.copytree if (PROJECT / name).is_dir() else shutil.copy
-            copy(PROJECT / name, context / name)
-        for lock in ("backend", "image"):
-            _run(
-                *(sys.executable, "-m", "pip", "download", "-q", "--dest", context / "wheels", "--no-deps"),
-                *("--only-binary=:all:", "--python-version=3.11", "--require-hashes"),
-                *("--requirement", PROJECT / f"systemd/deb/{lock}.lock"),
-            )
-        offline = ("PIP_NO_INDEX=1", "PIP_FIND_LINKS=/packages", f"BASE={base}")
-        arguments = (argument for value in offline for argument in ("--build-arg", value))
-        _run("docker", "build", "--quiet", *arguments, "--file", DOCKERFILE, "--tag", IMAGE, context)
-    return IMAGE
 
 
 def base_image() -> str:

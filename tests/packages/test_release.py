@@ -6,6 +6,7 @@ import json
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,18 @@ ROOT = Path(__file__).parents[2]
 DEB = ROOT / "systemd/deb"
 DOCKERFILE = ROOT / "configs/containers/Dockerfile"
 LABELS = dict(re.findall(r"""^(?:LABEL |    )(\w+)=["'](.*?)["'](?: \\)?$""", DOCKERFILE.read_text(), re.MULTILINE))
+
+
+@pytest.mark.parametrize(
+    ("lock", "extras"), [("debian-12", "speed web"), ("debian-13", "speed web"), ("image", "lab speed web")]
+)
+def test_lock_file_has_every_dependency(lock: str, extras: str) -> None:
+    """A new dependency of the project needs new lock files: `python systemd/deb/wheels.py` writes them."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    added = (one for extra in extras.split() for one in project["optional-dependencies"][extra])
+    names = {re.split(r"[^\w.-]", one)[0].replace("_", "-") for one in (*project["dependencies"], *added)}
+    locked = set(re.findall(r"^(\S+)==", (DEB / f"{lock}.lock").read_text(), re.MULTILINE))
+    assert names - {"uavlinkd"} <= locked
 
 
 @pytest.mark.long
