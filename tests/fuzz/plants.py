@@ -24,6 +24,8 @@ from uavlinkd.protocol.outputs import Deliver, Transmit
 from uavlinkd.relay import client_link as relay_link
 from uavlinkd.relay import direct_search, forwarding, service
 from uavlinkd.serial import line_framing
+from uavlinkd.stations import inner
+from uavlinkd.stations import session as station_session
 from uavlinkd.tls import stream as web_stream
 
 
@@ -85,6 +87,18 @@ def _marks_first(right: Any) -> Any:
         except Drop as drop:
             if drop.reason is DropReason.BAD_TAG:
                 self.window.mark(counter)
+            raise
+
+    return open_
+
+
+def _marks_first_of_a_station(right: Any) -> Any:
+    def open_(self: Any, datagram: bytes, now: float) -> Any:
+        try:
+            return right(self, datagram, now)
+        except Drop as drop:
+            if drop.reason is DropReason.BAD_TAG:
+                self._window.mark(int.from_bytes(datagram[8:16], "little"))
             raise
 
     return open_
@@ -237,6 +251,10 @@ PLANTS: Final = {
     "two spellings of a line": Plant(
         "enrolment", enrolment, "_decoded", lambda _: lambda text, reason: base64.b64decode(text.encode())
     ),
+    "a forgery takes a counter of a station": Plant(
+        "stations", station_session.TunnelSession, "open", _marks_first_of_a_station
+    ),
+    "a checksum is not verified": Plant("packets", inner, "_sum", lambda _: lambda data: 0),
     "an index beyond the end": Plant(
         "anatomy",
         anatomy,

@@ -15,8 +15,10 @@ from tests.fuzz import (
     lines,
     messages,
     outsiders,
+    packets,
     relays,
     requests,
+    stations,
 )
 from tests.fuzz.engine import Target
 
@@ -48,6 +50,8 @@ _TARGETS: Final = (
     Target("manifest", "a fleet's manifest", files.make_manifest, 4096, files.WORDS, True),
     Target("key", "a key file", files.make_key, 300),
     Target("enrolment", "the lines of an enrolment", files.make_enrolment),
+    Target("stations", "datagrams to the port for stations", stations.make, 512),
+    Target("packets", "packets inside a station's tunnel", packets.make, 256),
     Target("anatomy", "a datagram as the man in the middle parses it", files.make_anatomy),
 )
 TARGETS: Final = {target.name: target for target in _TARGETS}
