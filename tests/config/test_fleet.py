@@ -145,6 +145,10 @@ def test_pinned_links_carry_bulletins_in_a_fleet(tmp_path: Path) -> None:
 
 _ANY = to_base64(bytes(100))
 _FOREIGN = certificate(name="x", ids=(8, 8), signer=OTHER_SIGNER)
+STATION = (
+    f'[stations]\n[[station]]\nname = "tablet"\npublic_key = "{KEY["c"]}"\n'
+    'address = "10.66.0.2"\nrole = "operator"\nsystem_ids = [250]\n'
+)
 _ROLE = '[[fleet_role]]\nname = "operator"\n'
 _AUTHORITY = to_base64(authority())
 _ROWS = [
@@ -192,6 +196,11 @@ _ROWS = [
     (fleet() + PEER.replace('"drone1"', '"v7"'), "fleet", "has the name of peer[0] (v7)"),
     (fleet() + PEER.replace("[2]", "[7]"), "fleet", "has the system id 7 of peer[0] (drone1)"),
     (fleet() + PEER.replace("[2]", "[200]") + _GS, "contact[0] (gs)", "the system id 200 of peer[0] (drone1)"),
+    (
+        fleet(certificate(MemberRole.OPERATOR, ids=(254, 255))) + STATION,
+        "station[0].system_ids (tablet)",
+        "whose certificate has 254 to 255",
+    ),
     (_GS, "contact", "no effect without [fleet]"),
     (_ROLE, "fleet_role", "no effect without [fleet]"),
     (fleet() + _ROLE + _ROLE, "fleet_role[1].name (operator)", "is that of fleet_role[0] (operator) too"),

@@ -21,6 +21,7 @@ from uavlinkd.lab.sim.loopback_ports import free_port
 
 pytestmark = pytest.mark.long
 ARM = 400
+GROUND_HEARTBEAT = ground_heartbeat()
 
 
 class Tablet:
@@ -70,7 +71,7 @@ class Setup:
         private = keys.generate_private_key()
         stage.secrets.append(private)
         keys.write_secret_file(self.daemon.folder / "stations.key", private)
-        daemon_key = keys.decode_key(keys.public_key_text(private))
+        self.daemon_key = daemon_key = keys.decode_key(keys.public_key_text(private))
         port = free_port()
         self.tablet = Tablet(Client(daemon_key), ("127.0.0.1", port))
         self.daemon.config |= {
@@ -86,20 +87,20 @@ class Setup:
             ],
         }
 
-    async def connect(self) -> None:
+    async def connect(self, frame: bytes = GROUND_HEARTBEAT) -> None:
         """Start the daemon, and let the station show its heartbeat until a command would pass."""
         await self.daemon.start()
         await self.daemon.ready()
         self.tablet.send(self.tablet.client.initiation())
         await waiting.until(lambda: self.tablet.client.is_open)
-        await self.until_commands_pass()
+        await self.until_commands_pass(frame)
 
-    async def until_commands_pass(self) -> None:
-        """Send heartbeats of a ground station until one arrives at the autopilot."""
+    async def until_commands_pass(self, frame: bytes = GROUND_HEARTBEAT) -> None:
+        """Send a frame that must be new until it arrives at the autopilot."""
         self.autopilot.send(heartbeat(), self.to_autopilot)
         self.autopilot.clear()
         while not self.autopilot.frames:
-            self.tablet.send(self.tablet.client.udp(ground_heartbeat()))
+            self.tablet.send(self.tablet.client.udp(frame))
             await asyncio.sleep(0.05)
 
 

@@ -11,9 +11,10 @@ from ipaddress import ip_address, ip_network
 from itertools import combinations
 from typing import Final
 
+from uavlinkd.authority.certificates import MemberRole
 from uavlinkd.config import fleet_rules
 from uavlinkd.config.build import policy_data, policy_problems
-from uavlinkd.config.file import File, Found, over_ip, unique, with_same_key
+from uavlinkd.config.file import File, Found, over_ip, role_of, unique, with_same_key
 from uavlinkd.config.keys import looks_private
 from uavlinkd.config.members import MOST_MEMBERS
 from uavlinkd.config.model import SERIAL, PeerAddress
@@ -115,9 +116,17 @@ def _stations(file: File) -> Found:
             yield station.at("role"), text
         for system in _numbers(station) & set(local):
             text = (
-                f"has the system id of {local[system].at()} too: a station could speak as the vehicle; write its own"
+                f"has the system id of {local[system].at()} too, so one could speak as the other: write another one"
             )
-            yield station.at("system_ids"), f"{text}, such as 255"
+            yield station.at("system_ids"), text
+        # A vehicle's own station commands this vehicle. At others, the certificate of this member decides.
+        if role_of(fleet := file.one("fleet")) is MemberRole.OPERATOR:
+            first, last = fleet.get("certificate").certificate.system_ids
+            if any(not first <= system <= last for system in _numbers(station)):
+                text = (
+                    f"has an id that vehicles refuse from this member, whose certificate has {first} to {last}: write"
+                )
+                yield station.at("system_ids"), f"{text} one of these, or `uavlinkd fleet enroll --replace --id A-B`"
 
 
 def _numbers(section: Values) -> set[int]:
