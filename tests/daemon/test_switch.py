@@ -231,6 +231,17 @@ def test_system_that_a_port_may_no_longer_send_as_is_not_looked_for_there(stage:
     assert stage.delivered() == (0, 1, 0)
 
 
+def test_frames_of_a_station_go_to_vehicles_alone(stage: Stage) -> None:
+    """Not to another station, nor to an operator's daemon, which would refuse them as those of a foreign system."""
+    stage.a.is_station = True
+    operator = Peer()
+    stage.switch.add(operator, policy(role="operator", system_ids=[255]))
+    stage.switch.set_policy(stage.b.port, policy(role="operator", system_ids=[254]))
+    stage.forward(stage.a.port, [made(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3), 253)], 0.1)
+    assert stage.delivered() == (0, 0, 1)
+    assert operator.received == []
+
+
 def test_switch_notices_clients_that_come_and_go(stage: Stage) -> None:
     """A client that left receives no more frames, a new one receives the next frame."""
     stage.forward(stage.a.port, [attitude(1)], 0.0)

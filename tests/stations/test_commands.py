@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import base64
+import errno
+import socket
 import tomllib
 from pathlib import Path
 
@@ -117,3 +119,24 @@ def test_names_that_are_taken_or_absent(config: Path, capsys: pytest.CaptureFixt
     assert main(add) == 2
     assert main(("station", "remove", "other", "--config", str(config))) == 2
     assert "has no station other" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("own", "says"), [("100.64.7.2", "behind a carrier's NAT"), (None, "has no network now")])
+def test_own_address_that_no_station_reaches(
+    config: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    own: str | None,
+    says: str,
+) -> None:
+    """Without ``--at`` the code would name it."""
+
+    def connect(sock: socket.socket, address: object) -> None:
+        if own is None:
+            raise OSError(errno.ENETUNREACH, "Network is unreachable")
+
+    monkeypatch.setattr(socket.socket, "connect", connect)
+    monkeypatch.setattr(socket.socket, "getsockname", lambda sock: (own, 9))
+    assert main(("station", "add", "tablet", "--config", str(config))) == 1
+    assert says in capsys.readouterr().err
+    assert config.read_text() == CONFIG

@@ -105,6 +105,8 @@ class Switch:
         if shows is not None:
             shows.note(frame, now)
         ports = self.router.route(frame, source, now)
+        if isinstance(source, LocalPort) and source.endpoint.is_station:
+            ports = tuple(port for port in ports if not self.ports[port].policy.is_of_person)
         if ports:
             if now >= self.router.valid_until:
                 self.refresh(now)

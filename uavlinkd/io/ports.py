@@ -69,6 +69,9 @@ class PortHandler(Protocol):
 class Endpoint(ABC):
     """A local MAVLink endpoint of the daemon, with no, one or many clients."""
 
+    is_station = False
+    """Whether its clients are those of a person elsewhere: their frames are for vehicles alone."""
+
     def __init__(self, name: str, handler: PortHandler) -> None:
         self.name = name
         self.handler = handler

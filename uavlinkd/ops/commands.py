@@ -69,9 +69,9 @@ def control_sockets(options: argparse.Namespace) -> list[Path]:
     candidates = [RUNTIME_FOLDER / SOCKET_NAME, *sorted(RUNTIME_FOLDER.glob(f"*/{SOCKET_NAME}"))]
     if not (sockets := [path for path in candidates if os.path.lexists(path)]):
         raise CommandError(
-            f"no control socket in {RUNTIME_FOLDER} that this user may see: use sudo, start the service (`systemctl"
-            f' start uavlinkd`) with control_socket = "{candidates[0]}" in its file, or name the daemon:'
-            " --config FILE or --socket PATH"
+            "name the daemon: --config FILE or --socket PATH. No service has a control socket in"
+            f" {RUNTIME_FOLDER}{'' if os.geteuid() == 0 else ' that this user may see: use sudo'}, or start it with"
+            f' control_socket = "{candidates[0]}" in its file'
         )
     return sockets
 

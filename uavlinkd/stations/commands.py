@@ -10,7 +10,7 @@ import shutil
 import socket
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from ipaddress import ip_network
+from ipaddress import ip_address, ip_network
 from pathlib import Path
 from typing import Any, Final
 
@@ -26,6 +26,8 @@ from uavlinkd.system.terminal import OK, CommandError, UsageError
 _KEY_FILE: Final = "stations.key"
 _KEEPALIVE_S: Final = 15
 """Between two packets of an idle station: most NATs keep a mapping for 30 s."""
+_CARRIER: Final = ip_network("100.64.0.0/10")
+"""Addresses behind a carrier's NAT (RFC 6598): no station elsewhere reaches them."""
 _ANYWHERE: Final = "192.0.2.1", 9
 """An address (RFC 5737) to which nothing is sent: the kernel says from which own address it would be."""
 
@@ -56,8 +58,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _add(options: argparse.Namespace) -> int:
     path, name = options.config, options.name
+    host = options.at or _own_address()
     try:
-        parse_address(str(Address(options.at or _ANYWHERE[0], _ANYWHERE[1])), allow_names=True)
+        parse_address(str(Address(host, _ANYWHERE[1])), allow_names=True)
     except AddressError as error:
         raise UsageError(f"--at {error}") from None
     load_config(path, _environ(options.keys))  # it is valid before
@@ -86,7 +89,7 @@ def _add(options: argparse.Namespace) -> int:
     assert config.stations is not None
     own = keys.public_key_text(keys.encode_key(config.stations.private_key.reveal()))
     port = config.stations.listen.port
-    place = str(Address(options.at or _own_address(), port))
+    place = str(Address(host, port))
     _print_code(name, private, own, (address, config.stations.address), place)
     print(
         f"Restart the daemon of {path}; UDP port {port} must be open. Compare: the tunnel's peer has the key\n  {own}"
@@ -152,11 +155,11 @@ def _environ(folder: Path | None) -> Mapping[str, str]:
 
 
 def _own_address() -> str:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.connect(_ANYWHERE)
-        except OSError:
-            raise CommandError(
-                "this machine has no route to a network: write --at HOST, as the station reaches it"
-            ) from None
-        return str(probe.getsockname()[0])
+    address = ""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe, suppress(OSError):
+        probe.connect(_ANYWHERE)
+        address = str(probe.getsockname()[0])
+    if not address or ip_address(address) in _CARRIER:
+        problem = "is behind a carrier's NAT" if address else "has no network now"
+        raise CommandError(f"this machine {problem}: write --at HOST, where the station reaches it")
+    return address

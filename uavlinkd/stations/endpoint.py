@@ -25,6 +25,7 @@ class StationEndpoint(DatagramEndpoint):
     tunnel.
     """
 
+    is_station = True
     datagram_bytes = MOST_PAYLOAD_BYTES
 
     def __init__(

@@ -55,6 +55,11 @@ class Policy:
         # Sentences for the operator, the most severe first.
         self.warnings = tuple(_warnings(settings))
 
+    @property
+    def is_of_person(self) -> bool:
+        """Whether a person is at the other end: an operator, or an observer."""
+        return self._settings.role in ("operator", "observer")
+
     def __str__(self) -> str:
         """The role and the systems, for a line of text."""
         settings = self._settings
