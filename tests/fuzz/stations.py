@@ -46,6 +46,7 @@ class Outside:
         self.sent: list[tuple[bytes, SocketAddress]] = []
         self.drops: list[DropReason] = []
         self.frames: list[object] = []
+        self.epochs: set[int] = set()
         self.deliver: Callable[[Datagrams, float, int, float], None]
         self.stall = self
         self._stamp = 0
@@ -69,8 +70,9 @@ class Outside:
     def drop_datagram(self, reason: DropReason, name: str = "", path: NetworkPath | None = None) -> None:
         self.drops.append(reason)
 
-    def on_frames(self, _port: object, frames: list[object], *_: object) -> None:
+    def on_frames(self, _port: object, frames: list[object], _now: float, epoch: int) -> None:
         self.frames += frames
+        self.epochs.add(epoch)
 
     def ignore(self, *_: object) -> None:
         """What the rest of the daemon does."""
@@ -83,7 +85,7 @@ def _raise(error: BaseException) -> None:
 
 
 @contextmanager
-def _alone(outside: Outside) -> Iterator[None]:
+def alone(outside: Outside) -> Iterator[None]:
     """Put the outside into the service. A fault that it would survive fails here."""
     parts: dict[str, Any] = {
         "udp_socket": lambda *_, **__: outside,
@@ -160,7 +162,7 @@ def make() -> Run:
 
     def run(data: bytes) -> None:
         script, outside = Script(data), Outside()
-        with _alone(outside):
+        with alone(outside):
             attacked = Attacked(outside, has_session=bool(script.byte() & 1))
             while script:
                 how = script.byte()

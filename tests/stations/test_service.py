@@ -1,0 +1,85 @@
+"""The service without a socket: what hostile datagrams cost, and what is passed on to the switch."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.fuzz.stations import THERE, Attacked, Outside, alone
+from tests.processes.frames import heartbeat
+from uavlinkd.protocol.drops import DropReason
+from uavlinkd.stations import handshake
+from uavlinkd.system.stall import STALE
+
+STRANGER = ("198.51.100.1", 9)
+
+
+def test_frames_keep_the_epoch_in_which_they_were_read() -> None:
+    """The switch drops those from before a pause of the daemon."""
+    outside = Outside()
+    with alone(outside):
+        attacked = Attacked(outside, has_session=True)
+        outside.deliver([(attacked.client.udp(heartbeat()), THERE)], attacked.now, STALE, 0.0)
+    assert len(outside.frames) == 1
+    assert outside.epochs == {STALE}
+
+
+def test_responses_to_nothing_take_no_budget() -> None:
+    """The genuine one is read behind 20,000 with the right mac1 and an index that nobody has."""
+    outside = Outside()
+    with alone(outside):
+        attacked = Attacked(outside, has_session=False)
+        strange = attacked.macs.add(handshake.RESPONSE + bytes(56), None)
+        outside.deliver([(strange, STRANGER)] * 20_000, attacked.now, 0, 0.0)
+        assert set(outside.drops) == {DropReason.UNKNOWN_INDEX}
+        outside.drops.clear()
+        attacked.offer(attacked.genuine[0], THERE)
+        assert not outside.drops
+        assert attacked.endpoint.is_open
+
+
+def test_strangers_with_the_right_mac1_are_limited() -> None:
+    """Initiations cost a key exchange for as many as the budget has. Cookies are no more than messages."""
+    outside = Outside()
+    with alone(outside):
+        attacked = Attacked(outside, has_session=True)
+        strange = attacked.macs.add(handshake.INITIATION + bytes(112), None)
+        outside.deliver([(strange, STRANGER)] * 2000, attacked.now, 0, 0.0)
+        assert outside.drops.count(DropReason.INVALID_KEY_SHARE) < 200
+        assert all(len(datagram) == handshake.COOKIE_REPLY_BYTES for datagram, _ in outside.sent)
+        attacked.offer(attacked.genuine[1], THERE)  # data of the session
+        assert outside.drops.count(DropReason.RATE_LIMITED) + outside.drops.count(DropReason.COOKIE_REQUIRED) > 1500
+        assert len(outside.drops) == 2000
+
+
+@pytest.mark.parametrize("counter", [2**64 - 1, 2**64 - 2**13 - 1, 2**63])
+def test_counters_near_the_end_are_dropped(counter: int) -> None:
+    """Forged ones, and those beyond the last counter of a session."""
+    outside = Outside()
+    with alone(outside):
+        attacked = Attacked(outside, has_session=True)
+        genuine = attacked.genuine[1]
+        attacked.check(genuine[:8] + counter.to_bytes(8, "little") + genuine[16:], THERE)
+        attacked.check_sequel()
+
+
+def test_authentic_data_with_the_greatest_counter_passes() -> None:
+    """Then all smaller ones beyond the window are old, and nothing fails."""
+    outside = Outside()
+    with alone(outside):
+        attacked = Attacked(outside, has_session=True)
+        attacked.client.counter = 2**64 - 2**13 - 2
+        attacked.offer(attacked.client.data(b""), THERE)
+        assert not outside.drops
+        attacked.offer(attacked.genuine[1], THERE)
+        assert outside.drops == [DropReason.REPLAYED]
+
+
+@pytest.mark.parametrize("size", [0, 1, 15, 16, 17, 20, 28, 1500])
+def test_inner_packets_of_any_length_are_counted(size: int) -> None:
+    """Zeros are no packet; empty is a keepalive."""
+    outside = Outside()
+    with alone(outside):
+        attacked = Attacked(outside, has_session=True)
+        attacked.offer(attacked.client.data(bytes(size)), THERE)
+        assert not outside.drops
+        assert attacked.endpoint.failures["inner_packet"] == (size > 0)
