@@ -74,7 +74,7 @@ LINK_ROWS = (
     Mistake(
         "38b",
         scenes.wrong_system_of_fleet,
-        signs=_here("foreign_system", r"MAV_SYSID .*MAV_SYS_ID .* of its autopilot to 2"),
+        signs=_here("foreign_system", r"MAV_SYSID .*MAV_SYS_ID .* of its autopilot, or .* to 2"),
     ),
     Mistake("39", scenes.roles, signs=_here("roles_exchanged", r'write role = "operator"')),
     Mistake("40", scenes.no_control_socket, command=r'add control_socket = "NAME\.sock"'),

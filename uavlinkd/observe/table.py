@@ -188,8 +188,9 @@ _REFUSED: Final = (
     Row(
         *("foreign_system", FAULT, traffic_signs.foreign_system),
         "{which} of its frames are of system {systems}; its system_ids {where} are {ids}",
-        f"set {SYSTEM_ID} of its autopilot to {{ids}}; or, only if you know that {{who}} has this id, and no other"
-        " has it, {how}; else a client there forwards such frames, or treat {who} as captured",
+        f"set {SYSTEM_ID} of its autopilot, or the id of its ground station, to {{ids}}; or, only if you know that"
+        " {who} has this id, and no other has it, {how}; else a client there forwards such frames, or treat {who} as"
+        " captured",
         Exit.FAILED,
         code=1,
     ),
