@@ -13,6 +13,9 @@ import pytest
 from uavlinkd.cli import main
 from uavlinkd.config import keys
 from uavlinkd.config.load import load_config
+from uavlinkd.config.model import ConfigError, EndpointConfig
+from uavlinkd.io.url import StationUrl
+from uavlinkd.mavlink.policy.settings import PolicyError
 
 CONFIG = """name = "drone1"
 private_key_file = "drone1.key"  # a comment that stays
@@ -83,6 +86,21 @@ def test_invalid_station_changes_nothing(
     assert f"{config}: " in said
     assert ".trial" not in said
     assert config.read_text() == CONFIG
+
+
+def test_range_with_the_system_of_the_vehicle_is_refused(config: Path) -> None:
+    """Not only ids that are written one by one."""
+    assert main(("station", "add", "tablet", "--config", str(config), "--at", "h")) == 0
+    config.write_text(config.read_text().replace("system_ids = [255]", 'system_ids = [255, "1-20"]'))
+    with pytest.raises(ConfigError, match="has the system id of endpoint"):
+        load_config(config, {})
+
+
+def test_station_without_a_policy_passes_nothing() -> None:
+    """Also if a check of the file were missing: what is open for an endpoint is closed for a station."""
+    station = EndpointConfig("tablet", StationUrl("10.66.0.2", (14550,), bytes(32)))
+    with pytest.raises(PolicyError):
+        station.make_policy()
 
 
 @pytest.mark.parametrize("name", ['a"\n[log]\nlevel = "debug', "a\\", "a\x7f", "\u202ea", "", "a\0b"])

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from contextlib import suppress
 from ipaddress import ip_address, ip_network
 from itertools import combinations
 from typing import Final
@@ -20,6 +21,7 @@ from uavlinkd.config.members import MOST_MEMBERS
 from uavlinkd.config.model import SERIAL, PeerAddress
 from uavlinkd.config.section import Values
 from uavlinkd.io.url import EndpointKind, NetworkUrl, SerialUrl
+from uavlinkd.mavlink.policy.settings import PolicyError, read_settings
 from uavlinkd.protocol.crypto import x25519_public_key
 from uavlinkd.system.addresses import Address, overlaps
 
@@ -130,9 +132,10 @@ def _stations(file: File) -> Found:
 
 
 def _numbers(section: Values) -> set[int]:
-    """The system ids that a section names one by one."""
-    ids = section.get("system_ids")
-    return {one for one in ids if isinstance(one, int)} if isinstance(ids, list) else set()
+    """The system ids that a section names."""
+    with suppress(PolicyError):  # which is reported by itself
+        return set(read_settings(policy_data(section), is_local=True).systems or ())
+    return set()
 
 
 def _keys(file: File) -> Found:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from uavlinkd.authority.certificates import MemberRole
-from uavlinkd.io.url import EndpointUrl, SerialUrl
+from uavlinkd.io.url import EndpointKind, EndpointUrl, SerialUrl
 from uavlinkd.mavlink.egress.peer_egress import EgressSettings
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.settings import read_settings
@@ -71,7 +71,7 @@ class EndpointConfig:
 
     def make_policy(self) -> Policy:
         """A new policy: its counters at zero, its rates unused."""
-        return Policy(self.policy, is_local=True)
+        return Policy(self.policy, is_local=self.url.kind is not EndpointKind.STATION)
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 from functools import partial
-from typing import Final
+from typing import Final, NamedTuple
 
 from uavlinkd.config.model import EndpointConfig, StationsConfig
 from uavlinkd.daemon.features import Feature
@@ -35,14 +35,12 @@ ANSWERS_PER_S: Final = 10
 _SOCKET: Final = -1  # the number of the socket in paths: none of the daemon's own
 
 
-class Station:
+class Station(NamedTuple):
     """One station: its tunnel, its endpoint, and its budget of answers."""
 
-    def __init__(self, name: str, tunnel: Tunnel, endpoint: StationEndpoint, now: float) -> None:
-        self.name = name
-        self.tunnel = tunnel
-        self.endpoint = endpoint
-        self.answers = TokenBucket(ANSWERS_PER_S, ANSWERS_PER_S, now)
+    tunnel: Tunnel
+    endpoint: StationEndpoint
+    answers: TokenBucket
 
 
 class Stations(Feature):
@@ -89,8 +87,8 @@ class Stations(Feature):
         self._places.update([] if tunnel.address is None else [tunnel.address])
         send = partial(self._send_frames, tunnel)
         endpoint = StationEndpoint(config.name, url, handler, send, partial(self._start, tunnel), self._close)
-        station = Station(config.name, tunnel, endpoint, monotonic())
-        self._stations[tunnel] = self._by_key[url.key] = station
+        answers = TokenBucket(ANSWERS_PER_S, ANSWERS_PER_S, monotonic())
+        self._stations[tunnel] = self._by_key[url.key] = Station(tunnel, endpoint, answers)
         self._admission.set_peers(len(self._stations))
         return endpoint
 
