@@ -10,7 +10,8 @@ from itertools import count
 import pytest
 
 from tests import waiting
-from tests.processes.frames import command_long
+from tests.mavlink.parsers.captured_member import setup_signing
+from tests.processes.frames import command_long, heartbeat
 from tests.processes.harness import Stage
 from tests.processes.udp import open_socket
 from tests.stations.test_daemon import ARM, Setup
@@ -247,4 +248,25 @@ async def test_delayed_commands_are_dropped(attacked: Attacked) -> None:
     middle.pass_on()
     await attacked.until_one_passes()
     assert not set(old) & set(setup.autopilot.frames)
+    attacked.check()
+
+
+async def test_captured_station_is_bounded_by_its_role(attacked: Attacked) -> None:
+    """Its keys are the attacker's: another system in both versions of MAVLink, a signing key, another destination."""
+    setup, client = attacked.setup, attacked.setup.tablet.client
+    await setup.connect()
+    forbidden = [
+        command_long(ARM, 1, param1=1.0),
+        heartbeat(1),
+        heartbeat(1, version=1),
+        heartbeat(254, version=1),
+        setup_signing(255),
+        setup_signing(1),
+    ]
+    for frame in forbidden:
+        setup.tablet.send(client.udp(frame))
+        setup.tablet.send(client.udp(frame, port=14999))
+    setup.tablet.send(client.udp(b"".join(forbidden)))
+    await attacked.until_one_passes()
+    assert not set(forbidden) & set(setup.autopilot.frames)
     attacked.check()
