@@ -42,10 +42,12 @@ def test_printed_code_is_the_printed_text(scene: Scene) -> None:
 
 def test_heartbeat_is_at_the_station_without_asking(scene: Scene) -> None:
     """At port 14550, as soon as the tunnel is switched on."""
-    app = scene.app(scene.add("tablet"))
+    printed = scene.add("tablet")
     scene.start_daemon()
     scene.start_autopilot()
     until(lambda: scene.status()["endpoints"]["autopilot"]["clients"], "the autopilot is there")
+    # Only now: wireguard-go initiates when it is configured, and again after 5 s.
+    app = scene.app(printed)
     with udp_socket_in(scene.tablet.path, "0.0.0.0", 14550) as ground:
         took = Stopwatch()
         began = app.switch_on()
