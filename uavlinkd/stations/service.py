@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Iterable
 from functools import partial
@@ -196,7 +197,7 @@ class Stations(Feature):
         now = monotonic()
         datagram = tunnel.seal(inner.udp(tunnel.ends, MAVLINK_PORT, port, payload), now)
         if datagram is None or tunnel.address is None:
-            raise OSError(0, "no session")
+            raise OSError(errno.ENOTCONN, "no session")
         self._sock.sendto(datagram, tunnel.address)
         self._settle(tunnel)
 
