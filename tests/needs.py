@@ -15,6 +15,7 @@ MAY_BE_MISSING = (
     "no recorded flights",
     "no autopilot simulator",
     "needs a writable cgroup",
+    "needs minutes of emulation",
     "needs an interface with a link-local IPv6 address",
     "this machine does not know its own name",
 )
