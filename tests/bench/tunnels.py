@@ -85,7 +85,7 @@ class WireguardGo(Tunnel):
 
 
 class WireguardGoBehindRelay(WireguardGo):
-    """The same with the empty relay before it, which receives frames on loopback as a daemon does."""
+    """wireguard-go with the empty relay before it, which receives frames on loopback as a daemon does."""
 
     def why_not(self) -> str | None:
         return super().why_not() or Relay("relay").why_not()

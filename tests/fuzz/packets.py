@@ -87,7 +87,7 @@ def _summed(content: bytes, protocol: int, ends: inner.Ends) -> bytes:
 
 
 def _expected(packet: bytes, ends: inner.Ends) -> inner.Datagram | inner.Ping | inner.Closed | None:
-    """The same decision, from RFC 791, 8200, 768, 792 and 4443."""
+    """The decision of `inner.parse`, written again from RFC 791, 8200, 768, 792 and 4443."""
     is_four = ends is _FOUR
     start = 20 if is_four else 40
     if len(packet) < start:

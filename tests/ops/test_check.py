@@ -140,7 +140,7 @@ def test_what_is_left_of_an_example_is_a_failure(
 
 
 def test_every_published_key_is_known() -> None:
-    """Those of the files and pages that users copy."""
+    """The example keys that `check` knows are those of the files and pages that users copy."""
     pages = [*ROOT.glob("configs/*.toml"), ROOT / "uavlinkd/config/README.md", ROOT / "README.md"]
     published = {key for page in pages for key in re.findall(r'public_key = "([\w+/]{43}=)"', page.read_text())}
     assert published == EXAMPLE_KEYS

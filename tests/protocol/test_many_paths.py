@@ -63,7 +63,7 @@ def test_critical_envelope_goes_along_every_path_and_is_delivered_once(radios: R
 
 
 def test_copy_for_which_a_path_has_no_room_yet_is_counted_when_it_leaves(radios: Radios) -> None:
-    """The same bytes, which are sealed when the envelope leaves along its first path. Until then it costs nothing."""
+    """A copy is the datagram that left along the first path, with the same bytes. While it waits it costs nothing."""
     peer, (first, later) = radios.a.peer, (radios.state(radios.a, radio) for radio in (0, 1))
 
     def totals() -> tuple[int, ...]:

@@ -116,7 +116,8 @@ def _stations(file: File) -> Found:
         if station.get("role") == "vehicle":
             text = "is not the role of a ground station: write operator, or observer for one that only watches"
             yield station.at("role"), text
-        for system in _numbers(station) & set(local):
+        ids = _numbers(station)
+        for system in ids & set(local):
             text = (
                 f"has the system id of {local[system].at()} too, so one could speak as the other: write another one"
             )
@@ -124,7 +125,7 @@ def _stations(file: File) -> Found:
         # A vehicle's own station commands this vehicle. At others, the certificate of this member decides.
         if role_of(fleet := file.one("fleet")) is MemberRole.OPERATOR:
             first, last = fleet.get("certificate").certificate.system_ids
-            if any(not first <= system <= last for system in _numbers(station)):
+            if any(not first <= system <= last for system in ids):
                 text = (
                     f"has an id that vehicles refuse from this member, whose certificate has {first} to {last}: write"
                 )

@@ -27,15 +27,13 @@ from uavlinkd.protocol.node import Node
 from uavlinkd.protocol.outputs import Deliver, LinkedPeer, Output, Transmit
 from uavlinkd.protocol.path import Path, SocketAddress
 from uavlinkd.protocol.relay_records import RELAYED_START
-from uavlinkd.protocol.send import send_frames
-from uavlinkd.protocol.settings import Class
+from uavlinkd.protocol.send import STREAM, send_frames
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.guard import report
 from uavlinkd.system.stall import STALL_S, StallWatch
 
 MAX_PATHS: Final = 1024
 """Paths of a socket's received datagrams that are remembered: a frame on one of them costs no new object."""
-STREAM: Final = Class.STREAM
 
 
 class Line:

@@ -25,13 +25,11 @@ from uavlinkd.protocol.outputs import Output, Transmit
 from uavlinkd.protocol.path_slots import Route
 from uavlinkd.protocol.path_state import PathState
 from uavlinkd.protocol.peer import Peer
-from uavlinkd.protocol.send import batches, send_again
+from uavlinkd.protocol.send import CRITICAL, STREAM, batches, send_again
 from uavlinkd.protocol.settings import Class, Redundancy
 
 RAW = itemgetter(0)
 """The bytes of a frame."""
-CRITICAL, STREAM = Class.CRITICAL, Class.STREAM
-"""Members that each frame needs. The class of an enumeration looks them up by a Python function."""
 _STICKS: Final = frozenset(IDS[name] for name in ("MANUAL_CONTROL", "RC_CHANNELS_OVERRIDE"))
 
 
