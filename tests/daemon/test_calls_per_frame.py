@@ -155,7 +155,9 @@ def along(config: Config, relays: tuple[Address, ...]) -> Config:
     return replace(config, relays=(relay,), peers=tuple(replace(peer, relays=("relay",)) for peer in config.peers))
 
 
-@pytest.mark.parametrize("way", MOST)
+@pytest.mark.parametrize(
+    "way", [pytest.param(name, marks=() if name == "one path" else pytest.mark.long) for name in MOST]
+)  # in a busy run, what waits for its place in the order takes other functions
 async def test_calls_per_frame(way: str) -> None:
     """On flows that are remembered, with roles, a frame passes no more functions than before."""
     scene, counter = Scene(2 if way == "two paths" else 1, is_relayed=way == "a relay"), CallCounter()
