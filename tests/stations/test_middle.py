@@ -15,8 +15,6 @@ pytestmark = pytest.mark.long
 OLDEST_S = 5.5
 """The bound of the age of a command, as for peers."""
 BACK_S = 0.5
-BACK_BY_KEYS_S = 3.5
-"""Without answers: the daemon initiates every 2 s, and asks again for a second before."""
 REFUSING = "table inet tablet { chain in { type filter hook input priority 0; icmp type echo-request drop; }; }"
 
 
@@ -70,7 +68,7 @@ def test_delayed_commands_are_new_or_dropped(middle: Middle, delay_s: float, *, 
     print(f"answers {answers}, delay {delay_s} s: oldest {oldest.age_s:.2f} s, back after {back_s:.2f} s")
     assert max(arrival.calm_s for arrival in middle.arrivals) <= OLDEST_S
     assert no_duplicate(middle.arrivals)
-    assert calm_s <= (BACK_S if answers else BACK_BY_KEYS_S)
+    assert calm_s <= BACK_S
 
 
 def test_commands_of_a_station_that_answers_nothing_never_pass(middle: Middle) -> None:

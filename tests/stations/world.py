@@ -122,6 +122,7 @@ class World:
                 heapq.heappop(self._events)[2]()
             else:
                 self.from_daemon(self.tunnel.do_due(self.now))
+                assert self.tunnel.next_at > self.now
         self.now = until
 
     def connect(self) -> None:

@@ -51,6 +51,11 @@ class TunnelSession:
         """The highest counter that was opened, -1 before the first."""
         return self._window.highest
 
+    @property
+    def proved_at(self) -> float:
+        """The newest time after which the station sent what comes from now on."""
+        return self._proofs[-1][1]
+
     def seal(self, packet: bytes) -> bytes:
         """The data message with an inner packet, padded to 16 bytes; empty: a keepalive."""
         counter = self._sent

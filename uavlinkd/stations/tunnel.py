@@ -23,7 +23,7 @@ from uavlinkd.stations.handshake import (
     read_response,
     respond,
 )
-from uavlinkd.stations.session import REJECT_AFTER_S, TunnelSession
+from uavlinkd.stations.session import MOST_AGE_S, REJECT_AFTER_S, TunnelSession
 
 REKEY_AFTER_S: Final = 120.0
 """The age at which the initiator of a session makes new keys (section 6.1)."""
@@ -289,8 +289,10 @@ class Tunnel:
                 out += self._ask(now)
             else:
                 self._ask_at = NEVER
-        if now >= self._keepalive_at and (keepalive := self.seal(b"", now)) is not None:
-            out.append(keepalive)
+        if now >= self._keepalive_at:
+            self._keepalive_at = NEVER  # also without a session to send it
+            if (keepalive := self.seal(b"", now)) is not None:
+                out.append(keepalive)
         if now >= self._initiate_at(now):
             self._silent_at = NEVER
             out += self.initiate(now)
@@ -307,6 +309,9 @@ class Tunnel:
             return again_at if again_at < self._gives_up_at else NEVER
         if (session := self._current) is None:
             return NEVER
+        oldest = now - MOST_AGE_S
+        if renew_at != NEVER and session.proved_at < oldest <= self._sent_after:
+            return now  # these keys show nothing, and new ones will, as when a delay of the network ends
         age_s = REKEY_AFTER_S if session.is_initiator else RESPONDER_REKEY_S
         return min(session.born_at + age_s, self._silent_at, renew_at)
 
