@@ -10,26 +10,26 @@ import argparse
 import gzip
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import shtab
 
 from uavlinkd import __version__, cli
 from uavlinkd.system.terminal import CommandError
 
-LIST = "uavlinkd fleet list 2>/dev/null | tail -n +3 | cut -d ' ' -f 1"
-MEMBERS = {
-    "bash": "_uavlinkd_members",
-    "zsh": "_uavlinkd_members",
-    "fish": "(_uavlinkd_members)",
-    "preamble": {
-        "bash": f'_uavlinkd_members() {{ compgen -W "$({LIST})" -- "$1"; }}',
-        "zsh": f'_uavlinkd_members() {{ compadd -- ${{(f)"$({LIST})"}} }}',
-        "fish": f"function _uavlinkd_members; {LIST}; end",
-    },
+MEMBERS = "uavlinkd fleet list 2>/dev/null | tail -n +3 | cut -d ' ' -f 1"
+"""Prints the members of the fleet in the present folder, when Tab is pressed."""
+STATIONS = (
+    "find . /etc/uavlinkd -maxdepth 1 -name '*.toml' -exec"
+    """ awk -F'"' '/^[[]/ { here = /station[]][]]/ } here && /^name/ { print $2 }' '{}' + 2>/dev/null"""
+)
+"""Prints the stations of the configurations there and of the services."""
+NAMES = {
+    "uavlinkd fleet sign": ("members", MEMBERS),
+    "uavlinkd fleet remove": ("members", MEMBERS),
+    "uavlinkd station remove": ("stations", STATIONS),
 }
-"""How each shell completes a member's name: those of the fleet in the present folder, when Tab is pressed."""
-OF_MEMBERS = ("uavlinkd fleet sign", "uavlinkd fleet remove")
-"""Commands whose NAME is a member's."""
+"""Commands whose NAME is completed: with the names that a shell command prints."""
 
 
 def main() -> None:
@@ -76,11 +76,26 @@ def subparsers(parser: argparse.ArgumentParser) -> Iterator[argparse._SubParsers
     yield from (action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
 
 
+def names(kind: str, command: str) -> dict[str, Any]:
+    """How each shell completes names that a command prints."""
+    function = f"_uavlinkd_{kind}"
+    return {
+        "bash": function,
+        "zsh": function,
+        "fish": f"({function})",
+        "preamble": {
+            "bash": f'{function}() {{ compgen -W "$({command})" -- "$1"; }}',
+            "zsh": f'{function}() {{ compadd -- ${{(f)"$({command})"}} }}',
+            "fish": f"function {function}; {command}; end",
+        },
+    }
+
+
 def complete_arguments(parser: argparse.ArgumentParser) -> None:
-    """Complete files and folders where an argument is a path, and names of members."""
+    """Complete files and folders where an argument is a path, and names of members and stations."""
     for action in parser._actions:
-        if action.metavar == "NAME" and parser.prog in OF_MEMBERS:
-            action.complete = MEMBERS  # type: ignore[attr-defined]
+        if action.metavar == "NAME" and parser.prog in NAMES:
+            action.complete = names(*NAMES[parser.prog])  # type: ignore[attr-defined]
         if action.type is Path:
             action.complete = shtab.DIRECTORY if action.metavar == "DIR" else shtab.FILE  # type: ignore[attr-defined]
     for commands in subparsers(parser):

@@ -41,8 +41,8 @@ def test_one_line_goes_each_way(place: Path, say: Say) -> None:
     assert line.count("\n") == 1
     done = say("enroll --finish --url udpin:127.0.0.1:14551", line)
     fleet = read_manifest(place / "fleet")
-    assert f"v7 is a member of fleet {fingerprint_of(fleet.authority.public)}" in done
-    assert "system id 7" in done
+    assert f"v7 is a member of fleet {fingerprint_of(fleet.authority.public)}." in done
+    assert "of the autopilot to system id 7.\nThen: uavlinkd run --config v7.toml;" in done
     config = load_config(place / "v7.toml", {})
     assert config.fleet is not None
     assert config.fleet.own.certificate == fleet.member("v7").certificate
@@ -58,7 +58,9 @@ def test_one_line_goes_each_way(place: Path, say: Say) -> None:
 
 def test_address_in_the_line_is_listened_on(place: Path, say: Say) -> None:
     """A ground station with an address needs nothing more; `listen` in its file stays as it is."""
-    enrolled(say, "station", "--role operator --address 198.51.100.7:6000")
+    done = enrolled(say, "station", "--role operator --address 198.51.100.7:6000")
+    assert "Set the id of the ground control station to system id 255." in done
+    assert "Then: uavlinkd relay --config vps.toml;" in enrolled(say, "vps", "--role relay --address 192.0.2.9:5790")
     assert list(map(str, load_config(place / "station.toml", {}).listen)) == ["0.0.0.0:6000"]
     (place / "other.toml").write_text('name = "other"\nprivate_key_file = "other.key"\nlisten = ["127.0.0.1:6000"]\n')
     enrolled(say, "other", "--role operator --address 198.51.100.8:6000")
@@ -120,6 +122,9 @@ def test_what_is_to_be_done_is_on_standard_error(
     error = capsys.readouterr().err
     assert error.startswith("paste the line of `uavlinkd enroll NAME`, then press Enter\n")
     assert "serial 2 is revoked: `enroll --finish`, then `uavlinkd fleet publish`, then restart v7\n" in error
+    monkeypatch.setattr("sys.stdin", Terminal(say("fleet sign v7")))
+    assert main(["enroll", "--finish"]) == 0
+    assert "compare the fleet's eight characters with those that `fleet sign` printed" in capsys.readouterr().err
     monkeypatch.setattr("sys.stdin", Terminal("a"))
     assert main(["fleet", "restore"]) == 2
     assert capsys.readouterr().err.startswith("type both lines of the paper copy, then press Ctrl-D\n")

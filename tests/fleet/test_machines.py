@@ -113,6 +113,7 @@ def test_each_machine_is_enrolled_by_two_commands(hosts: Hosts, say: Say) -> Non
     fleet = read_manifest(Path("fleet"))
     assert [fleet.member(name).ids for name in ("v7", "v8")] == ["7", "8"]
     assert f"pi@v8: v8 is a member of fleet {fingerprint_of(fleet.authority.public)}" in said
+    assert "compare" not in said  # this command does
 
 
 def test_second_run_keeps_the_key_and_says_so(hosts: Hosts, say: Say) -> None:
@@ -170,6 +171,7 @@ def test_one_passphrase_is_asked_for_all(hosts: Hosts, say: Say, monkeypatch: py
     monkeypatch.setattr(authority_key, "load_key", load)
     assert say("fleet enroll v7 v8").count("the passphrase is wrong") == 1
     assert len(read_manifest(Path("fleet")).members) == 1
+    assert hosts.commands == []
     refusal.clear()
     for _ in range(2):
         say("fleet enroll v7 v8")
@@ -227,6 +229,15 @@ def test_interrupted_command_can_run_again(hosts: Hosts, say: Say, moment: str, 
     ]
 
 
+def test_machine_makes_no_key_that_the_fleet_would_not_sign(hosts: Hosts, say: Say) -> None:
+    """The refusal comes before the first command there."""
+    say("fleet enroll v7 --id 7")
+    hosts.commands.clear()
+    assert "would have the system id of v7, 7" in say("fleet enroll v8 --id 7")
+    assert "a relay needs --address HOST:PORT" in say("fleet enroll v8 --role relay")
+    assert hosts.commands == []
+
+
 def test_machine_gets_its_own_name_only(hosts: Hosts, say: Say) -> None:
     """A captured machine could ask for the name, and so for the role, of another one."""
     say("fleet enroll v7")
@@ -241,11 +252,13 @@ def test_service_is_started_and_its_link_awaited(hosts: Hosts, say: Say, monkeyp
     status = {"peers": {"gs": {"state": "up"}, "v8": {"state": "waiting"}}, "relays": {"relay": {"state": "up"}}}
     hosts.answers |= {f"systemctl {verb}": (0, "", "") for verb in ("cat", "link", "enable", "restart")}
     hosts.answers["uavlinkd status"] = (1, json.dumps(status), "")
+    hosts.answers["id -u"] = (0, "1000\n", "")
     assert "v7 has a link with gs\n" in say("fleet enroll pi@v7 --service")
     assert (hosts.home("v7") / "etc/uavlinkd/v7/v7.key").exists()
     assert (hosts.home("v7") / "etc/uavlinkd/v7.toml").exists()
     files = "--config /etc/uavlinkd/v7.toml --keys /etc/uavlinkd/v7"
     assert [command for _, command in hosts.commands] == [
+        "id -u",
         f"sudo -n uavlinkd enroll v7 {files}",
         f"sudo -n uavlinkd enroll --finish {files}",
         "sudo -n systemctl cat uavlinkd@v7",
@@ -269,12 +282,14 @@ def test_service_is_started_and_its_link_awaited(hosts: Hosts, say: Say, monkeyp
 
 
 def test_relay_has_a_unit_of_its_own(hosts: Hosts, say: Say) -> None:
-    """Its files have the names that the unit has; root needs no sudo, and no link is awaited."""
+    """Its files have the names that the unit has; root needs no sudo, also if ssh's configuration names it."""
     hosts.home("relay.example.net").mkdir()
+    hosts.answers["id -u"] = (0, "Welcome!\n0\n", "")
     hosts.answers |= {f"systemctl {verb}": (0, "", "") for verb in ("cat", "link", "enable", "restart")}
-    say("fleet enroll root@relay.example.net --name relay2 --role relay --address relay.example.net:5790 --service")
+    say("fleet enroll relay.example.net --name relay2 --role relay --address relay.example.net:5790 --service")
     files = "--config /etc/uavlinkd/relay.toml --keys /etc/uavlinkd/relay"
     assert [command for _, command in hosts.commands] == [
+        "id -u",
         f"uavlinkd enroll relay2 {files}",
         f"uavlinkd enroll --finish {files}",
         "systemctl cat uavlinkd-relay",

@@ -16,17 +16,23 @@ from tests.config.files import KEY
 from tests.config.fleets import OTHER_SIGNER, bulletin, certificate, contact, fleet, load_member, member_file
 from tests.daemon.test_evidence import THERE
 from tests.observe.test_findings import NOW, STRANGER, Daemon
+from tests.protocol.harness import PLAIN
 from uavlinkd.authority import state_file
 from uavlinkd.authority.certificates import MemberRole, digest_of
 from uavlinkd.authority.constants import CONTACTS_FIRST_S, HAVE_INTERVAL_S
 from uavlinkd.config.keys import encode_key
+from uavlinkd.config.model import RelayConfig
+from uavlinkd.daemon.peer_link import NOT_ANSWERING_S
 from uavlinkd.fleet.members import EVENT_S, FleetMembers
+from uavlinkd.observe.facts import Moment
 from uavlinkd.observe.finding import Severity, Subject
 from uavlinkd.protocol.drops import Drop, DropReason
 from uavlinkd.protocol.outputs import Dropped, RecordReceived
 from uavlinkd.protocol.path import SERIAL_HOST
 from uavlinkd.protocol.path import Path as NetPath
 from uavlinkd.protocol.relay_records import BulletinRecord, CertificateRecord, FleetRecord, Have
+from uavlinkd.protocol.settings import PeerSettings
+from uavlinkd.relay.client_link import RelayHandles, RelayLink
 
 C, D = (b64decode(KEY[name]) for name in ("c", "d"))
 
@@ -179,8 +185,14 @@ async def test_bulletins_that_contradict_each_other(tmp_path: Path) -> None:
 
 
 async def test_revoked_here_and_elsewhere(tmp_path: Path) -> None:
-    """This daemon, and a pinned peer, which stays; a bulletin that is too old for the file."""
+    """This daemon, which explains its silent relay, and a pinned peer, which stays; a bulletin that is too old."""
     member = Member(tmp_path, news=bulletin(2, 2, 7, 9), more="require_bulletin = 3", contacts=contact())
+    config = RelayConfig(PeerSettings("relay vps", C, None, PLAIN, is_certified=True), ())
+    relay = RelayLink(config, member.node, RelayHandles(), lambda *_: None, NOW - NOT_ANSWERING_S)
+    relay.set_paths([NetPath(0, THERE)], 0.0)
+    member.parts.relay_links["vps"] = relay
+    member.sockets.unresolved = lambda name: set[str]()
+    assert Moment(member.parts, member.history, NOW).silent_relays == [relay]
     member.have(2, bulletin(2, 2, 7, 9), serial=9)
     findings = member.findings()
     assert set(findings) == {

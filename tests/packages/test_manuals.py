@@ -36,9 +36,10 @@ def share(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A working folder with a file and a fleet."""
+    """A working folder with a file, a fleet, and a configuration with a station."""
     folder = tmp_path_factory.mktemp("place")
     (folder / "LICENSE").touch()
+    (folder / "v7.toml").write_text('[[peer]]\nname = "taxi"\n\n[[station]]\nname = "tablet"\n')
     enroll = "uavlinkd enroll drone1 | uavlinkd fleet sign --role operator --address 127.0.0.1:5790"
     command = f"uavlinkd fleet init --no-passphrase && {enroll}"
     subprocess.run(["sh", "-c", command], check=True, cwd=folder, env=environ(), capture_output=True)
@@ -60,6 +61,7 @@ LINES = pytest.mark.parametrize(
         ("uavlinkd check --config LIC", "LICENSE"),
         ("uavlinkd fleet remove dr", "drone1"),
         ("uavlinkd fleet sign --replace dr", "drone1"),
+        ("uavlinkd station remove --config v7.toml ta", "tablet"),
         ("uavlink-mitm --li", "--list"),
     ],
 )
@@ -67,7 +69,7 @@ LINES = pytest.mark.parametrize(
 
 @LINES
 def test_bash_completes(line: str, completed: str, share: Path, place: Path) -> None:
-    """Commands, options, choices, files and members."""
+    """Commands, options, choices, files, members and stations."""
     script = share / "bash-completion/completions" / line.split(maxsplit=1)[0]
     command: list[str | Path] = ["bash", "-c", PRESS_TAB, "bash", script, place, *line.split()]
     done = subprocess.run(command, capture_output=True, text=True, check=True, env=environ())

@@ -75,18 +75,18 @@ def _sign(options: argparse.Namespace) -> None:
     ask = passphrase_from(options.passphrase_file)
     before, fleet = operations.sign(options.out, request, _identity(options), ask, replaces=replaces)
     print(operations.line_of(fleet, request.name))
-    _note_signed(before, fleet, request.name, replaces=replaces)
+    _note_signed(before, fleet, request.name, replaces="`enroll --finish`, then " if replaces else None)
+    _note(f"fleet {fingerprint_of(fleet.authority.public)}: `enroll --finish` prints the same on {request.name}")
 
 
-def _note_signed(before: Fleet, fleet: Fleet, name: str, *, replaces: bool) -> None:
+def _note_signed(before: Fleet, fleet: Fleet, name: str, *, replaces: str | None) -> None:
+    """Print what was signed. ``replaces``: what comes before `publish`, for a new key of a member; else None."""
     member = fleet.member(name)
     role, serial = member.role.name.lower(), member.certificate.serial
     _note(f"signed {name}: {role}, system id {member.ids}, serial {serial}")
-    _note(f"fleet {fingerprint_of(fleet.authority.public)}: `enroll --finish` prints the same on {name}")
     former = [each.certificate.serial for each in fleet.members if each.name == name][:-1]
-    if replaces and former:
-        after = f"`enroll --finish`, then `uavlinkd fleet publish`, then restart {name}"
-        _note(f"serial {former[-1]} is revoked: {after}")
+    if replaces is not None and former:
+        _note(f"serial {former[-1]} is revoked: {replaces}`uavlinkd fleet publish`, then restart {name}")
     _note_contacts(before, fleet)
 
 
@@ -199,7 +199,8 @@ def _enroll_machine(
 ) -> None:
     """Enroll a machine: its key, then its certificate in the fleet's folder, then its configuration.
 
-    Wherever this was interrupted, it can run again: a member that the folder has keeps its key.
+    It makes no key before the fleet can sign it. Wherever this was interrupted, it can run again: a member that the
+    folder has keeps its key, and a key that is not signed yet is used.
     """
     fleet = read_manifest(options.out)
     known = next((member for member in fleet.current if member.name == name), None)
@@ -207,9 +208,10 @@ def _enroll_machine(
     unit = "uavlinkd-relay" if role is MemberRole.RELAY else f"uavlinkd@{name}"
     machine = Machine(name, target, unit if options.service else "")
     if known is None or options.replace:
+        operations.check_signing(options.out, name, identity, ask, replaces=options.replace)
         request = machine.request()
         before, fleet = operations.sign(options.out, request, identity, ask, replaces=options.replace)
-        _note_signed(before, fleet, name, replaces=options.replace)
+        _note_signed(before, fleet, name, replaces="" if options.replace else None)
     elif not identity.is_of(known):
         raise FleetError(f"{name} is {known.role.name.lower()}, system id {known.ids}: --replace changes that")
     else:
@@ -238,6 +240,7 @@ def _exchange(options: argparse.Namespace) -> None:
     finish = options.finish or _line("uavlinkd fleet sign")
     for text in enrolling.finish(finish, options.config, options.keys, options.url, options.control_socket):
         _say(text)
+    _note("compare the fleet's eight characters with those that `fleet sign` printed")
 
 
 def _line(source: str) -> str:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from uavlinkd.authority.certificates import Certificate, is_certified, parse_bulletin
+from uavlinkd.authority.certificates import Certificate, MemberRole, is_certified, parse_bulletin
 from uavlinkd.authority.enrolment import (
     FleetError,
     Reply,
@@ -21,7 +21,7 @@ from uavlinkd.authority.enrolment import (
 )
 from uavlinkd.config import keys
 from uavlinkd.config.load import load_config, read_toml
-from uavlinkd.config.model import ConfigError
+from uavlinkd.config.model import Config, ConfigError
 from uavlinkd.fleet.files import listen_on, new_table, with_fleet, written
 from uavlinkd.fleet.manifest import file_errors
 from uavlinkd.mavlink.dialect import SYSTEM_ID
@@ -104,32 +104,34 @@ def finish(line: str, config: Path | None, folder: Path | None, url: str | None,
     else:
         socket = socket or (f"{name}.sock" if folder is None else f"/run/uavlinkd/{folder.name}/control.sock")
         table = new_table(reply, key, socket, url, listen)
-    _write(place, written(with_fleet(table, reply)))
+    daemon = _write(place, written(with_fleet(table, reply)))
     if is_replaced:
         with file_errors():
             place.key(former).unlink()
-    fingerprint = fingerprint_of(reply.authority)
     contacts = ", ".join(certificate_in(contact).name for contact in reply.contacts)
-    ids = f"the id of the ground control station, to system id {ids_of(certificate)}"
+    of_vehicle = certificate.role is MemberRole.VEHICLE
+    what = f"{SYSTEM_ID} of the autopilot" if of_vehicle else "the id of the ground control station"
+    start = f"uavlinkd {'relay' if daemon.is_only_relay else 'run'} --config {place.config}"
     return [
-        f"{name} is a member of fleet {fingerprint}: compare this with the line of `fleet sign`.",
+        f"{name} is a member of fleet {fingerprint_of(reply.authority)}.",
         f"{place.config}: {certificate.role.name.lower()}, contacts {contacts or 'none'}",
-        *([f"Set {SYSTEM_ID} of the autopilot, or {ids}."] if ids_of(certificate) else []),
-        *([f"Then: uavlinkd run --config {place.config}; if it runs already, restart it."] if folder is None else []),
+        *([f"Set {what} to system id {ids_of(certificate)}."] if ids_of(certificate) else []),
+        *([f"Then: {start}; if it runs already, restart it."] if folder is None else []),
         *([f"The former key, {place.key(former)}, was deleted."] if is_replaced else []),
     ]
 
 
-def _write(place: MemberFiles, text: str) -> None:
-    """Replace the configuration as a whole, if a daemon would accept it."""
+def _write(place: MemberFiles, text: str) -> Config:
+    """Replace the configuration as a whole, if a daemon would accept it, and return it."""
     new = place.config.with_name(f".{place.config.name}.new")
     with file_errors():
         place.config.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         try:
             write_new(new, text.encode())
-            load_config(new, place.environ())
+            config = load_config(new, place.environ())
             new.replace(place.config)
             sync_folder(place.config.parent)
+            return config
         except ConfigError as error:
             problems = "\n".join(f"{problem.key}: {problem.message}" for problem in error.problems)
             raise FleetError(

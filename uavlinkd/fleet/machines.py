@@ -7,7 +7,6 @@ agent. Only public lines pass; the private key stays there. Each failure has the
 from __future__ import annotations
 
 import json
-import os
 import re
 import shlex
 import shutil
@@ -17,6 +16,7 @@ import time
 from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 from uavlinkd.authority.certificates import NAME
@@ -50,7 +50,7 @@ def name_of(target: str) -> str:
     return name
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Machine:
     """A machine that becomes a member of a fleet."""
 
@@ -116,8 +116,10 @@ class Machine:
 
     def _run(self, *words: str, line: str = "", accepted: Collection[int] = (0,)) -> str:
         """Run a command there, and return what it printed. Raises CommandError with its own words if it fails."""
-        if self.unit:
-            words = (*self._sudo, *words)
+        return self._call(*(self._sudo if self.unit else ()), *words, line=line, accepted=accepted)
+
+    def _call(self, *words: str, line: str = "", accepted: Collection[int] = (0,)) -> str:
+        """Run a command there as the user that logs in."""
         if self.target is not None:
             if shutil.which("ssh") is None:
                 raise CommandError("ssh is not installed here: install it, or carry each line by hand")
@@ -143,9 +145,9 @@ class Machine:
         """The program: on this machine it may not be in the PATH."""
         return (sys.executable, "-m", "uavlinkd") if self.target is None else ("uavlinkd",)
 
-    @property
+    @cached_property
     def _sudo(self) -> tuple[str, ...]:
         """Root's rights, which a service's files need. Through ssh, sudo has no terminal to ask on."""
-        if self.target is None:
-            return () if os.geteuid() == 0 else ("sudo",)
-        return () if self.target.startswith("root@") else ("sudo", "-n")
+        if self._call("id", "-u").split()[-1:] == ["0"]:  # the configuration of ssh may name the user
+            return ()
+        return ("sudo",) if self.target is None else ("sudo", "-n")

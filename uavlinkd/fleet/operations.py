@@ -34,7 +34,7 @@ from uavlinkd.fleet.manifest import (
 from uavlinkd.fleet.recovery import recovered
 from uavlinkd.fleet.signing import Identity
 from uavlinkd.ops.control import ask as ask_daemon
-from uavlinkd.protocol.crypto import Secret, SigningKey, signing_key_pem
+from uavlinkd.protocol.crypto import Secret, SigningKey, signing_key_pem, x25519_public_key
 from uavlinkd.system.base64_text import to_base64
 from uavlinkd.system.folders import replace_file
 
@@ -82,6 +82,12 @@ def sign(
         after = signing.certify(before, signer, request.public_key, request.name, identity, replaces=replaces)
         _save(folder, after)
     return before, after
+
+
+def check_signing(folder: Path, name: str, identity: Identity, ask: Passphrase, *, replaces: bool) -> None:
+    """Check that :func:`sign` would accept any new key of a member. Raises FleetError as it does."""
+    fleet, key = read_manifest(folder), x25519_public_key(secrets.token_bytes(32))
+    signing.certify(fleet, _signer(folder, fleet, ask), key, name, identity, replaces=replaces)
 
 
 def line_of(fleet: Fleet, name: str) -> str:

@@ -248,7 +248,7 @@ def state_of(peer: Peer) -> str:
 def used_relay_status(relay: RelayLink, daemon: DaemonParts, now: float) -> dict[str, object]:
     """The status of a relay. ``peer``: the peer that it is too, or None. ``peers``: those that use it, each with
     ``bound``, ``waiting`` for the peer to ask too, or ``unanswered``. ``seen_as``: this daemon's addresses as the
-    relay sees them. ``tls``: by URL whether there is a connection, or why not.
+    relay sees them, along the paths that work now. ``tls``: by URL whether there is a connection, or why not.
     """
     peer = relay.peer
     return {
@@ -257,7 +257,7 @@ def used_relay_status(relay: RelayLink, daemon: DaemonParts, now: float) -> dict
         "public_key": encode_key(peer.settings.public_key),
         "addresses": [str(written) for written in relay.config.addresses],
         "tls": {} if daemon.tls is None else daemon.tls.states(relay.config.addresses),
-        "seen_as": [str(seen) for _, seen in relay.views()],
+        "seen_as": [str(seen) for path, seen in relay.views() if relay.works_along(path)],
         "last_received_s": _age(peer.received_at, now),
         "handshake_s": _age(peer.established_at, now),
         "round_trip_s": peer.round_trip_s,

@@ -144,6 +144,7 @@ OF_DAEMON: Final = (
         " compare its address, and open its firewall. `uavlinkd pubkey` there must print the public_key of the"
         " [[relay]] here, and this daemon must be a member there",
         Exit.FAILED,
+        frozenset({"own_certificate_revoked"}),
     ),
     Row(
         *("line_noise", WARNING, signs.line_noise),

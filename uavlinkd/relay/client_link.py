@@ -184,6 +184,11 @@ class RelayLink:
         seen = ((path, binding.seen_as) for path, binding in self._bindings.items() if path.is_udp)
         return [(path, seen_as) for path, seen_as in seen if seen_as is not None]
 
+    def works_along(self, path: Path) -> bool:
+        """Whether the relay answers along a path now."""
+        state = self.peer.paths.find(path)
+        return self.peer.is_up and state is not None and state.works
+
     def state_for(self, link: PeerLink) -> str:
         """Whether a peer is reached along the relay: ``bound``, ``waiting`` for it to ask too, or ``unanswered``."""
         handles = [binding.handles[link.key] for binding in self._bindings.values() if link.key in binding.handles]

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import io
+import json
 from pathlib import Path
 from typing import Any
 
 import pytest
 from rich.console import Console
 
+from tests.ops.schema import golden
 from uavlinkd.lab.demo.run import attacks_of
 from uavlinkd.lab.demo.screen import AttackResult, Summary, render
 from uavlinkd.lab.sim.drone_process import DroneProcess
+from uavlinkd.ops import DEMO_SCHEMA
 from uavlinkd.protocol.drops import DropReason
 
 ATTACKED: dict[str, Any] = {"attacks": [AttackResult("drop", 9)]}
@@ -36,6 +39,17 @@ def test_good_means_that_nothing_false_arrived(
 ) -> None:
     """Without an attack, no frame is lost either. An attack must have had a target, and the link recovers."""
     assert Summary(2.0, *counts, 3, {"bad_tag": 4}, 0.25, **more).is_good is is_good
+
+
+def test_json_has_the_declared_names() -> None:
+    """With and without attacks."""
+    drops = {"bad_tag": 4}
+    calm = Summary(2.0, 10, 10, 0, 3, drops, 0.2)
+    attacked = Summary(2.0, 10, 10, 0, 3, drops, None, [AttackResult("drop", 9, drops)])
+    facts = [json.loads(summary.to_json()) for summary in (calm, attacked)]
+    names = golden.names_of(*facts, counts={"drops": 1, "attacks[].noticed": 1})
+    assert {one["schema"] for one in facts} == {DEMO_SCHEMA}
+    assert golden.differences("demo", DEMO_SCHEMA, golden.load("demo"), names) == []
 
 
 def test_the_screen_fits_a_small_terminal(tmp_path: Path) -> None:

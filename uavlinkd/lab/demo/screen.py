@@ -12,6 +12,8 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
+from uavlinkd.ops import DEMO_SCHEMA
+
 if TYPE_CHECKING:
     from uavlinkd.lab.sim.drone_process import DroneProcess
 
@@ -58,7 +60,7 @@ class Summary:
         return self.is_recovered and all(attack.interventions for attack in self.attacks)
 
     def to_json(self) -> str:
-        facts = asdict(self)
+        facts = {"schema": DEMO_SCHEMA, **asdict(self)}
         if self.attacks is None:
             del facts["attacks"], facts["is_recovered"]
         return json.dumps(facts)
