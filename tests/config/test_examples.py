@@ -66,7 +66,8 @@ def test_station_has_every_default() -> None:
     (endpoint,) = table["endpoint"]
     keys = SECTIONS["endpoint"]
     values, problems = read(keys, endpoint)
-    assert (set(endpoint), problems) == (set(keys) - set(POLICY), [])
+    of_autopilots = {"signing_key_file", "signing_link_id"}
+    assert (set(endpoint), problems) == (set(keys) - set(POLICY) - of_autopilots, [])
     assert all(keys[key].default in (REQUIRED, value) for key, value in values.valid.items())
     assert {*POLICY, *ROLES} <= set(re.findall(r"[\w-]+", STATION))
 

@@ -24,6 +24,7 @@ from uavlinkd.config.model import (
     PolicyData,
     RelayConfig,
     RelayServer,
+    SigningConfig,
     StationsConfig,
 )
 from uavlinkd.config.schema import LINK, POLICY
@@ -179,7 +180,9 @@ def _network(section: Values) -> NetworkConfig:
 
 def _endpoint(section: Values) -> EndpointConfig:
     own = ("name", "url", "radio_status", "status_text")
-    return EndpointConfig(**{key: section.get(key) for key in own}, policy=policy_data(section))
+    secrets = section.get("signing_key_file")
+    signing = SigningConfig(secrets, section.get("signing_link_id")) if secrets else None
+    return EndpointConfig(**{key: section.get(key) for key in own}, policy=policy_data(section), signing=signing)
 
 
 def _peer(file: File, peer: Values) -> PeerConfig:

@@ -39,7 +39,7 @@ def check(file: File) -> Found:
     for kind, key in _UNIQUE:
         yield from unique(file[kind], key)
     of_others = (_keys, _members, _relays, _uses, fleet_rules.check, _networks, _who_initiates)
-    for rule in (*of_others, _ports, _devices, _stations):
+    for rule in (*of_others, _ports, _devices, _stations, _signing):
         yield from rule(file)
     for kind in ("endpoint", "peer", "station"):
         for section in file[kind]:
@@ -130,6 +130,24 @@ def _stations(file: File) -> Found:
                     f"has an id that vehicles refuse from this member, whose certificate has {first} to {last}: write"
                 )
                 yield station.at("system_ids"), f"{text} one of these, or `uavlinkd fleet enroll --replace --id A-B`"
+
+
+def _signing(file: File) -> Found:
+    """A signing key is no other key of the file. Two endpoints with the same one have two link ids."""
+    of_sections = ((file.top, "private_key_file"), (file.one("stations"), "private_key_file"))
+    others = [section.get(key) for section, key in (*of_sections, *((peer, "psk_file") for peer in file["peer"]))]
+    before: list[Values] = []
+    for endpoint in file["endpoint"]:
+        secrets = endpoint.get("signing_key_file") or ()
+        if any(secret in others for secret in secrets):
+            text = "is another key of this file too, and the autopilot would get it: make one of its own with"
+            yield endpoint.at("signing_key_file"), f"{text} `uavlinkd signing setup`"
+        for other in before:
+            is_shared = any(secret in secrets for secret in other.get("signing_key_file") or ())
+            if is_shared and other.get("signing_link_id") == endpoint.get("signing_link_id"):
+                text = f"is in use by {other.at()} with the same key: write another one, 1 to 255"
+                yield endpoint.at("signing_link_id"), text
+        before.append(endpoint)
 
 
 def _numbers(section: Values) -> set[int]:

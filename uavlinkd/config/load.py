@@ -19,12 +19,12 @@ from uavlinkd.config import checks
 from uavlinkd.config.advice import advice
 from uavlinkd.config.build import build
 from uavlinkd.config.file import File, example_of
-from uavlinkd.config.keys import CREDENTIALS, KeyFileError, find_secret_file, read_secret_file, reason_of
+from uavlinkd.config.keys import CREDENTIALS, NEW_KEY, KeyFileError, find_secret_file, read_secret_file, reason_of
 from uavlinkd.config.model import Config, ConfigError, Problem
 from uavlinkd.config.schema import TOP
 from uavlinkd.config.section import Values, read
 from uavlinkd.config.tls_files import TlsFileError, find_tls_files
-from uavlinkd.protocol.crypto import x25519_public_key
+from uavlinkd.protocol.crypto import Secret, x25519_public_key
 from uavlinkd.system.tasks import Threads
 
 STATES = "STATE_DIRECTORY"
@@ -49,6 +49,8 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
     secrets = ((section, "private_key_file") for section in (file.top, *file["stations"]))
     for section, key in (*secrets, *((peer, "psk_file") for peer in file["peer"])):
         _read_secret(file, section, key, environ)
+    for endpoint in file["endpoint"]:
+        _read_signing_keys(file, endpoint, environ)
     if (private := file.top.get("private_key_file")) is not None:
         file.own_key = x25519_public_key(private.reveal())
     if (https := file.one("relay_server").get("https")) is not None:
@@ -151,6 +153,20 @@ def _read_secret(file: File, section: Values, key: str, environ: Mapping[str, st
         file.add(section.at(key), f"{error}; {remedy}" if remedy else str(error))
 
 
+def _read_signing_keys(file: File, endpoint: Values, environ: Mapping[str, str]) -> None:
+    """Put an endpoint's keys in the place of their file's name: the key in force, then the new one of a change."""
+    key = "signing_key_file"
+    if (name := endpoint.valid.get(key)) is None:
+        return
+    has_new = os.path.lexists(find_secret_file(name + NEW_KEY, file.folder, environ)[0])
+    secrets = list[Secret]()
+    for written in (name, name + NEW_KEY) if has_new else (name,):
+        endpoint.valid[key] = written
+        _read_secret(file, endpoint, key, environ)
+        secrets += [endpoint.valid[key]] if key in endpoint.valid else []
+    endpoint.valid[key] = tuple(secrets)
+
+
 _FOR_A_SERVICE = (
     "put a service's keys into the folder that LoadCredential= names in its unit, owned by root and with mode 0600; "
     "the service reads them at its next start"
@@ -161,5 +177,7 @@ def _how_to_get(key: str, path: Path) -> str:
     where = shlex.quote(str(path))
     if key == "psk_file":
         return f"copy it from the peer, or make it on one of the two with `uavlinkd psk --out {where}`"
+    if key == "signing_key_file":
+        return "delete this line, and run `uavlinkd signing setup` beside the autopilot: it makes the file"
     remedy = f"make it with `uavlinkd keygen --out {where}`"
     return f"{remedy}, or name the folder of a service's keys with `uavlinkd check --keys DIR`"

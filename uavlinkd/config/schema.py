@@ -247,6 +247,8 @@ REPEATED: Final[dict[str, Keys]] = {
         "url": Key(lambda value: parse_url(text(value)), written='"udpin:127.0.0.1:14550"'),
         "radio_status": Key(boolean, False),
         "status_text": Key(boolean, False),
+        "signing_key_file": Key(_file_name, None, '"autopilot.key"'),
+        "signing_link_id": Key(integer(1, 255), 1),
         **POLICY,
     },
     "peer": {
