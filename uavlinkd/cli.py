@@ -48,6 +48,10 @@ COMMANDS: Final = {
         "add a ground station that has the WireGuard app and nothing of uavlinkd",
         "uavlinkd.stations.commands:add_arguments",
     ),
+    "signing": (
+        "make the autopilot and the daemon beside it sign MAVLink",
+        "uavlinkd.ops.signing:add_arguments",
+    ),
     "help": ("show the commands, or with COMMAND the options of one", ""),
     "sim": ("fly a simulated autopilot", "uavlinkd.lab.commands:add_arguments"),
     "demo": ("run two daemons on this machine that exchange frames", "uavlinkd.lab.commands:add_arguments"),

@@ -6,21 +6,19 @@ import argparse
 import json
 import os
 import re
-import shutil
 import socket
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
 from ipaddress import ip_address, ip_network
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from uavlinkd.config import keys
+from uavlinkd.config.edit import environ_of, replace_valid
 from uavlinkd.config.load import load_config, read_toml
-from uavlinkd.config.model import ConfigError
 from uavlinkd.config.schema import SECTIONS
 from uavlinkd.stations.inner import MTU
 from uavlinkd.system.addresses import Address, AddressError, parse_address
-from uavlinkd.system.folders import replace_file
 from uavlinkd.system.terminal import OK, CommandError, UsageError
 
 _KEY_FILE: Final = "stations.key"
@@ -63,7 +61,7 @@ def _add(options: argparse.Namespace) -> int:
         parse_address(str(Address(host, _ANYWHERE[1])), allow_names=True)
     except AddressError as error:
         raise UsageError(f"--at {error}") from None
-    load_config(path, _environ(options.keys))  # it is valid before
+    load_config(path, environ_of(options.keys))  # it is valid before
     table = read_toml(path)
     stations, settings = table.get("station", []), table.get("stations", {})
     if any(station.get("name") == name for station in stations):
@@ -85,7 +83,7 @@ def _add(options: argparse.Namespace) -> int:
         f'\n[[station]]\nname = {json.dumps(name)}\npublic_key = {json.dumps(public)}\naddress = "{address}"\n'
         f'role = "{options.role}"\nsystem_ids = [{options.system_id}]\n'
     )
-    config = _replace(path, path.read_text().rstrip("\n") + "\n" + text, options.keys)
+    config = replace_valid(path, path.read_text().rstrip("\n") + "\n" + text, options.keys)
     assert config.stations is not None
     own = keys.public_key_text(keys.encode_key(config.stations.private_key.reveal()))
     port = config.stations.listen.port
@@ -120,7 +118,7 @@ def _remove(options: argparse.Namespace) -> int:
     kept = [block for block in blocks if not _is_station(block, name)]
     if not any(block.lstrip().startswith("[[station]]") for block in kept):
         kept = [block for block in kept if not block.lstrip().startswith("[stations]")]
-    _replace(path, "".join(kept).rstrip("\n") + "\n", options.keys)
+    replace_valid(path, "".join(kept).rstrip("\n") + "\n", options.keys)
     print(f"Restart the daemon of {path}: then {name} gets no answer any more")
     return OK
 
@@ -129,29 +127,6 @@ def _is_station(block: str, name: str) -> bool:
     return block.lstrip().startswith("[[station]]") and bool(
         re.search(rf"""^\s*name\s*=\s*["']{re.escape(name)}["']""", block, re.MULTILINE)
     )
-
-
-def _replace(path: Path, text: str, folder: Path | None) -> Any:
-    """Replace the file, if the text is a valid one. Returns its configuration. Raises ConfigError."""
-    trial = path.with_name(f".{path.name}.trial")
-    try:
-        trial.write_text(text)
-        config = load_config(trial, _environ(folder))
-        shutil.copystat(path, trial)
-        replace_file(path, text.encode())
-        shutil.copystat(trial, path)
-    except ConfigError as error:
-        raise ConfigError(tuple(one._replace(file=str(path)) for one in error.problems)) from None
-    except OSError as error:
-        raise CommandError(f"{path}: cannot be written: {error.strerror}") from None
-    finally:
-        with suppress(OSError):
-            trial.unlink()
-    return config
-
-
-def _environ(folder: Path | None) -> Mapping[str, str]:
-    return os.environ if folder is None else {keys.CREDENTIALS: str(folder.absolute())}
 
 
 def _own_address() -> str:
