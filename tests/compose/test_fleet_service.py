@@ -18,7 +18,7 @@ from uavlinkd.cli import main
 def test_one_command_for_each_service(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A station, a relay and a vehicle on one machine: the vehicle has a link when the command ends."""
+    """A station, a relay and a vehicle on one machine, by root: the vehicle has a link when the command ends."""
     why = images.why_not()
     need(why is None, str(why))
     monkeypatch.chdir(tmp_path)
@@ -27,11 +27,11 @@ def test_one_command_for_each_service(
     with Machine(build()) as machine:
         machine.stand_in_for_ssh(tmp_path)
         machine.say("rm /etc/systemd/system/uavlinkd*.service && systemctl daemon-reload")
-        _enroll("root@relay --role relay --address 127.0.0.1:5789")
-        _enroll("root@gs --role operator --address 127.0.0.1:5790")
+        _enroll("relay --role relay --address 127.0.0.1:5789")
+        _enroll("gs --role operator --address 127.0.0.1:5790")
         watch = Stopwatch()
         capsys.readouterr()
-        _enroll("root@v7 --id 7 --url udpin:127.0.0.1:14551")
+        _enroll("v7 --id 7 --url udpin:127.0.0.1:14551")
         out = capsys.readouterr().out
         took_s = watch.elapsed_s
         assert "v7 has a link with gs" in out
@@ -40,10 +40,10 @@ def test_one_command_for_each_service(
             assert machine.show(unit, "UnitFileState") == "enabled"
             assert machine.show(unit, "NRestarts") == "0"
         before = machine.show("uavlinkd@v7", "MainPID")
-        _enroll("root@v7 --id 7")
+        _enroll("v7 --id 7")
         assert machine.show("uavlinkd@v7", "MainPID") != before
         machine.say("rm -r /etc/systemd/system/uavlinkd@* /opt/uavlinkd/lib/systemd && systemctl daemon-reload")
-        assert main(["fleet", "enroll", "root@v8", "--service"]) == 1
+        assert main(["fleet", "enroll", "v8", "--service"]) == 1
         assert "Install uavlinkd there in /opt/uavlinkd, or its package" in capsys.readouterr().err
     print(f"a vehicle was enrolled, started and linked in {took_s:.1f} s:\n{out}")
 
