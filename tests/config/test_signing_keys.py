@@ -29,7 +29,7 @@ def test_key_of_a_change_follows_the_key_in_force(tmp_path: Path) -> None:
     new = _write(tmp_path, "autopilot.key.new", 2)
     text = SIGNED.replace(LINE, LINE + "signing_link_id = 7\n")
     assert load(tmp_path, text).endpoints[0].signing == SigningConfig((old, new), 7)
-    assert load(tmp_path, GOOD).endpoints[0].signing is None
+    assert load(tmp_path, GOOD).endpoints[0].signing == SigningConfig()
 
 
 def test_file_that_cannot_be_used_is_refused(tmp_path: Path) -> None:

@@ -44,7 +44,7 @@ class Client(Endpoint):
     """An endpoint with one client, which keeps the frames that it receives."""
 
     def __init__(self, name: str, kind: type[ClientPort] = ClientPort) -> None:
-        super().__init__(name, cast(PortHandler, None))
+        super().__init__(name, cast(PortHandler, SimpleNamespace(on_frames=None)))
         self.received: list[bytes] = []
         self.port = kind(self, name, None)
 

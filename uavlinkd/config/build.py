@@ -180,8 +180,7 @@ def _network(section: Values) -> NetworkConfig:
 
 def _endpoint(section: Values) -> EndpointConfig:
     own = ("name", "url", "radio_status", "status_text")
-    secrets = section.get("signing_key_file")
-    signing = SigningConfig(secrets, section.get("signing_link_id")) if secrets else None
+    signing = SigningConfig(section.get("signing_key_file") or (), section.get("signing_link_id"))
     return EndpointConfig(**{key: section.get(key) for key in own}, policy=policy_data(section), signing=signing)
 
 

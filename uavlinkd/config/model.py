@@ -54,12 +54,12 @@ class ConfigError(UsageError):
 class SigningConfig:
     """MAVLink message signing with the autopilot at an endpoint.
 
-    ``keys``: the key in force. While a change of the key goes on, the new key follows it. ``link_id``: the number of
-    this daemon's stream in its signatures, 1 to 255.
+    ``keys``: the key in force; none: frames pass unsigned. While a change of the key goes on, the new key follows it.
+    ``link_id``: the number of this daemon's stream in its signatures, 1 to 255.
     """
 
-    keys: tuple[Secret, ...]
-    link_id: int
+    keys: tuple[Secret, ...] = ()
+    link_id: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,8 +67,7 @@ class EndpointConfig:
     """A local MAVLink port.
 
     ``radio_status``: whether this daemon reports the state of the link to the client there, by a RADIO_STATUS every
-    second. ``status_text``: whether it reports lost links and withheld commands to the pilot there. ``signing``: with
-    which keys frames are signed and verified there; None: they are not.
+    second. ``status_text``: whether it reports lost links and withheld commands to the pilot there.
     """
 
     name: str
@@ -76,7 +75,7 @@ class EndpointConfig:
     policy: PolicyData = field(default_factory=dict)
     radio_status: bool = False
     status_text: bool = False
-    signing: SigningConfig | None = None
+    signing: SigningConfig = field(default_factory=SigningConfig)
 
     @property
     def systems(self) -> frozenset[int]:

@@ -156,6 +156,8 @@ class Daemon:
                 facts = {key: status[key] for key in ("name", "public_key", "relays")}
                 web = {} if parts.tls is None else await parts.tls.probe()
                 return {"schema": NETCHECK_SCHEMA, **facts, "web": web}
+            case ("signing", " ", wish):
+                return await parts.signing.answer(wish)
             case ("bulletin", "", "") if parts.fleet is not None:
                 return {"bulletin": to_base64(parts.fleet.trust.bulletin_bytes)}
             case ("fleet", "", "") if parts.fleet is not None:

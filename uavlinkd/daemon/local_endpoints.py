@@ -74,6 +74,8 @@ class LocalEndpoints:
         self.stall = stall
         self.open_station: Callable[[EndpointConfig, PortHandler], Endpoint]
         """Opens the endpoint of a station, if the file has any."""
+        self.sign: Callable[[Endpoint, EndpointConfig], object]
+        """Makes an endpoint sign, if the file has a key for any."""
         self.on_frames: Callable[..., None]
         """Of :class:`uavlinkd.io.ports.PortHandler`: :meth:`.Line.forward`, without a call in between."""
         self._switch = switch
@@ -96,6 +98,8 @@ class LocalEndpoints:
                 self.endpoints.append((self.open_station if is_station else open_endpoint)(config, self))
             except (BindError, OSError) as error:
                 raise BindError(f"endpoint.url ({config.name}): {error}") from None
+            if config.signing.keys:
+                self.sign(self.endpoints[-1], config)
             self.policies[config.name] = config.make_policy()
             if config.radio_status:
                 self._radio[self.endpoints[-1]] = RadioStatusSource()
@@ -159,11 +163,14 @@ class LocalEndpoints:
     def _write(self, sources: Mapping[Endpoint, S], frame_of: Callable[[S], bytes], now: float) -> None:
         """Send a frame of each source to the clients of its endpoint. It goes nowhere else."""
         for endpoint, source in sources.items():
-            raw = frame_of(source)
-            self._switch.router.sendings.note_own(raw, endpoint.ports, now)
-            frames = split_payload(raw, SplitCounters())
-            for port in endpoint.ports:
-                port.send(frames, self._own, now, 0.0)
+            self.send_own(endpoint, frame_of(source), now)
+
+    def send_own(self, endpoint: Endpoint, raw: bytes, now: float) -> None:
+        """Send a frame of the daemon's own to the clients of an endpoint."""
+        self._switch.router.sendings.note_own(raw, endpoint.ports, now)
+        frames = split_payload(raw, SplitCounters())
+        for port in endpoint.ports:
+            port.send(frames, self._own, now, 0.0)
 
 
 # What the pilot should know about the links, as short texts for the ground station: at most one a second. Texts wait,

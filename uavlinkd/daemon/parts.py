@@ -6,6 +6,7 @@ This is the one module that imports the features, and only those that the config
 from __future__ import annotations
 
 import os
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 from structlog.typing import FilteringBoundLogger
@@ -30,6 +31,7 @@ from uavlinkd.system.guard import FaultGuard
 from uavlinkd.system.stall import StallWatch
 
 if TYPE_CHECKING:
+    from uavlinkd.daemon.signing import AutopilotSigning
     from uavlinkd.fleet.members import FleetMembers
     from uavlinkd.relay.client_link import RelayLink
     from uavlinkd.relay.clients import Relays
@@ -90,6 +92,8 @@ class DaemonParts:
         """The connections by TLS to relays."""
         self.stations = self._stations()
         """Who comes with WireGuard."""
+        if any(endpoint.signing.keys for endpoint in config.endpoints):
+            self.local.sign = self.signing.install
 
     # Features. Each is imported only if it is configured: a daemon on UDP starts faster and stays smaller.
 
@@ -156,6 +160,13 @@ class DaemonParts:
         self.local.open_station = stations.endpoint
         self.features.append(stations)
         return stations
+
+    @cached_property
+    def signing(self) -> AutopilotSigning:
+        """The signatures between this daemon and its autopilots: made when an endpoint or a person wants them."""
+        from uavlinkd.daemon.signing import AutopilotSigning  # noqa: PLC0415
+
+        return AutopilotSigning(self.local, self.config)
 
     def _tls(self) -> WebRelays | None:
         if not any(written.address.resource for relay in self.config.relays for written in relay.addresses):

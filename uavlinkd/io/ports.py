@@ -10,12 +10,15 @@ import asyncio
 import errno
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Sequence
-from typing import Protocol
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Protocol
 
 from uavlinkd.mavlink.frames import Frame, SplitCounters
 from uavlinkd.mavlink.policy.delivery import DeliveredStreams, Source
 from uavlinkd.system.stall import StallWatch
+
+if TYPE_CHECKING:
+    from uavlinkd.mavlink.signing.endpoint_signing import EndpointSigning
 
 CLIENTS_PER_ENDPOINT = 32  # most clients of one `udpin` or `tcpin` endpoint
 CLIENT_SILENT_S = 5.0
@@ -75,6 +78,9 @@ class Endpoint(ABC):
     def __init__(self, name: str, handler: PortHandler) -> None:
         self.name = name
         self.handler = handler
+        self.on_frames: Callable[..., None] = handler.on_frames
+        """Receives what a client sent, as :meth:`PortHandler.on_frames`. Signing stands before the daemon here."""
+        self.signing: EndpointSigning | None = None
         self.counters = SplitCounters()  # frames and garbage in the received bytes
         self.failures: Counter[str] = Counter()
         """Errors by name: the kernel's (``ECONNREFUSED``), and the endpoint's own reasons."""

@@ -133,7 +133,7 @@ class Connection(LocalPort):
             frames += self._splitter.end()
         if frames:
             self.received_at = now
-            self.endpoint.handler.on_frames(self, frames, now, epoch if self._splitter.is_fresh else STALE)
+            self.endpoint.on_frames(self, frames, now, epoch if self._splitter.is_fresh else STALE)
         if ended is not None:
             self.lose(ended)
 
@@ -157,7 +157,7 @@ class Connection(LocalPort):
         """Drop stale frames. Close the connection if the kernel has accepted no byte for long."""
         if frames := self._splitter.give_up(now, self._stall.epoch):
             epoch = self._stall.epoch if self._splitter.is_fresh else STALE
-            self.endpoint.handler.on_frames(self, frames, now, epoch)
+            self.endpoint.on_frames(self, frames, now, epoch)
         self.outgoing.queue.drop_stale(now)
         if self.outgoing.queue.count and not self._awaits_writable and self._room_timer is None:
             self._flush(now)  # a fault has interrupted the last one

@@ -43,6 +43,8 @@ class UdpPort(LocalPort):
         """Send frames to the client, together where they fit. The endpoint counts what the kernel refuses."""
         delivered, endpoint = self.delivered, self.endpoint
         batch, count = b"", 0
+        if (sign := delivered.sign) is not None:
+            frames = [signed for frame in frames if (signed := sign(frame, source)) is not None]
         for frame in frames:
             data = frame.raw
             # As admit() does, without a call where nothing is open and no frame can begin within this one.
@@ -80,7 +82,6 @@ class DatagramEndpoint(Endpoint):
 
     def __init__(self, name: str, handler: PortHandler) -> None:
         super().__init__(name, handler)
-        self._on_frames = handler.on_frames
         self._ports: dict[SocketAddress, UdpPort] = {}
         self._silent: set[LocalPort] = set()
         self._streams: dict[SocketAddress, StreamSplitter] = {}
@@ -120,14 +121,20 @@ class DatagramEndpoint(Endpoint):
                 if isinstance(sender, UdpPort):
                     port = sender if not sender.is_closed else self._admitted(sender.address, now)
                 else:
-                    port = self._admitted(sender, now)
+                    port = (
+                        self._admitted(sender, now) if self.signing is None or self.signing.admits(frames) else None
+                    )
                 if port is not None:
                     if self._silent:
                         self._wake(port)
                     port.received_at = now
-                    self._on_frames(port, frames, now, STALE if stale and sender in stale else epoch, waited_s)
+                    self.on_frames(port, frames, now, STALE if stale and sender in stale else epoch, waited_s)
             except Exception as error:  # of this client
                 report(error)
+
+    def _has_genuine(self, frames: list[Frame]) -> bool:
+        """Whether a stranger that sent these may become a client."""
+        return self.signing is None or self.signing.admits(frames)
 
     def _feed(self, data: bytes, address: SocketAddress, frames: list[Frame], now: float, epoch: int) -> bool:
         """Add the frames that these bytes of a sender complete. Returns whether they began in this epoch."""
@@ -179,11 +186,12 @@ class DatagramEndpoint(Endpoint):
             frames = stream.give_up(now, epoch)
             if not stream.pending_bytes:
                 del self._streams[address]
-            port = self._admitted(address, now) if frames else None
+            is_client = frames and (address in self._ports or self._has_genuine(frames))
+            port = self._admitted(address, now) if is_client else None
             if port is not None:
                 self._wake(port)
                 port.received_at = now
-                self._on_frames(port, frames, now, epoch if stream.is_fresh else STALE, 0.0)
+                self.on_frames(port, frames, now, epoch if stream.is_fresh else STALE, 0.0)
 
     def close(self) -> None:
         super().close()

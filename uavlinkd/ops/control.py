@@ -163,7 +163,8 @@ def ask(
     except (ValueError, RecursionError):
         raise ControlError(f"the answer of the daemon at {path} is not valid JSON") from None
     if not isinstance(answer, dict) or answer.get("error") == UNKNOWN:
-        raise ControlError(f"the daemon at {path} does not know the request {request!r}")
+        word = request.partition(" ")[0]  # the rest may have a key
+        raise ControlError(f"the daemon at {path} does not know the request {word!r}")
     if "error" in answer:
         raise ControlError(f"the daemon at {path} refuses the request: {answer['error']}")
     return answer

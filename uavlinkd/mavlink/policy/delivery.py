@@ -41,6 +41,9 @@ MAX_STREAMS: Final = 64
 Report = Callable[[str, Header, Refusal, float], None]
 """Receives each refusal: the source's name, the header of the frame that was not delivered, why, and when."""
 
+Sign = Callable[[Frame, "Source"], Frame | None]
+"""Returns a frame with a signature, or None if it must not be delivered."""
+
 Forget = Callable[[bytes], None]
 """Receives the bytes of a frame that was not delivered: the same frame from another source is not its duplicate."""
 
@@ -76,9 +79,21 @@ class DeliveredStream:
     Call :meth:`admit` once for each frame, in the order of delivery, and deliver all of what it returns.
     """
 
-    __slots__ = ("_authors", "_due_at", "_has_mavlink2", "_has_rare", "_tail", "outgoing", "separators", "starts")
+    __slots__ = (
+        "_authors",
+        "_due_at",
+        "_has_mavlink2",
+        "_has_rare",
+        "_tail",
+        "outgoing",
+        "separators",
+        "sign",
+        "starts",
+    )
 
-    def __init__(self, outgoing: Gate | None = None) -> None:
+    def __init__(self, outgoing: Gate | None = None, sign: Sign | None = None) -> None:
+        self.sign = sign
+        """Applied to each frame before :meth:`admit`, where its client wants signatures."""
         self.outgoing = outgoing
         """The rules for what goes to this client; None where nothing is withheld."""
         self.separators = 0  # how often bytes had to be put between frames of different sources
@@ -217,10 +232,17 @@ class DeliveredStreams:
 
     def __init__(self) -> None:
         self._by_name: dict[str, DeliveredStream] = {}
+        self._sign: Sign | None = None
+
+    def set_sign(self, sign: Sign | None) -> None:
+        """From now on, frames to the clients are signed so."""
+        self._sign = sign
+        for stream in self._by_name.values():
+            stream.sign = sign
 
     def of(self, name: str) -> DeliveredStream:
         """The stream of the client of this name, which is opened now."""
-        stream = self._by_name.pop(name, None) or DeliveredStream()
+        stream = self._by_name.pop(name, None) or DeliveredStream(sign=self._sign)
         if len(self._by_name) >= MAX_STREAMS:
             del self._by_name[next(iter(self._by_name))]
         self._by_name[name] = stream

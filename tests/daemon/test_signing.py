@@ -1,0 +1,259 @@
+"""Two real daemons, a ground station, and an autopilot that signs, on each kind of endpoint."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import socket
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager, suppress
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import all as mavlink
+
+from tests.daemon_pair import ANY_PORT, are_linked, config
+from tests.mavlink.signing.autopilot import Autopilot
+from tests.mavlink.signing.wire import KEY, OTHER
+from tests.samples import pack
+from tests.waiting import until
+from uavlinkd.config.keys import encode_key
+from uavlinkd.daemon.daemon import Daemon
+from uavlinkd.io.url import EndpointKind, NetworkUrl, SerialUrl
+from uavlinkd.protocol.crypto import Secret
+
+HEARTBEAT_S = 0.1
+"""Between two of the autopilot: a real one sends one a second."""
+
+
+class Cable:
+    """The autopilot's end of its endpoint."""
+
+    def __init__(self, autopilot: Autopilot, fd: int, send: Callable[[bytes], object]) -> None:
+        self.autopilot, self._fd, self._send = autopilot, fd, send
+        self._loop = asyncio.get_running_loop()
+        self._loop.add_reader(fd, self._read)
+        self._beating = asyncio.create_task(self._beat())
+
+    def _read(self) -> None:
+        with suppress(BlockingIOError):
+            for answer in self.autopilot.receive(os.read(self._fd, 4096)):
+                self.send(answer)
+
+    def send(self, raw: bytes) -> None:
+        with suppress(OSError):
+            self._send(raw)
+
+    async def _beat(self) -> None:
+        while True:
+            self.send(self.autopilot.heartbeat())
+            await asyncio.sleep(HEARTBEAT_S)
+
+    def close(self) -> None:
+        self._loop.remove_reader(self._fd)
+        self._beating.cancel()
+
+
+class Pair:
+    """A vehicle's daemon with an autopilot, and a ground station's."""
+
+    def __init__(self, vehicle: Daemon, ground: Daemon, cable: Cable, station: socket.socket) -> None:
+        self.vehicle, self.ground, self.cable, self.station = vehicle, ground, cable, station
+        self.autopilot = cable.autopilot
+        (self.endpoint,) = vehicle.parts.local.endpoints
+        self._number = 0
+
+    def heard(self) -> list[bytes]:
+        """The datagrams that reached the ground station since the last call."""
+        datagrams = []
+        with suppress(BlockingIOError):
+            while True:
+                datagrams.append(self.station.recv(4096))
+        return datagrams
+
+    def command(self) -> int:
+        """Send a numbered command."""
+        self._number += 1
+        message = mavlink.MAVLink_command_long_message(1, 1, 400, 0, 1, self._number, 0, 0, 0, 0, 0)
+        (endpoint,) = self.ground.parts.local.endpoints
+        self.station.sendto(pack(message, 255, 190), endpoint._sock.getsockname())  # type: ignore[attr-defined]
+        return self._number
+
+    async def commands_pass(self) -> None:
+        """Wait until a command of the station is executed, and none is under way."""
+        while not await self._is_executed(self.command()):
+            pass
+
+    async def _is_executed(self, number: int) -> bool:
+        with suppress(TimeoutError):
+            await until(lambda: any(one.param2 == number for one in self.autopilot.accepted), 0.5)
+            return True
+        return False
+
+    async def ask(self, action: str, key: Secret | None = KEY, endpoint: str = "client") -> dict[str, Any]:
+        text = "" if key is None else encode_key(key.reveal())
+        request = {"action": action, "endpoint": endpoint, "key": text}
+        answer = await self.vehicle.answer(f"signing {json.dumps(request)}")
+        assert answer is not None
+        return answer
+
+
+@asynccontextmanager
+async def flying(kind: str, autopilot: Autopilot, *keys: Secret) -> AsyncIterator[Pair]:
+    """Linked daemons; the vehicle's has a serial, UDP or TCP endpoint."""
+    closing: list[Callable[[], object]] = []
+    listener = socket.socket()
+    closing.append(listener.close)
+    if kind == "serial":
+        master, slave = os.openpty()
+        closing += [lambda: os.close(master), lambda: os.close(slave)]
+        url: Any = SerialUrl(os.ttyname(slave), 115200)
+    elif kind == "tcp":
+        listener.bind(("127.0.0.1", 0))
+        listener.listen()
+        url = NetworkUrl(EndpointKind.TCP, replace(ANY_PORT, port=listener.getsockname()[1]))
+    else:
+        url = NetworkUrl(EndpointKind.UDPIN, ANY_PORT)
+    of_vehicle = config("left", url)
+    signing = replace(of_vehicle.endpoints[0].signing, keys=keys)
+    vehicle = Daemon(replace(of_vehicle, endpoints=(replace(of_vehicle.endpoints[0], signing=signing),)))
+    await vehicle.start()
+    address = tuple(vehicle.parts.peer_sockets.addresses)
+    ground = Daemon(config("right", NetworkUrl(EndpointKind.UDPIN, ANY_PORT), address))
+    await ground.start()
+    try:
+        if kind == "serial":
+            os.set_blocking(master, False)
+            cable = Cable(autopilot, master, lambda raw: os.write(master, raw))
+        else:
+            sock = socket.socket(type=socket.SOCK_DGRAM)
+            if kind == "tcp":
+                sock.close()
+                sock = await asyncio.to_thread(lambda: listener.accept()[0])
+            else:
+                sock.connect(vehicle.parts.local.endpoints[0]._sock.getsockname())  # type: ignore[attr-defined]
+            sock.setblocking(False)
+            cable = Cable(autopilot, sock.fileno(), sock.send)
+            closing.append(sock.close)
+        closing.insert(0, cable.close)
+        station = socket.socket(type=socket.SOCK_DGRAM)
+        station.bind(("127.0.0.1", 0))
+        station.setblocking(False)
+        closing.append(station.close)
+        await until(lambda: are_linked(vehicle, ground))
+        yield Pair(vehicle, ground, cable, station)
+    finally:
+        for close in closing:
+            close()
+        await vehicle.stop()
+        await ground.stop()
+
+
+@pytest.mark.parametrize("kind", ["serial", "tcp", "udpin"])
+async def test_a_life(kind: str) -> None:
+    """A key is set up, rotated and cleared under traffic; what is unsigned is dropped in between."""
+    autopilot = Autopilot()
+    async with flying(kind, autopilot) as pair:
+        assert await pair.ask("setup") == {
+            "problem": "",
+            "is_changed": True,
+            "system": 1,
+            "accepts_unsigned": False,
+        }
+        assert autopilot.key == KEY.reveal()
+        await pair.commands_pass()
+        await until(lambda: any(not raw[2] for raw in pair.heard()))  # telemetry, as if it had not been signed
+        pair.cable.send(pack(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3)))
+        await until(lambda: pair.endpoint.failures["unsigned"] == 1)
+        autopilot.restart()
+        await pair.commands_pass()
+        first = autopilot.key
+        assert (await pair.ask("rotate", OTHER))["is_changed"]
+        assert first != autopilot.key == OTHER.reveal()
+        await pair.commands_pass()
+        assert (await pair.ask("clear", None))["is_changed"]
+        assert not autopilot.has_key
+        await pair.commands_pass()
+        assert pair.endpoint.signing is None
+        assert autopilot.rejected["unsigned"] == 4  # two questions behind each new key
+
+
+async def test_an_autopilot_that_takes_what_is_unsigned() -> None:
+    """ArduPilot does so on its USB port: the answer says it."""
+    async with flying("udpin", Autopilot(is_usb=True)) as pair:
+        answer = await pair.ask("setup")
+        assert answer["is_changed"]
+        assert answer["accepts_unsigned"]
+
+
+async def test_what_keeps_an_autopilot_from_a_key() -> None:
+    """Each problem has its sentence, and changes nothing."""
+    autopilot = Autopilot()
+    async with flying("udpin", autopilot) as pair:
+
+        async def refused(text: str, action: str = "setup", *wish: Any) -> None:
+            answer = await pair.ask(action, *wish)
+            assert answer["is_changed"] is False
+            assert text in answer["problem"]
+            assert pair.endpoint.signing is None
+            assert autopilot.key is None
+
+        await refused("has no endpoint elsewhere", "setup", KEY, "elsewhere")
+        await refused("begins it", "rotate")
+        await refused("begins it", "clear", None)
+        autopilot.is_armed = True
+        await refused("is armed")
+        autopilot.is_armed = False
+        second = Autopilot(system=2)
+        beating = asyncio.create_task(_beat(pair.cable, second))
+        await refused("systems 1 and 2")
+        beating.cancel()
+        pair.cable.close()
+        await refused("no autopilot was heard")
+
+
+async def _beat(cable: Cable, autopilot: Autopilot) -> None:
+    while True:
+        cable.send(autopilot.heartbeat())
+        await asyncio.sleep(HEARTBEAT_S)
+
+
+async def test_an_autopilot_with_another_key() -> None:
+    """It keeps its key, and goes on as before."""
+    autopilot = Autopilot()
+    autopilot.receive(pack(mavlink.MAVLink_setup_signing_message(1, 1, list(OTHER.reveal()), 5)))
+    async with flying("udpin", autopilot) as pair:
+        answer = await pair.ask("setup")
+        assert answer["is_changed"] is False
+        assert "a key that this daemon does not have" in answer["problem"]
+        assert autopilot.key == OTHER.reveal()
+        pair.command()  # as the first frame of a client does
+        await until(lambda: bool(pair.heard()))
+
+
+async def test_a_setup_that_is_not_confirmed() -> None:
+    """The autopilot may have the key: the daemon signs when it shows that, and the same command ends well."""
+    autopilot = Autopilot()
+    async with flying("udpin", autopilot) as pair:
+        autopilot.is_deaf = True
+        answer = await pair.ask("setup")
+        assert answer["is_changed"] is None
+        assert "run the same command again" in answer["problem"]
+        autopilot.is_deaf = False
+        assert (await pair.ask("setup"))["is_changed"]
+        assert (await pair.ask("setup"))["is_changed"]  # a command that was killed behind it
+        await pair.commands_pass()
+
+
+async def test_a_daemon_with_a_key() -> None:
+    """A daemon that starts with a key serves only who has it, also at a port to which anybody can send."""
+    autopilot = Autopilot()
+    autopilot.receive(pack(mavlink.MAVLink_setup_signing_message(1, 1, list(KEY.reveal()), 5)))
+    async with flying("udpin", autopilot, KEY) as pair:
+        await pair.commands_pass()
+        with socket.socket(type=socket.SOCK_DGRAM) as stranger:
+            stranger.sendto(pack(mavlink.MAVLink_system_time_message(1, 1)), pair.endpoint._sock.getsockname())  # type: ignore[attr-defined]
+            await pair.commands_pass()
+        assert len(pair.endpoint.ports) == 1

@@ -1,0 +1,1 @@
+"""Message signing between a daemon and its autopilot."""

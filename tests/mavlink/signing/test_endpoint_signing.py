@@ -1,0 +1,244 @@
+"""The signatures of one endpoint, with an autopilot that judges them by pymavlink's rules."""
+
+from __future__ import annotations
+
+import pytest
+from pymavlink.dialects.v20 import all as mavlink
+
+from tests.mavlink.signing.autopilot import Autopilot
+from tests.mavlink.signing.wire import KEY, OTHER, STATION, Wire
+from tests.samples import pack, read
+from uavlinkd.mavlink.signing.endpoint_signing import (
+    MOST_OF_SOURCE,
+    MOST_REPORTERS,
+    MOST_SENDERS,
+    SigningDrop,
+)
+from uavlinkd.mavlink.signing.signature import LAST_TIMESTAMP
+from uavlinkd.protocol.crypto import Secret
+
+KINDS = pytest.mark.parametrize("kind", ["ardupilot", "px4"])
+
+
+def with_key(kind: str = "ardupilot", key: Secret = KEY) -> Autopilot:
+    autopilot = Autopilot(kind)
+    autopilot.receive(pack(mavlink.MAVLink_setup_signing_message(1, 1, list(key.reveal()), 5)))
+    return autopilot
+
+
+def command(system: int = 255, component: int = 190, number: int = 0) -> bytes:
+    message = mavlink.MAVLink_command_long_message(1, 1, 400, 0, 1.0, number, 0, 0, 0, 0, 0)
+    return pack(message, system, component)
+
+
+def report(system: int, component: int = 1) -> bytes:
+    return pack(mavlink.MAVLink_attitude_message(1, 2, 3, 4, 5, 6, 7), system, component)
+
+
+@KINDS
+def test_nothing_passes_before_an_answer(kind: str) -> None:
+    """Until the autopilot answers a question, nothing passes in either direction; then everything that it signs."""
+    autopilot = with_key(kind)
+    wire = Wire(autopilot)
+    assert not wire.to_autopilot(command())
+    autopilot.is_deaf = True
+    wire.second()
+    assert not wire.passed
+    assert not wire.to_autopilot(command())
+    autopilot.is_deaf = False
+    wire.second()
+    assert wire.signing.is_proven
+    wire.second()
+    assert [frame.header.msgid for frame in wire.passed] == [0]
+    assert not wire.passed[0].raw[2]  # as if it had never been signed
+    assert wire.to_autopilot(command())
+    assert [message.get_type() for message in autopilot.accepted] == ["COMMAND_LONG"]
+    assert not autopilot.rejected
+    assert set(wire.drops) == {SigningDrop.NOT_PROVEN}
+
+
+def test_unsigned_forged_and_replayed_frames() -> None:
+    """A frame of the autopilot counts once, with a valid signature."""
+    wire = Wire(with_key())
+    wire.second()
+    wire.second()
+    passed = len(wire.passed)
+    for raw in wire.recorded[-2:]:
+        assert not wire.to_daemon(raw)
+    assert not wire.to_daemon(pack(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3)))
+    assert not wire.to_daemon(with_key(key=OTHER).heartbeat())
+    assert len(wire.passed) == passed
+    assert wire.drops[SigningDrop.REPLAYED] == 2
+    assert wire.drops[SigningDrop.UNSIGNED] == wire.drops[SigningDrop.BAD_SIGNATURE] == 1
+
+
+def test_recorded_frames_prove_nothing_after_a_restart() -> None:
+    """A new daemon accepts no frame that was recorded before it, earlier answers included."""
+    wire = Wire(with_key())
+    for _ in range(50):
+        wire.second()
+    recorded = list(wire.recorded)
+    wire.autopilot.is_deaf = True
+    wire.daemon_starts()
+    for raw in recorded:
+        wire.now += 1
+        assert not wire.to_daemon(raw)
+    assert not wire.passed[50:]
+    assert not wire.to_autopilot(command())
+    wire.autopilot.is_deaf = False
+    wire.second()
+    assert wire.to_autopilot(command())
+    for raw in recorded:
+        assert not wire.to_daemon(raw)
+
+
+@KINDS
+def test_restarts(kind: str) -> None:
+    """After a restart of either end, frames pass again with the autopilot's next HEARTBEATs, and none is rejected."""
+    autopilot = with_key(kind)
+    wire = Wire(autopilot)
+    wire.second()
+    for number in range(100):
+        if number % 3 == 0:
+            wire.daemon_starts()
+        elif number % 3 == 1:
+            autopilot.restart()
+        for _ in range(2):
+            wire.second()
+        assert wire.signing.is_proven
+        for one in range(5):
+            assert wire.to_autopilot(command(number=one))
+    assert not autopilot.rejected
+    assert len(autopilot.accepted) == 500
+
+
+@pytest.mark.parametrize("timestamp", [10, 2**40, LAST_TIMESTAMP - 1_000_000])
+def test_clocks(timestamp: int) -> None:
+    """The autopilot's clock may jump to any time: the daemon follows its next frame."""
+    wire = Wire(with_key())
+    wire.second()
+    wire.autopilot.set_time(timestamp)
+    wire.second()
+    for sender in range(2):
+        assert wire.to_autopilot(command(component=190 + sender))
+    assert len(wire.autopilot.accepted) == 2
+    assert not wire.autopilot.rejected
+
+
+def test_the_last_timestamp() -> None:
+    """Behind the last timestamp nothing can be signed: frames are dropped, and counted."""
+    wire = Wire(with_key())
+    wire.second()
+    wire.autopilot.set_time(LAST_TIMESTAMP)
+    wire.second()
+    assert not wire.to_autopilot(command())
+    assert wire.drops[SigningDrop.NO_TIMESTAMP] == 1
+
+
+def test_a_station_cannot_move_the_timestamp() -> None:
+    """The timestamp in a station's own signature is replaced with the signature."""
+    wire = Wire(with_key())
+    wire.second()
+    before = wire.signing.timestamp
+    codec = mavlink.MAVLink(None, 255, 190)
+    codec.signing.secret_key, codec.signing.sign_outgoing, codec.signing.timestamp = b"s" * 32, True, LAST_TIMESTAMP
+    assert wire.to_autopilot(bytes(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3).pack(codec)))
+    assert wire.signing.timestamp == before + 1
+    assert len(wire.autopilot.accepted) == 1
+
+
+def test_mavlink_1() -> None:
+    """A MAVLink 1 frame cannot be signed."""
+    wire = Wire(with_key())
+    wire.second()
+    assert not wire.to_autopilot(pack(mavlink.MAVLink_param_request_list_message(1, 1), 255, 190, version=1))
+    assert wire.drops[SigningDrop.MAVLINK1] == 1
+
+
+def test_places() -> None:
+    """An autopilot keeps few senders. Other vehicles' reports and one peer that invents senders leave room."""
+    wire = Wire(with_key())
+    wire.second()
+    for system in range(1, 50):
+        wire.to_autopilot(report(system), f"vehicle {system}")
+    assert wire.drops[SigningDrop.TOO_MANY_REPORTERS] == 49 - MOST_REPORTERS
+    for component in range(1, 50):
+        wire.to_autopilot(command(200, component), "captured")
+    for component in range(1, 5):
+        wire.to_autopilot(command(255, component), STATION)
+    assert wire.drops[SigningDrop.TOO_MANY_SENDERS] == 49 - MOST_OF_SOURCE + 2
+    assert len(wire.autopilot.accepted) == MOST_SENDERS
+    wire.to_autopilot(command(255, 1), STATION)
+    assert len(wire.autopilot.accepted) == MOST_SENDERS + 1
+    assert not wire.autopilot.rejected
+
+
+def test_strangers() -> None:
+    """A stranger becomes a client by a frame with the key's signature, also before an answer."""
+    wire = Wire(with_key())
+    assert not wire.signing.admits([read(command())])
+    assert wire.signing.admits([read(wire.autopilot.heartbeat())])
+
+
+def test_set_up() -> None:
+    """An autopilot without a key is used unsigned until it has proven the new one."""
+    autopilot = Autopilot()
+    wire = Wire(autopilot, is_open=True)
+    wire.second()
+    assert wire.to_autopilot(command())
+    assert len(wire.passed) == len(autopilot.accepted) == 1
+    wire.signing.set_up(KEY, 1)
+    assert autopilot.key == KEY.reveal()
+    wire.signing.ask(wire.signing.signer, wire.now)
+    assert wire.signing.is_proven
+    assert not wire.signing.is_open
+    assert not wire.to_daemon(pack(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3)))
+    assert wire.to_autopilot(command())
+    assert len(autopilot.accepted) == 2
+
+
+@pytest.mark.parametrize("arrives", [False, True])
+def test_a_rotation_that_is_interrupted(*, arrives: bool) -> None:
+    """A daemon that starts with two keys uses the one that the autopilot has, and the new one ends the old one."""
+    autopilot = with_key()
+    wire = Wire(autopilot)
+    wire.second()
+    if arrives:
+        wire.signing.set_up(OTHER, 1)
+    wire.daemon_starts([KEY, OTHER])
+    wire.second()
+    assert wire.signing.is_proven
+    assert wire.signing.signer.secret == (OTHER if arrives else KEY)
+    if not arrives:
+        wire.signing.set_up(OTHER, 1)
+        wire.second()
+    wire.second()
+    assert wire.signing.signer.secret == OTHER
+    assert not wire.to_daemon(with_key().heartbeat())
+    assert wire.drops[SigningDrop.BAD_SIGNATURE] == 1
+    assert wire.to_autopilot(command())
+
+
+@KINDS
+def test_rotations_under_traffic(kind: str) -> None:
+    """At each of 1,000 disarms the key changes. No frame is rejected, and the old key is void at once."""
+    autopilot = with_key(kind)
+    wire = Wire(autopilot)
+    wire.second()
+    keys = [Secret(bytes([1 + number % 250, number // 250]) * 16) for number in range(1000)]
+    for key in keys:
+        autopilot.is_armed = True
+        wire.second()
+        assert wire.to_autopilot(command())
+        autopilot.is_armed = False
+        wire.second()
+        before = wire.signing.signer
+        newest = wire.signing.add(key)
+        wire.signing.set_up(key, 1)
+        wire.signing.ask(newest, wire.now)
+        assert autopilot.key == key.reveal()
+        assert wire.signing.signer is newest
+        assert wire.to_autopilot(command())
+        assert not wire.to_daemon(before.sign(pack(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3)), 3, 2**47))
+    assert not autopilot.rejected
+    assert len(autopilot.accepted) == 2000

@@ -1,0 +1,60 @@
+"""The two ends of a cable in virtual time: a daemon's endpoint with its signatures, and an autopilot."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from random import Random
+
+from tests.mavlink.signing.autopilot import Autopilot
+from tests.samples import read
+from uavlinkd.mavlink.frames import Frame
+from uavlinkd.mavlink.signing.endpoint_signing import EndpointSigning
+from uavlinkd.protocol.crypto import Secret
+
+KEY, OTHER = Secret(b"1" * 32), Secret(b"2" * 32)
+STATION = object()
+"""A source of frames."""
+
+
+class Wire:
+    """Each frame that one end sends arrives at the other in the same order, unless a test takes it away."""
+
+    def __init__(self, autopilot: Autopilot, keys: Sequence[Secret] = (KEY,), *, is_open: bool = False) -> None:
+        self.autopilot = autopilot
+        self.drops = Counter[str]()
+        self.now = 0.0
+        self.recorded: list[bytes] = []
+        """Everything that the autopilot sent."""
+        self.passed: list[Frame] = []
+        """What the daemon accepted from the autopilot."""
+        self._random = Random(1)
+        self.signing = self.daemon_starts(keys, is_open=is_open)
+
+    def daemon_starts(self, keys: Sequence[Secret] = (KEY,), *, is_open: bool = False) -> EndpointSigning:
+        """A daemon that remembers nothing of the one before."""
+        signing = EndpointSigning(keys, 1, self._random.randbytes, self.drops, is_open=is_open)
+        signing.send = lambda raw: self.to_autopilot(raw, self)
+        self.signing = signing
+        return signing
+
+    def to_autopilot(self, raw: bytes, source: object = STATION) -> bool:
+        """Send a frame. Returns whether it left."""
+        signed = self.signing.sign(read(raw), source)
+        if signed is None:
+            return False
+        for answer in self.autopilot.receive(signed.raw):
+            self.to_daemon(answer)
+        return True
+
+    def to_daemon(self, raw: bytes) -> list[Frame]:
+        """What passes of a frame at the daemon."""
+        self.recorded.append(raw)
+        passed = self.signing.accept([read(raw)], self.now)
+        self.passed += passed
+        return passed
+
+    def second(self) -> None:
+        """The autopilot sends its HEARTBEAT, as each second."""
+        self.now += 1.0
+        self.to_daemon(self.autopilot.heartbeat())

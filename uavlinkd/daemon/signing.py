@@ -1,0 +1,190 @@
+"""Signatures at the endpoints of this daemon, and the change of a key: ``uavlinkd signing setup``, rotate and clear.
+
+A change sends SETUP_SIGNING to the one autopilot behind an endpoint, while it is disarmed, and is done when the
+autopilot has proven the new key. The caller keeps the key's file: a key that was sent may be in force.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Final
+
+from uavlinkd.config.keys import decode_key
+from uavlinkd.config.model import Config, EndpointConfig, SigningConfig
+from uavlinkd.daemon.local_endpoints import LocalEndpoints
+from uavlinkd.io.ports import Endpoint, LocalPort
+from uavlinkd.mavlink.frames import Frame
+from uavlinkd.mavlink.signing.endpoint_signing import EndpointSigning, Heard
+from uavlinkd.protocol.crypto import Secret
+from uavlinkd.system.clock import monotonic
+
+HEARD_S: Final = 3.0
+"""An autopilot whose last HEARTBEAT is older is not there. They send one a second."""
+CONFIRMED_S: Final = 4.0
+"""How long to wait for the autopilot's proof: its slowest link is asked several times."""
+LISTENS_S: Final = 2.5
+"""How long to listen before the first key: there may be several autopilots."""
+REPEAT_S: Final = 0.5
+"""Between two SETUP_SIGNING."""
+_LOOK_S: Final = 0.02
+
+OTHER_KEY: Final = (
+    "the autopilot signs with a key that this daemon does not have: give the key's file, or remove the key there"
+    " (ArduPilot: over USB; PX4: delete mavlink/mavlink-signing-key.bin on its card, and restart it)"
+)
+_UNKNOWN: Final[dict[str, object]] = {
+    "problem": f"the autopilot did not confirm it within {CONFIRMED_S:g} s, and may have done it or not: run the same"
+    " command again, which uses the same key",
+    "is_changed": None,
+}
+
+
+class AutopilotSigning:
+    """The signing at the endpoints of one daemon: each has an :class:`.EndpointSigning`, or none."""
+
+    def __init__(self, local: LocalEndpoints, config: Config) -> None:
+        self._local, self._config = local, config
+        self._is_changing = False
+
+    def install(self, endpoint: Endpoint, config: EndpointConfig) -> None:
+        """Sign at an endpoint with the keys of the file."""
+        self._install(endpoint, config.signing)
+
+    def _install(self, endpoint: Endpoint, config: SigningConfig, *, is_open: bool = False) -> EndpointSigning:
+        signing = EndpointSigning(config.keys, config.link_id, os.urandom, endpoint.failures, is_open=is_open)
+        signing.send = lambda raw: self._local.send_own(endpoint, raw, monotonic())
+        deliver = endpoint.handler.on_frames
+
+        def on_frames(port: LocalPort, frames: list[Frame], now: float, epoch: int, waited_s: float = 0.0) -> None:
+            if passed := signing.accept(frames, now):
+                deliver(port, passed, now, epoch, waited_s)
+
+        endpoint.signing, endpoint.on_frames = signing, on_frames
+        endpoint.delivered.set_sign(signing.sign)
+        return signing
+
+    def _remove(self, endpoint: Endpoint) -> None:
+        endpoint.signing, endpoint.on_frames = None, endpoint.handler.on_frames
+        endpoint.delivered.set_sign(None)
+
+    # Changes.
+
+    async def answer(self, wish: str) -> dict[str, object]:
+        """Change a key. ``wish``: ``action``, ``endpoint`` and ``key`` as JSON.
+
+        The answer has a ``problem``, or nothing there. ``is_changed``: whether the autopilot has the new key; None if
+        that is not known.
+        """
+        asked = json.loads(wish)
+        endpoint = next((one for one in self._local.endpoints if one.name == asked["endpoint"]), None)
+        if endpoint is None or endpoint.is_station:
+            return _nothing(f"the daemon has no endpoint {asked['endpoint']} for an autopilot: restart it")
+        if self._is_changing:
+            return _nothing("another change of a key goes on: wait for its end")
+        self._is_changing = True
+        try:
+            key = Secret(decode_key(asked["key"])) if asked["key"] else None
+            return await self._change(endpoint, asked["action"], key)
+        finally:
+            self._is_changing = False
+
+    async def _change(self, endpoint: Endpoint, action: str, key: Secret | None) -> dict[str, object]:
+        signing = endpoint.signing
+        if signing is None:
+            if key is None or action != "setup":
+                return _nothing(f"the daemon does not sign at {endpoint.name}: `uavlinkd signing setup` begins it")
+            config = next(one.signing for one in self._config.endpoints if one.name == endpoint.name)
+            signing = self._install(endpoint, replace(config, keys=(key,)), is_open=True)
+        is_new = signing.is_open
+        if is_new:
+            await _until(lambda: signing.is_proven, LISTENS_S)
+        else:
+            await _until(lambda: signing.is_proven and bool(_heard(signing)), HEARD_S)
+        if key is not None and signing.is_proven and signing.signer.secret == key:
+            return await _done(signing)
+        heard = _heard(signing)
+        problem = _problem(signing, heard)
+        if problem is not None:
+            if is_new:
+                self._remove(endpoint)
+            return _nothing(problem)
+        (system,) = heard
+        if key is None:
+            return await self._clear(endpoint, signing, system)
+        newest = signing.add(key)
+
+        def set_up() -> None:
+            signing.set_up(key, system)
+            signing.ask(newest, monotonic())
+
+        await _repeat(set_up, lambda: signing.is_proven and signing.signer is newest)
+        return await _done(signing) if signing.signer is newest and signing.is_proven else _UNKNOWN
+
+    async def _clear(self, endpoint: Endpoint, signing: EndpointSigning, system: int) -> dict[str, object]:
+        began_at = monotonic()
+
+        def is_cleared() -> bool:
+            heard = signing.autopilots[system]
+            return heard.at > began_at and not heard.is_signed
+
+        await _repeat(lambda: signing.set_up(None, system), is_cleared)
+        signing.is_clearing = False
+        if not is_cleared():
+            return _UNKNOWN
+        self._remove(endpoint)
+        return {"problem": "", "is_changed": True, "system": system, "accepts_unsigned": True}
+
+
+def _heard(signing: EndpointSigning) -> dict[int, Heard]:
+    """The autopilots behind an endpoint now."""
+    since = monotonic() - HEARD_S
+    return {system: heard for system, heard in signing.autopilots.items() if heard.at >= since}
+
+
+def _problem(signing: EndpointSigning, heard: Mapping[int, Heard]) -> str | None:
+    """Why the autopilot cannot get a key now."""
+    if signing.is_open and signing.has_foreign_key:
+        return OTHER_KEY
+    if not heard:
+        return f"no autopilot was heard for {HEARD_S:g} s: is it on, and does `uavlinkd status` show its frames?"
+    if not signing.is_open and not signing.is_proven:
+        return "the autopilot has not proven that it has this endpoint's key: see `uavlinkd status`"
+    if len(heard) > 1:
+        systems = " and ".join(map(str, sorted(heard)))
+        return f"several autopilots are behind this endpoint (systems {systems}): give each an endpoint of its own"
+    if any(one.is_armed for one in heard.values()):
+        return "the autopilot is armed, and takes no key then: disarm it, and run the command again"
+    return None
+
+
+async def _done(signing: EndpointSigning) -> dict[str, object]:
+    """Ask whether the autopilot still takes what is unsigned."""
+    signing.accepts_unsigned = False
+    await _repeat(lambda: signing.ask(None, monotonic()), lambda: signing.accepts_unsigned, 2 * REPEAT_S)
+    return {
+        "problem": "",
+        "is_changed": True,
+        "system": next(iter(signing.autopilots), 0),
+        "accepts_unsigned": signing.accepts_unsigned,
+    }
+
+
+async def _repeat(send: Callable[[], object], is_done: Callable[[], bool], seconds: float = CONFIRMED_S) -> None:
+    end = monotonic() + seconds
+    while monotonic() < end and not is_done():
+        send()
+        await _until(is_done, REPEAT_S)
+
+
+async def _until(is_done: Callable[[], bool], seconds: float) -> None:
+    end = monotonic() + seconds
+    while not is_done() and monotonic() < end:  # noqa: ASYNC110  a frame must not pay for an event
+        await asyncio.sleep(_LOOK_S)
+
+
+def _nothing(problem: str) -> dict[str, object]:
+    return {"problem": problem, "is_changed": False}

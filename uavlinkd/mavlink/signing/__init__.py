@@ -1,0 +1,1 @@
+"""MAVLink's message signing between this daemon and the autopilot beside it (README.md). No clock, no I/O."""
