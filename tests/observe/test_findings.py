@@ -19,7 +19,7 @@ from tests.protocol.harness import PLAIN
 from tests.samples import blank
 from tests.test_readmes import ROOT
 from uavlinkd.config.keys import encode_key
-from uavlinkd.config.model import EndpointConfig, PeerConfig
+from uavlinkd.config.model import EndpointConfig, PeerConfig, SigningConfig
 from uavlinkd.daemon.evidence import EVIDENCE_S, REPORTED
 from uavlinkd.daemon.peer_link import PeerLink
 from uavlinkd.io.url import parse_url
@@ -29,6 +29,7 @@ from uavlinkd.mavlink.frames import SplitCounters, split_payload
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.mavlink.routing import Router
+from uavlinkd.mavlink.signing.endpoint_signing import Heard
 from uavlinkd.observe.facts import ICMP_S, SECURITY_S, is_contested
 from uavlinkd.observe.finding import Finding, Severity, Subject
 from uavlinkd.observe.findings import find, has_no_client, own_codes, stop_frames
@@ -36,6 +37,7 @@ from uavlinkd.observe.history import HIDDEN_LEAST, History
 from uavlinkd.observe.table import ROWS, Exit
 from uavlinkd.observe.traffic_signs import PROBLEMS
 from uavlinkd.protocol import constants as c
+from uavlinkd.protocol.crypto import Secret
 from uavlinkd.protocol.drops import DropReason
 from uavlinkd.protocol.outputs import Dropped
 from uavlinkd.protocol.path import Path
@@ -284,13 +286,20 @@ def test_system_of_another(daemon: Daemon) -> None:
     assert "`uavlinkd fleet sign --replace drone1 --id 7`" in daemon.findings()["foreign_system"].remedy
 
 
+def made_up_endpoint(config: EndpointConfig) -> Any:
+    """An endpoint without a client, which signs nothing."""
+    empty: Any = {"ports": [], "frames_sent": 0, "signing": None}
+    return SimpleNamespace(
+        name=config.name, failures=Counter(), counters=SplitCounters(), policy=config.make_policy(), **empty
+    )
+
+
 def test_autopilot_with_another_system_id(daemon: Daemon) -> None:
     """The remedy names the parameters of both autopilots, and never a role."""
     daemon.set_up(role="all", system_ids=[1])
     rules: Any = {"system_ids": [3]}
     config = EndpointConfig("autopilot", parse_url("udpin:127.0.0.1:14550"), policy=rules)
-    local = SimpleNamespace(name="autopilot", ports=[], failures={}, frames_sent=0, counters=SplitCounters())
-    local.policy = config.make_policy()
+    local = made_up_endpoint(config)
     daemon.parts.config.endpoints.append(config)
     daemon.local.append(local)
     for frame in split_payload(heartbeat(1), local.counters):
@@ -419,7 +428,7 @@ def test_key_on_two_machines_is_named_for_ten_minutes(daemon: Daemon) -> None:
 def test_frames_cannot_pass_without_any_client(daemon: Daemon, url: str, cause: str) -> None:
     """From 5 s on, unless one endpoint has a client, also one that only listens. A hub has no endpoint."""
     for name in ("autopilot", "companion"):
-        daemon.local.append(SimpleNamespace(name=name, ports=[]))
+        daemon.local.append(SimpleNamespace(name=name, ports=[], signing=None))
         daemon.parts.config.endpoints.append(SimpleNamespace(name=name, url=parse_url(url), policy={}))
     assert not has_no_client(find(daemon.parts, daemon.history, 4.9), 2)
     found = find(daemon.parts, daemon.history, 5.0)
@@ -450,7 +459,7 @@ def test_a_peer_says_what_its_problems_are(daemon: Daemon) -> None:
 
 def test_a_daemon_reports_its_own_problems_only(daemon: Daemon) -> None:
     """Not what it finds about peers, nor what they say. Each code is in the specification, with its name."""
-    daemon.local.append(SimpleNamespace(name="autopilot", ports=[]))
+    daemon.local.append(SimpleNamespace(name="autopilot", ports=[], signing=None))
     url = parse_url("udpin:127.0.0.1:14550")
     daemon.parts.config.endpoints.append(SimpleNamespace(name="autopilot", url=url, policy={}))
     daemon.set_up(role="all", system_ids="all").peer.claims.problems = ProblemClaim((1,), 6.0)
@@ -482,6 +491,7 @@ def test_frames_that_were_dropped_here_are_named() -> None:
 def test_send_error_that_lasts_is_named_while_the_client_sends(daemon: Daemon, url: str) -> None:
     """Whichever error it is: nothing else shows that one direction is blocked."""
     endpoint: Any = SimpleNamespace(name="ground", ports=[SimpleNamespace(name="192.0.2.1:1")], frames_sent=0)
+    endpoint.signing = None
     endpoint.counters, endpoint.failures = SplitCounters(), Counter[str]()
     daemon.local.append(endpoint)
     daemon.parts.config.endpoints.append(SimpleNamespace(name="ground", url=parse_url(url), policy={}))
@@ -490,3 +500,50 @@ def test_send_error_that_lasts_is_named_while_the_client_sends(daemon: Daemon, u
         endpoint.failures["EMSGSIZE"] += 1
         daemon.history.sample([], [(endpoint, Policy({}, is_local=True))], float(now))
         assert ("send_fails" in daemon.findings(float(now))) == (now >= 5)
+
+
+@pytest.mark.parametrize(
+    ("drop", "is_heard", "is_proven", "says"),
+    [
+        ("unsigned", False, True, "does not sign"),
+        ("bad_signature", False, False, "signs with another key"),
+        ("not_proven", True, False, "answers no question"),
+        ("unsigned", True, True, ""),  # those of another client
+    ],
+)
+def test_autopilot_that_does_not_prove_its_key(
+    daemon: Daemon, drop: str, is_heard: bool, is_proven: bool, says: str
+) -> None:
+    """Once it lasts. What others send to an endpoint whose autopilot signs is only counted."""
+    daemon.parts.config.endpoints.append(config := EndpointConfig("autopilot", parse_url("udpin:127.0.0.1:14550")))
+    daemon.local.append(endpoint := made_up_endpoint(config))
+    endpoint.signing = SimpleNamespace(is_open=False, is_proven=is_proven, signers=[1], autopilots={})
+    for _ in range(7):
+        daemon.now += 1.0
+        endpoint.counters.frames += 1
+        endpoint.failures[drop] += 1
+        endpoint.signing.autopilots = {1: Heard(daemon.now, False, True)} if is_heard else {}
+        daemon.sample()
+    finding = daemon.findings().get("autopilot_unverified")
+    assert (finding is not None) == bool(says)
+    assert finding is None or (says in finding.text and stop_frames([finding]))
+    endpoint.signing.is_open = True  # its first key is being set up
+    assert "autopilot_unverified" not in daemon.findings()
+
+
+def test_senders_and_keys_that_are_too_many(daemon: Daemon) -> None:
+    """Frames without a signature for 10 s; two keys in memory, or in the files that the next start reads."""
+    config = EndpointConfig("autopilot", parse_url("udpin:127.0.0.1:14550"))
+    daemon.parts.config.endpoints.append(config)
+    daemon.local.append(endpoint := made_up_endpoint(config))
+    endpoint.signing = SimpleNamespace(is_open=False, is_proven=True, signers=[1, 2], autopilots={})
+    endpoint.failures["too_many_senders"] += 3
+    daemon.sample()
+    findings = daemon.findings()
+    assert findings["too_many_senders"].text.startswith("3 frames to autopilot got no signature")
+    assert "run `uavlinkd signing rotate` again" in findings["key_change_interrupted"].remedy
+    endpoint.signing.signers = [2]
+    assert not {"too_many_senders", "key_change_interrupted"} & set(daemon.findings(daemon.now + 11))
+    both = SigningConfig((Secret(bytes(32)), Secret(bytes(31) + b"1")))
+    daemon.parts.config.endpoints[:] = [replace(config, signing=both)]
+    assert "key_change_interrupted" in daemon.findings()

@@ -232,3 +232,15 @@ def test_relay_shows_its_members_those_that_are_down_first() -> None:
     https["refused"] = {}
     assert "refused so far" not in words(render_status(status_of({}, relay=relay)))
     assert "endpoint" not in text
+
+
+@pytest.mark.parametrize(("is_verified", "says"), [(True, "proved"), (False, "has not proved")])
+def test_an_endpoint_that_signs_has_a_line(is_verified: bool, says: str) -> None:
+    """An endpoint without a key has none."""
+    plain: dict[str, Any] = {"clients": {}, "frames_received": 0, "frames_sent": 0, "signing": None}
+    plain |= {"faults": {}, "failures": {}, "refused": {}}
+    signing = plain | {"signing": {"is_verified": is_verified, "link_id": 7}, "failures": {"bad_signature": 3}}
+    text = words(render_status(status_of({}, endpoints={"autopilot": signing, "gcs": plain})))
+    assert f"autopilot signing: the autopilot {says} the key, link id 7" in text
+    assert "3 frames with a wrong signature" in text
+    assert "gcs signing" not in text

@@ -274,7 +274,7 @@ def used_relay_status(relay: RelayLink, daemon: DaemonParts, now: float) -> dict
 
 
 def endpoint_status(endpoint: Endpoint, policy: Policy, now: float) -> dict[str, object]:
-    """The status of a local endpoint and its clients."""
+    """The status of a local endpoint and its clients. ``signing``: whether its autopilot proved the key."""
     return {
         "clients": {port.name: {"last_received_s": _age(port.received_at, now)} for port in endpoint.ports},
         "frames_received": endpoint.counters.frames,
@@ -285,6 +285,9 @@ def endpoint_status(endpoint: Endpoint, policy: Policy, now: float) -> dict[str,
         "garbage_bytes": endpoint.counters.garbage_bytes,
         "faults": _counts(endpoint.counters.faults),
         "failures": dict(endpoint.failures),
+        "signing": None
+        if (signing := endpoint.signing) is None
+        else {"is_verified": signing.is_proven, "link_id": signing.link_id},
         **_refusals(policy),
     }
 

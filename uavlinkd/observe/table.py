@@ -365,6 +365,23 @@ OF_ENDPOINT: Final = (
         code=3,
     ),
     Row(
+        *("autopilot_unverified", FAULT, traffic_signs.autopilot_unverified),
+        "no frame passes to or from {url}, because none has a valid signature that is new: the autopilot {what}",
+        "{advice}",
+        Exit.FAILED,
+    ),
+    Row(
+        *("too_many_senders", WARNING, traffic_signs.too_many_senders),
+        "{count:,} frames to {who} got no signature: its autopilot remembers 16 senders, and more send to it",
+        "let fewer systems and components send to it, by system_ids and roles; then restart this daemon and the"
+        " autopilot, which forget all senders",
+    ),
+    Row(
+        *("key_change_interrupted", WARNING, traffic_signs.key_change_interrupted),
+        "a change of its signing key did not end, and two keys are in force",
+        "run `uavlinkd signing rotate` again: it uses the same new key",
+    ),
+    Row(
         *("station_unverified", FAULT, traffic_signs.station_unverified),
         "commands of {who} are dropped, because nothing shows that they are new: its firewall drops pings from"
         " {address}, or an attacker delays its datagrams. Reports pass",

@@ -234,6 +234,43 @@ def station_unverified(endpoint: EndpointFacts) -> Signs:
         yield {"address": stations.address if stations else ""}
 
 
+def autopilot_unverified(endpoint: EndpointFacts) -> Signs:
+    """Frames come, and its autopilot does not prove the key: nothing passes."""
+    signing, lasting = endpoint.endpoint.signing, endpoint.history.failures.lasting(endpoint.now)
+    if signing is None or signing.is_open:
+        return
+    is_signed = any(heard.is_signed and endpoint.now - heard.at < SILENT_S for heard in signing.autopilots.values())
+    if not is_signed and "bad_signature" in lasting:
+        yield {
+            "what": "signs with another key",
+            "advice": "write the file of that key; or remove it there, over USB, and run `uavlinkd signing setup`",
+        }
+    elif not is_signed and "unsigned" in lasting:
+        yield {
+            "what": "does not sign, or its frames are another sender's",
+            "advice": "run `uavlinkd signing setup`, which hands it the key of this endpoint",
+        }
+    elif is_signed and not signing.is_proven and "not_proven" in lasting:
+        yield {
+            "what": "signs, and answers no question of this daemon: the direction to it is cut",
+            "advice": "look at the wire from here to it, and at its baud rate",
+        }
+
+
+def too_many_senders(endpoint: EndpointFacts) -> Signs:
+    """More systems and components send to the autopilot than it can tell apart."""
+    drops = endpoint.history.failures.within(REFUSED_S, endpoint.now)
+    if count := sum(drops.get(reason, 0) for reason in ("too_many_senders", "too_many_reporters")):
+        yield {"count": count}
+
+
+def key_change_interrupted(endpoint: EndpointFacts) -> Signs:
+    """Two keys are in force: in memory, or in the files that the next start reads."""
+    signing = endpoint.endpoint.signing
+    if signing is not None and max(len(signing.signers), len(endpoint.config.signing.keys)) > 1:
+        yield {}
+
+
 def send_fails(endpoint: EndpointFacts) -> Signs:
     """An error of the kernel that lasts: nothing else shows that one direction is blocked."""
     url, failures = endpoint.config.url, endpoint.history.failures

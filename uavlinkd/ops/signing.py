@@ -104,8 +104,7 @@ class _Place:
 
     def ask(self, action: str, key: str = "") -> dict[str, Any]:
         """The daemon's answer: an empty ``problem`` if it is done. Raises ControlError."""
-        link_id = self._section.get("signing_link_id", 1)
-        request = {"action": action, "endpoint": self.endpoint, "key": key, "link_id": link_id}
+        request = {"action": action, "endpoint": self.endpoint, "key": key}
         try:
             answer = ask(self.socket, f"signing {json.dumps(request)}", _TIMEOUT_S)
         except ControlError as error:

@@ -41,6 +41,7 @@ def render_status(status: Status) -> RenderableType:
     relay = status["relay"]
     if relay is None or words.peers_of(status) or status["endpoints"]:
         parts += [_peers(status), *map(Text, _problems(status)), _endpoints(status)]
+        parts += [_said(line) for line in words.signing_lines(status)]
     if relay is not None:
         parts.append(_members(relay))
         if (https := relay["https"]) is not None:

@@ -36,6 +36,14 @@ ENDPOINT_FAILURES: Final[Mapping[str, str]] = {
     "family_unavailable": "addresses of an unavailable family",
     "stranger": "datagrams of another address",
     "other_port": "datagrams of another port of the client's host",
+    "unsigned": "unsigned frames",
+    "bad_signature": "frames with a wrong signature",
+    "replayed": "signed frames with an old timestamp",
+    "not_proven": "frames before the autopilot proved its key",
+    "mavlink1_not_signed": "MAVLink 1 frames, which have no signatures",
+    "too_many_senders": "frames of more senders than an autopilot remembers",
+    "too_many_reporters": "reports of more senders than an autopilot remembers",
+    "no_timestamp": "frames behind the last timestamp that there is",
 }
 """Errors of an endpoint that the daemon names itself; the others are names of the kernel."""
 _NOT_USABLE: Final = {"unanswered": "no answer", "loss": "loss", "network": "no network"}
@@ -259,6 +267,16 @@ def overtaken(peer: Status) -> str:
 def endpoint_drops(endpoint: Status) -> list[Count]:
     """All reasons of a local endpoint."""
     return by_count(endpoint["faults"], FrameFault) + by_count(endpoint["failures"]) + _refused(endpoint)
+
+
+def signing_lines(status: Status) -> Iterator[Phrase]:
+    """Each endpoint that signs, and whether its autopilot proved the key."""
+    for name, endpoint in status["endpoints"].items():
+        if (signing := endpoint["signing"]) is not None:
+            result = (
+                "the autopilot proved the key" if signing["is_verified"] else "the autopilot has not proved the key"
+            )
+            yield Phrase(f"{name} signing: {result}, link id {signing['link_id']}", signing["is_verified"])
 
 
 def _refused(part: Status) -> list[Count]:
