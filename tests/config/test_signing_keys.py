@@ -25,10 +25,10 @@ def _write(folder: Path, name: str, byte: int) -> Secret:
 def test_key_of_a_change_follows_the_key_in_force(tmp_path: Path) -> None:
     """A daemon that starts in the middle of a rotation knows both."""
     old = _write(tmp_path, "autopilot.key", 1)
-    assert load(tmp_path, SIGNED).endpoints[0].signing == SigningConfig((old,), 1)
+    assert load(tmp_path, SIGNED).endpoints[0].signing == SigningConfig((old,))
     new = _write(tmp_path, "autopilot.key.new", 2)
-    text = SIGNED.replace(LINE, LINE + "signing_link_id = 7\n")
-    assert load(tmp_path, text).endpoints[0].signing == SigningConfig((old, new), 7)
+    text = SIGNED.replace(LINE, LINE + "signing_link_id = 77\n")
+    assert load(tmp_path, text).endpoints[0].signing == SigningConfig((old, new), 77)
     assert load(tmp_path, GOOD).endpoints[0].signing == SigningConfig()
 
 
@@ -55,7 +55,7 @@ def test_link_id_has_one_endpoint(tmp_path: Path) -> None:
     two = HEAD + ENDPOINT + LINE + GCS.replace("14550", "14551") + LINE
     place = "endpoint[1].signing_link_id (gcs)"
     assert "in use by endpoint[0] (autopilot)" in refused(tmp_path, two + PEER)[place]
-    assert len(load(tmp_path, two + "signing_link_id = 2\n" + PEER).endpoints) == 2
+    assert len(load(tmp_path, two + "signing_link_id = 22\n" + PEER).endpoints) == 2
 
 
 @pytest.mark.parametrize(("name", "lines"), [("drone0.key", ""), ("pair.psk", 'psk_file = "pair.psk"\n')])
@@ -68,6 +68,6 @@ def test_signing_needs_a_restart(tmp_path: Path) -> None:
     """A reload keeps an endpoint's keys and link id."""
     _write(tmp_path, "autopilot.key", 1)
     before = load(tmp_path, SIGNED)
-    for text in (GOOD, SIGNED.replace(LINE, LINE + "signing_link_id = 2\n")):
+    for text in (GOOD, SIGNED.replace(LINE, LINE + "signing_link_id = 22\n")):
         with pytest.raises(ConfigError, match=r"endpoint: has changed.*restart"):
             compare(before, load(tmp_path, text))

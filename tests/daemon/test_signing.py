@@ -20,6 +20,7 @@ from tests.mavlink.signing.wire import KEY, OTHER
 from tests.samples import pack
 from tests.waiting import until
 from uavlinkd.config.keys import encode_key
+from uavlinkd.config.model import LINK_ID
 from uavlinkd.daemon.daemon import Daemon
 from uavlinkd.io.url import EndpointKind, NetworkUrl, SerialUrl
 from uavlinkd.protocol.crypto import Secret
@@ -94,7 +95,7 @@ class Pair:
 
     async def ask(self, action: str, key: Secret | None = KEY, endpoint: str = "client") -> dict[str, Any]:
         text = "" if key is None else encode_key(key.reveal())
-        request = {"action": action, "endpoint": endpoint, "key": text}
+        request = {"action": action, "endpoint": endpoint, "key": text, "link_id": LINK_ID}
         answer = await self.vehicle.answer(f"signing {json.dumps(request)}")
         assert answer is not None
         return answer

@@ -17,6 +17,7 @@ from tests.killed_commands import KILLED, Stage
 from uavlinkd.cli import main
 from uavlinkd.config import keys
 from uavlinkd.config.load import load_config
+from uavlinkd.config.model import LINK_ID
 from uavlinkd.ops.control import ControlServer, ask
 
 CONFIG = """name = "drone1"
@@ -54,7 +55,7 @@ def made_up_daemon(
     def respond(line: str) -> dict[str, object]:
         word, _, text = line.partition(" ")
         if word == "status":
-            return {"endpoints": {"autopilot": {"signing": {"link_id": 1} if seen["key"] else None}}}
+            return {"endpoints": {"autopilot": {"signing": {"link_id": LINK_ID} if seen["key"] else None}}}
         if word == "signing":
             request = json.loads(text)
             seen["requests"].append(request)
@@ -122,7 +123,7 @@ def test_key_is_set_up_changed_and_cleared(tmp_path: Path, capsys: pytest.Captur
         assert (path.read_text(), key_files(tmp_path)) == (CONFIG, {})
         requests = seen()["requests"]
     assert [request["action"] for request in requests] == ["setup", "setup", "rotate", "clear"]
-    assert all(request["endpoint"] == "autopilot" for request in requests)
+    assert all(request["endpoint"] == "autopilot" and request["link_id"] == LINK_ID for request in requests)
     out, err = capsys.readouterr()
     assert err == ""
     assert first not in out

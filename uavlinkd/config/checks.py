@@ -145,7 +145,7 @@ def _signing(file: File) -> Found:
         for other in before:
             is_shared = any(secret in secrets for secret in other.get("signing_key_file") or ())
             if is_shared and other.get("signing_link_id") == endpoint.get("signing_link_id"):
-                text = f"is in use by {other.at()} with the same key: write another one, 1 to 255"
+                text = f"is in use by {other.at()} with the same key: write another one, 16 to 255"
                 yield endpoint.at("signing_link_id"), text
         before.append(endpoint)
 

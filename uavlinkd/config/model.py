@@ -6,7 +6,7 @@ import socket
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from uavlinkd.authority.certificates import MemberRole
 from uavlinkd.io.url import EndpointKind, EndpointUrl, SerialUrl
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from uavlinkd.authority.trust import HeldCertificate
     from uavlinkd.relay.forwarding import MemberSettings
 
+LINK_ID: Final = 100
+"""A daemon's number in its signatures, by default. Autopilots number their own ports from 0."""
 SERIAL = Address(SERIAL_HOST, 0)  # the other end of a serial network
 PolicyData = Mapping[str, object]
 """A policy as immutable plain data. :mod:`uavlinkd.mavlink.policy.compilation` documents its keys."""
@@ -55,11 +57,11 @@ class SigningConfig:
     """MAVLink message signing with the autopilot at an endpoint.
 
     ``keys``: the key in force; none: frames pass unsigned. While a change of the key goes on, the new key follows it.
-    ``link_id``: the number of this daemon's stream in its signatures, 1 to 255.
+    ``link_id``: the number of this daemon's stream in its signatures, 16 to 255.
     """
 
     keys: tuple[Secret, ...] = ()
-    link_id: int = 1
+    link_id: int = LINK_ID
 
 
 @dataclass(frozen=True, slots=True)

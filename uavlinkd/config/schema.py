@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from uavlinkd.authority.certificates import LAST_SERIAL, parse_bulletin, parse_certificate
 from uavlinkd.config.keys import decode_key, is_canonical_public_key
-from uavlinkd.config.model import SERIAL, HttpsServer, PeerAddress
+from uavlinkd.config.model import LINK_ID, SERIAL, HttpsServer, PeerAddress
 from uavlinkd.config.section import Choice, Key, Keys, Kind, Number, anything, boolean, each, integer, text
 from uavlinkd.io.url import parse_line, parse_url
 from uavlinkd.mavlink.egress.peer_egress import EgressSettings
@@ -248,7 +248,7 @@ REPEATED: Final[dict[str, Keys]] = {
         "radio_status": Key(boolean, False),
         "status_text": Key(boolean, False),
         "signing_key_file": Key(_file_name, None, '"autopilot.key"'),
-        "signing_link_id": Key(integer(1, 255), 1),
+        "signing_link_id": Key(integer(16, 255), LINK_ID),
         **POLICY,
     },
     "peer": {

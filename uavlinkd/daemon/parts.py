@@ -166,7 +166,7 @@ class DaemonParts:
         """The signatures between this daemon and its autopilots: made when an endpoint or a person wants them."""
         from uavlinkd.daemon.signing import AutopilotSigning  # noqa: PLC0415
 
-        return AutopilotSigning(self.local, self.config)
+        return AutopilotSigning(self.local)
 
     def _tls(self) -> WebRelays | None:
         if not any(written.address.resource for relay in self.config.relays for written in relay.addresses):

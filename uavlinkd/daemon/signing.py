@@ -10,11 +10,10 @@ import asyncio
 import json
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from typing import Final
 
 from uavlinkd.config.keys import decode_key
-from uavlinkd.config.model import Config, EndpointConfig, SigningConfig
+from uavlinkd.config.model import EndpointConfig, SigningConfig
 from uavlinkd.daemon.local_endpoints import LocalEndpoints
 from uavlinkd.io.ports import Endpoint, LocalPort
 from uavlinkd.mavlink.frames import Frame
@@ -46,8 +45,8 @@ _UNKNOWN: Final[dict[str, object]] = {
 class AutopilotSigning:
     """The signing at the endpoints of one daemon: each has an :class:`.EndpointSigning`, or none."""
 
-    def __init__(self, local: LocalEndpoints, config: Config) -> None:
-        self._local, self._config = local, config
+    def __init__(self, local: LocalEndpoints) -> None:
+        self._local = local
         self._is_changing = False
 
     def install(self, endpoint: Endpoint, config: EndpointConfig) -> None:
@@ -74,7 +73,7 @@ class AutopilotSigning:
     # Changes.
 
     async def answer(self, wish: str) -> dict[str, object]:
-        """Change a key. ``wish``: ``action``, ``endpoint`` and ``key`` as JSON.
+        """Change a key. ``wish``: ``action``, ``endpoint``, ``key`` and ``link_id`` as JSON.
 
         The answer has a ``problem``, or nothing there. ``is_changed``: whether the autopilot has the new key; None if
         that is not known.
@@ -88,17 +87,16 @@ class AutopilotSigning:
         self._is_changing = True
         try:
             key = Secret(decode_key(asked["key"])) if asked["key"] else None
-            return await self._change(endpoint, asked["action"], key)
+            return await self._change(endpoint, asked["action"], key, asked["link_id"])
         finally:
             self._is_changing = False
 
-    async def _change(self, endpoint: Endpoint, action: str, key: Secret | None) -> dict[str, object]:
+    async def _change(self, endpoint: Endpoint, action: str, key: Secret | None, link_id: int) -> dict[str, object]:
         signing = endpoint.signing
         if signing is None:
             if key is None or action != "setup":
                 return _nothing(f"the daemon does not sign at {endpoint.name}: `uavlinkd signing setup` begins it")
-            config = next(one.signing for one in self._config.endpoints if one.name == endpoint.name)
-            signing = self._install(endpoint, replace(config, keys=(key,)), is_open=True)
+            signing = self._install(endpoint, SigningConfig((key,), link_id), is_open=True)
         is_new = signing.is_open
         if is_new:
             await _until(lambda: signing.is_proven, LISTENS_S)

@@ -17,7 +17,7 @@ from typing import Any, Final
 from uavlinkd.config import keys
 from uavlinkd.config.edit import environ_of, keep_owner, replace_valid, trial
 from uavlinkd.config.load import load_config, read_toml
-from uavlinkd.config.model import Config
+from uavlinkd.config.model import LINK_ID, Config
 from uavlinkd.io.url import EndpointKind
 from uavlinkd.ops.commands import control_socket
 from uavlinkd.ops.control import ControlError, ask
@@ -104,7 +104,8 @@ class _Place:
 
     def ask(self, action: str, key: str = "") -> dict[str, Any]:
         """The daemon's answer: an empty ``problem`` if it is done. Raises ControlError."""
-        request = {"action": action, "endpoint": self.endpoint, "key": key}
+        link_id = self._section.get("signing_link_id", LINK_ID)
+        request = {"action": action, "endpoint": self.endpoint, "key": key, "link_id": link_id}
         try:
             answer = ask(self.socket, f"signing {json.dumps(request)}", _TIMEOUT_S)
         except ControlError as error:

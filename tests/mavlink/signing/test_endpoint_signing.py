@@ -72,6 +72,15 @@ def test_unsigned_forged_and_replayed_frames() -> None:
     assert wire.drops[SigningDrop.UNSIGNED] == wire.drops[SigningDrop.BAD_SIGNATURE] == 1
 
 
+def test_frames_that_somebody_on_the_cable_returns() -> None:
+    """What this end signed is no frame of the autopilot."""
+    wire = Wire(with_key())
+    wire.second()
+    assert wire.to_autopilot(command())
+    assert not wire.to_daemon(wire.sent[-1])
+    assert wire.drops[SigningDrop.REFLECTED] == 1
+
+
 def test_recorded_frames_prove_nothing_after_a_restart() -> None:
     """A new daemon accepts no frame that was recorded before it, earlier answers included."""
     wire = Wire(with_key())

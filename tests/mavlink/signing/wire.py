@@ -8,6 +8,7 @@ from random import Random
 
 from tests.mavlink.signing.autopilot import Autopilot
 from tests.samples import read
+from uavlinkd.config.model import LINK_ID
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.mavlink.signing.endpoint_signing import EndpointSigning
 from uavlinkd.protocol.crypto import Secret
@@ -26,6 +27,8 @@ class Wire:
         self.now = 0.0
         self.recorded: list[bytes] = []
         """Everything that the autopilot sent."""
+        self.sent: list[bytes] = []
+        """Everything that the daemon sent."""
         self.passed: list[Frame] = []
         """What the daemon accepted from the autopilot."""
         self._random = Random(1)
@@ -33,7 +36,7 @@ class Wire:
 
     def daemon_starts(self, keys: Sequence[Secret] = (KEY,), *, is_open: bool = False) -> EndpointSigning:
         """A daemon that remembers nothing of the one before."""
-        signing = EndpointSigning(keys, 1, self._random.randbytes, self.drops, is_open=is_open)
+        signing = EndpointSigning(keys, LINK_ID, self._random.randbytes, self.drops, is_open=is_open)
         signing.send = lambda raw: self.to_autopilot(raw, self)
         self.signing = signing
         return signing
@@ -43,6 +46,7 @@ class Wire:
         signed = self.signing.sign(read(raw), source)
         if signed is None:
             return False
+        self.sent.append(signed.raw)
         for answer in self.autopilot.receive(signed.raw):
             self.to_daemon(answer)
         return True

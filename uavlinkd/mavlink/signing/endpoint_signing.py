@@ -20,7 +20,7 @@ from struct import Struct
 from typing import Final, NamedTuple
 
 from uavlinkd.mavlink.dialect import IDS
-from uavlinkd.mavlink.frames import MAVLINK2, Frame, pack, payload_bytes
+from uavlinkd.mavlink.frames import MAVLINK2, SIGNATURE_BYTES, Frame, pack, payload_bytes
 from uavlinkd.mavlink.own_frames import RADIO_COMPONENT, RADIO_SYSTEM
 from uavlinkd.mavlink.payloads import HEARTBEAT, claims_to_be_ground_station, may_be_old
 from uavlinkd.mavlink.signing.signature import (
@@ -62,6 +62,7 @@ class SigningDrop(StrEnum):
     UNSIGNED = "unsigned"
     BAD_SIGNATURE = "bad_signature"
     REPLAYED = "replayed"
+    REFLECTED = "reflected"
     NOT_PROVEN = "not_proven"  # this end asked, and no answer has come yet
     MAVLINK1 = "mavlink1_not_signed"
     TOO_MANY_SENDERS = "too_many_senders"
@@ -177,6 +178,9 @@ class EndpointSigning:
             timestamp, stream = timestamp_of(raw), stream_of(raw)
             last = self._streams.get(stream)
             is_current = self.is_proven and signer is self.signer
+            if raw[-SIGNATURE_BYTES] == self.link_id:  # this end's own, and somebody on the cable returned it
+                self._drops[SigningDrop.REFLECTED] += 1
+                continue
             if is_current and timestamp <= (self._floor if last is None else last):
                 self._drops[SigningDrop.REPLAYED] += 1
                 asks = signer

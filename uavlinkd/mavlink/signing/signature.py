@@ -23,8 +23,6 @@ from uavlinkd.mavlink.frames import MAVLINK2, SIGNATURE_BYTES
 from uavlinkd.protocol.crypto import Secret
 
 LAST_TIMESTAMP: Final = 2**48 - 1
-MINUTE: Final = 6_000_000
-"""A minute, in timestamps."""
 _DIGEST_BYTES: Final = 6
 _SIGNED: Final = 1  # in incompat_flags
 _REST: Final = 8
