@@ -161,7 +161,7 @@ def test_no_schedule_of_an_attacker_makes_a_command_older(seed: int, *, answers:
             world.commands(seconds)
         else:
             world.run(world.now + seconds)
-        assert world.indices.count <= 4
+        assert len(world.indices) <= 4
     decisions.clear()
     world.commands(20.0)
     assert oldest(world) <= MOST_AGE_S

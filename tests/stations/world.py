@@ -11,7 +11,7 @@ from itertools import count
 from tests.stations.client import Client
 from uavlinkd.protocol.drops import Drop, DropReason
 from uavlinkd.stations import handshake, inner
-from uavlinkd.stations.tunnel import Tunnel, TunnelIndices
+from uavlinkd.stations.tunnel import Tunnel
 
 THERE = ("203.0.113.7", 40001)
 
@@ -26,7 +26,7 @@ class World:
         self.own = handshake.StationKey(entropy(32))
         self.client = Client(self.own.key.public, host, daemon_host)
         self.numbers = count(1)
-        self.indices = TunnelIndices(entropy)
+        self.indices: dict[int, Tunnel] = {}
         self._ends = inner.Ends.of(host, daemon_host)
         self.tunnel = self._new_tunnel()
         self.there = THERE
@@ -50,7 +50,7 @@ class World:
     def restart_daemon(self) -> None:
         """The daemon ends and starts: it knows where the station was, and initiates there."""
         at = self.tunnel.address
-        self.indices = TunnelIndices(self.random.randbytes)
+        self.indices = {}
         self.tunnel = self._new_tunnel()
         self.tunnel.address = at
         self.from_daemon(self.tunnel.initiate(self.now))
@@ -78,11 +78,9 @@ class World:
                     self.from_daemon([self.tunnel.on_initiation(initiation, self.now)], self.there)
                 case 2:
                     index = int.from_bytes(datagram[8:12], "little")
-                    self.indices.get(index)
                     self.from_daemon(self.tunnel.on_response(datagram, index, self.now))
                 case 4:
                     index = int.from_bytes(datagram[4:8], "little")
-                    self.indices.get(index)
                     opened = self.tunnel.open(datagram, index, self.there, self.now)
                     content = inner.parse(opened.packet, self.tunnel.ends) if opened.packet else None
                     if isinstance(content, inner.Datagram):

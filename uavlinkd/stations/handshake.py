@@ -19,7 +19,7 @@ from uavlinkd.protocol import constants as c
 from uavlinkd.protocol.crypto import AeadKey, Entropy, KeyPair, equal
 from uavlinkd.protocol.drops import Drop, DropReason
 from uavlinkd.protocol.path import Path
-from uavlinkd.stations.primitives import MAC_BYTES, XNONCE_BYTES, blake2, hkdf, mac, open_cookie, seal_cookie
+from uavlinkd.stations.primitives import MAC_BYTES, XNONCE_BYTES, blake2, hkdf, mac, xchacha
 
 INITIATION: Final = b"\1\0\0\0"
 RESPONSE: Final = b"\2\0\0\0"
@@ -61,11 +61,13 @@ class Macs:
 
     def seal(self, cookie: bytes, nonce: bytes, mac1: bytes) -> bytes:
         """The cookie for the sender of the message that carried ``mac1``."""
-        return seal_cookie(self._cookie, nonce, cookie, mac1)
+        key, counter = xchacha(self._cookie, nonce)
+        return key.seal(counter, cookie, mac1)
 
     def open(self, reply: bytes, mac1: bytes) -> bytes:
         """The cookie in a reply to a message that carried ``mac1``. Raises ``BAD_COOKIE``."""
-        cookie = open_cookie(self._cookie, reply[8 : 8 + XNONCE_BYTES], reply[8 + XNONCE_BYTES :], mac1)
+        key, counter = xchacha(self._cookie, reply[8 : 8 + XNONCE_BYTES])
+        cookie = key.open(counter, reply[8 + XNONCE_BYTES :], mac1)
         if cookie is None:
             raise Drop(DropReason.BAD_COOKIE)
         return cookie

@@ -7,6 +7,7 @@ the sender left it out (RFC 768 permits 0, and no known client sends it).
 
 from __future__ import annotations
 
+from functools import lru_cache
 from ipaddress import ip_address
 from struct import Struct
 from typing import Final, NamedTuple
@@ -17,7 +18,9 @@ MOST_PAYLOAD_BYTES: Final = MTU - 48
 """Of a UDP datagram over IPv6, in one packet."""
 TOKEN_BYTES: Final = 16
 """Random bytes in an echo request of this daemon."""
-_UDP, _ICMP, _ICMP6 = 17, 1, 58
+_UDP: Final = 17
+_ICMP: Final = {4: 1, 6: 58}
+"""The protocol of echo requests, by IP version."""
 _ECHO: Final = {4: (8, 0), 6: (128, 129)}
 """Types of an echo request and its answer, by IP version."""
 _CLOSED: Final = {4: (3, 3), 6: (1, 4)}
@@ -76,17 +79,14 @@ def parse(packet: bytes, ends: Ends) -> Datagram | Ping | Closed | None:
     if body is None:
         return None
     protocol, content = body
-    pseudo = ends.station + ends.daemon
+    if len(content) < _UDP_HEADER.size or _sum(content, _pseudo(ends, protocol, len(content))):
+        return None  # ICMP has a header of the same length
     if protocol == _UDP:
-        if len(content) < _UDP_HEADER.size:
-            return None
         source_port, port, length, checksum = _UDP_HEADER.unpack_from(content)
-        if length != len(content) or not checksum or not source_port or _sum(_pseudo(pseudo, _UDP, content)):
+        if length != len(content) or not checksum or not source_port:
             return None
         return Datagram(source_port, port, content[_UDP_HEADER.size :])
-    if protocol != (_ICMP if ends.version == 4 else _ICMP6) or len(content) < 8:
-        return None
-    if _sum(content if ends.version == 4 else _pseudo(pseudo, _ICMP6, content)):
+    if protocol != _ICMP[ends.version]:
         return None
     kind = content[0], content[1]
     if kind == _CLOSED[ends.version]:
@@ -118,46 +118,35 @@ def _ipv6_body(packet: bytes, ends: Ends) -> tuple[int, bytes] | None:
 def udp(ends: Ends, port: int, to_port: int, payload: bytes) -> bytes:
     """A packet with a UDP datagram from a port of the daemon to a port of the station."""
     length = _UDP_HEADER.size + len(payload)
-    content = _UDP_HEADER.pack(port, to_port, length, 0) + payload
-    checksum = _sum(_pseudo(ends.daemon + ends.station, _UDP, content)) or 0xFFFF
-    return _packet(ends, _UDP, content[:6] + checksum.to_bytes(2, "big") + payload)
+    header, total = _head(ends, _UDP, length)
+    checksum = _sum(payload, total + length + port + to_port) or 0xFFFF
+    return header + _UDP_HEADER.pack(port, to_port, length, checksum) + payload
 
 
-def question(ends: Ends, token: bytes) -> bytes:
-    """A packet with an echo request of the daemon."""
-    return _echo(ends, is_answer=False, content=bytes(4) + token)
+def echo(ends: Ends, content: bytes, *, is_answer: bool) -> bytes:
+    """A packet with an echo request of the daemon or an answer; ``content`` begins with the identifier and number."""
+    kind = bytes([_ECHO[ends.version][is_answer], 0])
+    header, total = _head(ends, _ICMP[ends.version], len(kind) + 2 + len(content))
+    return header + kind + _sum(kind + b"\0\0" + content, total).to_bytes(2, "big") + content
 
 
-def answer(ends: Ends, request: Ping) -> bytes:
-    """A packet with the answer to an echo request of the station."""
-    return _echo(ends, is_answer=True, content=request.content)
-
-
-def _echo(ends: Ends, *, is_answer: bool, content: bytes) -> bytes:
-    kind = _ECHO[ends.version][is_answer]
-    protocol = _ICMP if ends.version == 4 else _ICMP6
-    message = bytes([kind, 0, 0, 0]) + content
-    summed = message if protocol == _ICMP else _pseudo(ends.daemon + ends.station, protocol, message)
-    return _packet(ends, protocol, message[:2] + _sum(summed).to_bytes(2, "big") + content)
-
-
-def _packet(ends: Ends, protocol: int, content: bytes) -> bytes:
+@lru_cache(1024)
+def _head(ends: Ends, protocol: int, length: int) -> tuple[bytes, int]:
+    """The header of a packet to the station with so many bytes behind it, and what they add to the checksum there."""
+    pseudo, addresses = _pseudo(ends, protocol, length), (ends.daemon, ends.station)
     if ends.version == 6:
-        return _IPV6.pack(6 << 28, len(content), protocol, _HOPS, ends.daemon, ends.station) + content
-    length, addresses = _IPV4.size + len(content), (ends.daemon, ends.station)
-    header = _IPV4.pack(0x45, 0, length, 0, _DONT_FRAGMENT, _HOPS, protocol, 0, *addresses)
-    return _IPV4.pack(0x45, 0, length, 0, _DONT_FRAGMENT, _HOPS, protocol, _sum(header), *addresses) + content
+        return _IPV6.pack(6 << 28, length, protocol, _HOPS, *addresses), pseudo
+    fields = 0x45, 0, _IPV4.size + length, 0, _DONT_FRAGMENT, _HOPS, protocol
+    return _IPV4.pack(*fields, _sum(_IPV4.pack(*fields, 0, *addresses)), *addresses), pseudo
 
 
-def _pseudo(addresses: bytes, protocol: int, content: bytes) -> bytes:
-    """The content behind the pseudo header over which UDP and ICMPv6 compute their checksums."""
-    return addresses + len(content).to_bytes(4, "big") + bytes([0, 0, 0, protocol]) + content
+def _pseudo(ends: Ends, protocol: int, length: int) -> int:
+    """The sum over the pseudo header of UDP and ICMPv6; ICMP has none. It is the same in both directions."""
+    return 0 if protocol == _ICMP[4] else int.from_bytes(ends.station + ends.daemon, "big") + protocol + length
 
 
-def _sum(data: bytes) -> int:
-    """The Internet checksum (RFC 1071): 0 over data that has a valid one."""
-    if len(data) % 2:
-        data += b"\0"
+def _sum(data: bytes, more: int = 0) -> int:
+    """The Internet checksum (RFC 1071) over data and words that sum up to ``more``: 0 if they have a valid one."""
     # The number of all bytes is, modulo 65,535, the sum of its words.
-    total = int.from_bytes(data, "big") % 0xFFFF
-    return 0xFFFF - total if total or not any(data) else 0
+    number = more + int.from_bytes(data + b"\0" if len(data) % 2 else data, "big")
+    return -number % 0xFFFF if number else 0xFFFF

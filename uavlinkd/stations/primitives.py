@@ -10,10 +10,10 @@ from hashlib import blake2s
 from struct import Struct
 from typing import Final
 
-from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.ciphers import Cipher
-from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 from cryptography.hazmat.primitives.ciphers.algorithms import ChaCha20
+
+from uavlinkd.protocol.crypto import AeadKey
 
 MAC_BYTES: Final = 16
 """The length of mac1, mac2 and a cookie."""
@@ -41,25 +41,9 @@ def hkdf(key: bytes, material: bytes, outputs: int) -> list[bytes]:
     return blocks
 
 
-def seal_cookie(key: bytes, nonce: bytes, cookie: bytes, associated: bytes) -> bytes:
-    """Ciphertext and tag of XChaCha20-Poly1305 (draft-irtf-cfrg-xchacha, section 2.3)."""
-    return _xchacha(key, nonce).encrypt(_inner_nonce(nonce), cookie, associated)
-
-
-def open_cookie(key: bytes, nonce: bytes, sealed: bytes, associated: bytes) -> bytes | None:
-    """The plaintext, or None if the tag does not verify."""
-    try:
-        return _xchacha(key, nonce).decrypt(_inner_nonce(nonce), sealed, associated)
-    except InvalidTag:
-        return None
-
-
-def _inner_nonce(nonce: bytes) -> bytes:
-    return bytes(4) + nonce[16:]
-
-
-def _xchacha(key: bytes, nonce: bytes) -> ChaCha20Poly1305:
-    return ChaCha20Poly1305(hchacha20(key, nonce[:16]))
+def xchacha(key: bytes, nonce: bytes) -> tuple[AeadKey, int]:
+    """XChaCha20-Poly1305 (draft-irtf-cfrg-xchacha, section 2.3): the key for this nonce, and its counter there."""
+    return AeadKey(hchacha20(key, nonce[:16])), int.from_bytes(nonce[16:], "little")
 
 
 def hchacha20(key: bytes, nonce: bytes) -> bytes:

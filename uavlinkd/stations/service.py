@@ -24,7 +24,7 @@ from uavlinkd.stations import handshake, inner
 from uavlinkd.stations.endpoint import StationEndpoint
 from uavlinkd.stations.session import DATA, HEADER_BYTES, TAG_BYTES
 from uavlinkd.stations.state import StationDisk
-from uavlinkd.stations.tunnel import Opened, Tunnel, TunnelIndices
+from uavlinkd.stations.tunnel import Opened, Tunnel
 from uavlinkd.system.clock import monotonic
 from uavlinkd.system.guard import report, run
 from uavlinkd.system.stall import StallWatch
@@ -57,7 +57,7 @@ class Stations(Feature):
         self._own = handshake.StationKey(config.private_key.reveal())
         self._cookies = handshake.StationCookies(self._own.macs, os.urandom, monotonic())
         self._admission = Admission(self._is_known, monotonic())
-        self._indices = TunnelIndices(os.urandom)
+        self._indices: dict[int, Tunnel] = {}
         self._stations: dict[Tunnel, Station] = {}
         self._by_key: dict[bytes, Station] = {}
         self._disk = StationDisk(config.state_file)
@@ -131,15 +131,21 @@ class Stations(Feature):
             self._settle(station.tunnel)
         elif kind == handshake.RESPONSE and size == handshake.RESPONSE_BYTES:
             index = _index(datagram, 8)
-            tunnel = self._indices.get(index)  # first, so that a response to nothing takes no budget
+            tunnel = self._named(index)  # first, so that a response to nothing takes no budget
             self._admit(datagram, Path(_SOCKET, address), now, is_response=True)
             self._send_all(tunnel, tunnel.on_response(datagram, index, now), address)
             self._follow(tunnel)
         elif kind == handshake.COOKIE_REPLY and size == handshake.COOKIE_REPLY_BYTES:
             index = _index(datagram, 4)
-            self._indices.get(index).on_cookie(datagram, index, now)
+            self._named(index).on_cookie(datagram, index, now)
         else:
             raise Drop(DropReason.MALFORMED)
+
+    def _named(self, index: int) -> Tunnel:
+        """The tunnel that a received message names. Raises Drop."""
+        if (tunnel := self._indices.get(index)) is None:
+            raise Drop(DropReason.UNKNOWN_INDEX)
+        return tunnel
 
     def _admit(self, datagram: bytes, path: Path, now: float, *, is_response: bool) -> None:
         """Whether a handshake message may cost a key exchange. Raises Drop."""
@@ -154,7 +160,7 @@ class Stations(Feature):
 
     def _receive_data(self, datagram: bytes, address: SocketAddress, now: float, epoch: int) -> None:
         index = _index(datagram, 4)
-        tunnel = self._indices.get(index)
+        tunnel = self._named(index)
         station = self._stations[tunnel]
         opened = tunnel.open(datagram, index, address, now)
         self._follow(tunnel)
@@ -172,7 +178,7 @@ class Stations(Feature):
             case inner.Ping(is_answer=True, token=token) if tunnel.on_answer(opened, token):
                 pass
             case inner.Ping(is_answer=False) as echo if station.answers.take(now):
-                self._send_packet(station, inner.answer(tunnel.ends, echo), now)
+                self._send_all(tunnel, tunnel.seal(inner.echo(tunnel.ends, echo.content, is_answer=True), now))
             case inner.Closed():
                 station.endpoint.failures["ECONNREFUSED"] += 1
             case _:
@@ -181,11 +187,8 @@ class Stations(Feature):
     def _follow(self, tunnel: Tunnel) -> None:
         """The clients of a station are there while it has a session."""
         endpoint = self._stations[tunnel].endpoint
-        if tunnel.is_open:
-            if not endpoint.is_open:
-                endpoint.open()
-        elif endpoint.is_open:
-            endpoint.end()
+        if tunnel.is_open != endpoint.is_open:
+            (endpoint.open if tunnel.is_open else endpoint.end)()
 
     def _is_known(self, place: SocketAddress) -> bool:
         return place in self._places
@@ -194,16 +197,11 @@ class Stations(Feature):
 
     def _send_frames(self, tunnel: Tunnel, port: int, payload: bytes) -> None:
         """Send frames to a port of a station. Raises OSError."""
-        now = monotonic()
-        datagram = tunnel.seal(inner.udp(tunnel.ends, MAVLINK_PORT, port, payload), now)
-        if datagram is None or tunnel.address is None:
+        sealed = tunnel.seal(inner.udp(tunnel.ends, MAVLINK_PORT, port, payload), monotonic())
+        if not sealed or tunnel.address is None:
             raise OSError(errno.ENOTCONN, "no session")
-        self._sock.sendto(datagram, tunnel.address)
+        self._sock.sendto(sealed[0], tunnel.address)
         self._settle(tunnel)
-
-    def _send_packet(self, station: Station, packet: bytes, now: float) -> None:
-        datagram = station.tunnel.seal(packet, now)
-        self._send_all(station.tunnel, [] if datagram is None else [datagram])
 
     def _send_all(self, tunnel: Tunnel, datagrams: Iterable[bytes], address: SocketAddress | None = None) -> None:
         """Send to where a station is."""

@@ -68,40 +68,10 @@ class Opened(NamedTuple):
         return self.session.is_new(self.counter, now)
 
 
-class TunnelIndices:
-    """Numbers for the sessions and initiations of all tunnels. A received message names one."""
-
-    def __init__(self, entropy: Entropy) -> None:
-        self._entropy = entropy
-        self._tunnels: dict[int, Tunnel] = {}
-
-    @property
-    def count(self) -> int:
-        """How many numbers are in use."""
-        return len(self._tunnels)
-
-    def add(self, tunnel: Tunnel) -> int:
-        """A random unused number."""
-        while (index := int.from_bytes(self._entropy(4), "little")) in self._tunnels:
-            pass
-        self._tunnels[index] = tunnel
-        return index
-
-    def remove(self, index: int) -> None:
-        """The number is unused again."""
-        del self._tunnels[index]
-
-    def get(self, index: int) -> Tunnel:
-        """The tunnel of a number. Raises ``UNKNOWN_INDEX``."""
-        tunnel = self._tunnels.get(index)
-        if tunnel is None:
-            raise Drop(DropReason.UNKNOWN_INDEX)
-        return tunnel
-
-
 class Tunnel:
     """All state of one station. All times are monotonic seconds.
 
+    ``indices``: the numbers of the sessions and initiations of all tunnels. A received message names one.
     ``timestamp`` returns one that is greater than all before, also than those before a restart.
     """
 
@@ -111,7 +81,7 @@ class Tunnel:
         key: bytes,
         ends: inner.Ends,
         entropy: Entropy,
-        indices: TunnelIndices,
+        indices: dict[int, Tunnel],
         timestamp: Callable[[], bytes],
     ) -> None:
         self.key = key
@@ -159,7 +129,7 @@ class Tunnel:
         if initiation.timestamp <= self._newest_timestamp or now - self._responded_at < INITIATIONS_S:
             raise Drop(DropReason.REPLAYED_INITIATION)
         self._newest_timestamp, self._responded_at = initiation.timestamp, now
-        index = self._indices.add(self)
+        index = self._new_index()
         datagram, keys = respond(initiation, KeyPair(self._entropy(KEY_BYTES)), index)
         self._forget(self._next)
         self._next = TunnelSession(index, keys, now, self._sent_after, is_initiator=False)
@@ -174,7 +144,7 @@ class Tunnel:
             self._trying_since = now
         self._give_up()
         cookie, until = self._cookie
-        pair, index = KeyPair(self._entropy(KEY_BYTES)), self._indices.add(self)
+        pair, index = KeyPair(self._entropy(KEY_BYTES)), self._new_index()
         usable = cookie if now < until else None
         self._pending = initiate(self._own, self.key, self._timestamp(), pair, index, usable)
         self._initiated_at = now
@@ -202,16 +172,16 @@ class Tunnel:
 
     # Packets.
 
-    def seal(self, packet: bytes, now: float) -> bytes | None:
-        """The data message with an inner packet, or with nothing: a keepalive. None without a session."""
+    def seal(self, packet: bytes, now: float) -> list[bytes]:
+        """The data message with an inner packet, or with nothing: a keepalive. Without a session there is none."""
         session = self._current
         if session is None or session.is_over(now):
-            return None
+            return []
         self._keepalive_at = NEVER
         if packet and self._silent_at == NEVER:
             self._silent_at = now + KEEPALIVE_S + REKEY_TIMEOUT_S
             self.next_at = min(self.next_at, self._silent_at)
-        return session.seal(packet)
+        return [session.seal(packet)]
 
     def open(self, datagram: bytes, index: int, address: SocketAddress, now: float) -> Opened:
         """The packet in a data message. Raises Drop, and then nothing has changed."""
@@ -267,32 +237,28 @@ class Tunnel:
         self._questions[token] = self._asked_at = now
         self._unanswered_since = min(self._unanswered_since, now)
         self._set_next(now)
-        question = self.seal(inner.question(self.ends, token), now)
-        return [] if question is None else [question]
+        return self.seal(inner.echo(self.ends, bytes(4) + token, is_answer=False), now)
 
     # Time.
 
     def do_due(self, now: float) -> list[bytes]:
         """The datagrams that are due, for :attr:`address`. Sessions that are over end."""
         out: list[bytes] = []
-        if self._current is not None and self._current.is_over(now):
-            self._forget(self._current)
-            self._current, self._ask_at, self._silent_at, self._keepalive_at = None, NEVER, NEVER, NEVER
-        if self._previous is not None and self._previous.is_over(now):
-            self._forget(self._previous)
-            self._previous = None
-        if self._next is not None and self._next.is_over(now):
-            self._forget(self._next)
-            self._next = None
+        over = [session for session in self._sessions() if session.is_over(now)]
+        if over:
+            slots = (self._current, self._previous, self._next)
+            self._current, self._previous, self._next = (None if one in over else one for one in slots)
+            for session in over:
+                self._forget(session)
+        if self._current is None:
+            self._ask_at = self._silent_at = self._keepalive_at = NEVER
         if now >= self._ask_at:
             if now - self._received_at <= ACTIVE_S:
                 out += self._ask(now)
             else:
                 self._ask_at = NEVER
         if now >= self._keepalive_at:
-            self._keepalive_at = NEVER  # also without a session to send it
-            if (keepalive := self.seal(b"", now)) is not None:
-                out.append(keepalive)
+            out += self.seal(b"", now)
         if now >= self._initiate_at(now):
             self._silent_at = NEVER
             out += self.initiate(now)
@@ -330,15 +296,22 @@ class Tunnel:
     def _sessions(self) -> Iterator[TunnelSession]:
         return (one for one in (self._current, self._previous, self._next) if one is not None)
 
+    def _new_index(self) -> int:
+        """A random unused number."""
+        while (index := int.from_bytes(self._entropy(4), "little")) in self._indices:
+            pass
+        self._indices[index] = self
+        return index
+
     def _use(self, session: TunnelSession) -> None:
         self._forget(self._previous)
         self._previous, self._current = self._current, session
 
     def _give_up(self) -> None:
         if self._pending is not None:
-            self._indices.remove(self._pending.number)
+            del self._indices[self._pending.number]
             self._pending = None
 
     def _forget(self, session: TunnelSession | None) -> None:
         if session is not None:
-            self._indices.remove(session.index)
+            del self._indices[session.index]
