@@ -51,7 +51,7 @@ class Outside:
         self.stall = self
         self._stamp = 0
 
-    def reader(self, _sock: object, deliver: Any, *_: object) -> Outside:
+    def reader(self, _sock: object, deliver: Any, *_: object, most: int) -> Outside:
         self.deliver = deliver
         return self
 
@@ -90,7 +90,6 @@ def alone(outside: Outside) -> Iterator[None]:
     parts: dict[str, Any] = {
         "udp_socket": lambda *_, **__: outside,
         "Reader": outside.reader,
-        "ErrorReports": lambda _: outside,
         "StationDisk": lambda _: outside,
         "report": _raise,
     }

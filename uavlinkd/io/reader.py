@@ -21,7 +21,7 @@ except ImportError:  # Windows
 else:
     _CAN_ASK = True
 
-DATAGRAMS_PER_WAKE_UP = 128  # most that one read takes from a socket; then the others have their turn
+DATAGRAMS_PER_WAKE_UP = 128
 RECEIVE_BYTES = 65536
 _buffer = memoryview(bytearray(RECEIVE_BYTES))
 """Every datagram is read into this buffer and copied at its own size. A new buffer of 64 KiB for each of them would
@@ -53,11 +53,12 @@ class Reader:
       every :data:`PAUSE_S` until a read finds fewer than two datagrams.
 
     ``on_failure`` receives each error that a read returns, such as the failure of an earlier send. With a ``pause_s``
-    of 0 a busy socket is read at once too: a relay must not delay what it forwards.
+    of 0 a busy socket is read at once too: a relay must not delay what it forwards. ``most``: of one read; then the
+    other sockets have their turn.
     """
 
     __slots__ = (
-        *("_burst_until", "_busy_until", "_calm_in", "_deliver", "_is_watched", "_loop", "_on_failure", "_pause_s"),
+        *("_burst_until", "_busy_until", "_calm_in", "_deliver", "_is_watched", "_loop", "_most", "_on_failure", "_pause_s"),
         *("_sock", "_stall", "_timer", "_waiting", "backlog", "gather_s"),
     )
 
@@ -68,12 +69,14 @@ class Reader:
         on_failure: Callable[[OSError], None],
         stall: StallWatch,
         pause_s: float = PAUSE_S,
+        most: int = DATAGRAMS_PER_WAKE_UP,
     ) -> None:
         self.backlog = Backlog(stall, sock.fileno(), lambda: sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF))
         self._sock = sock
         self._deliver = deliver
         self._on_failure = on_failure
         self._pause_s = pause_s
+        self._most = most
         self._stall = stall
         self._loop = asyncio.get_running_loop()
         self._is_watched = False  # by the loop
@@ -156,7 +159,7 @@ class Reader:
                 if count < 2 or self.gather_s:
                     self.start()
                 else:
-                    seconds = self._pause_s if count < DATAGRAMS_PER_WAKE_UP else 0.0
+                    seconds = self._pause_s if count < self._most else 0.0
                     self._timer = self._loop.call_later(seconds, self._on_timer, seconds)
 
     def _unwatch(self) -> None:
@@ -164,7 +167,7 @@ class Reader:
         self._loop.remove_reader(self._sock)
 
     def read(self, now: float, waited_s: float = 0.0, *, drains: bool = True) -> int:
-        """Read up to :data:`DATAGRAMS_PER_WAKE_UP` datagrams and deliver them. Returns how many there were.
+        """Read up to ``most`` datagrams and deliver them. Returns how many there were.
 
         Without ``drains``, read a second one only if FIONREAD reports it. Asking is cheaper than reading in vain.
         """
@@ -183,7 +186,7 @@ class Reader:
         self._calm_in = self._stall.epoch if is_calm else None
         self._deliver(datagrams, now, epoch, waited_s)
         # Behind a full batch, more datagrams have gathered already. New ones must not wait behind stale ones.
-        is_full = epoch == STALE or count == DATAGRAMS_PER_WAKE_UP
+        is_full = epoch == STALE or count == self._most
         self._busy_until = -inf if is_full else monotonic() + BUSY_S
         return count
 
@@ -201,7 +204,7 @@ class Reader:
 
     def _drain(self, datagrams: Datagrams) -> bool:
         """Read up to a batch. Returns whether the queue is empty now."""
-        for _ in range(DATAGRAMS_PER_WAKE_UP - len(datagrams)):
+        for _ in range(self._most - len(datagrams)):
             try:
                 size, source = self._sock.recvfrom_into(_buffer)
                 datagrams.append((bytes(_buffer[:size]), source))

@@ -13,7 +13,7 @@ from uavlinkd.daemon.features import Feature
 from uavlinkd.daemon.line import Line
 from uavlinkd.io.ports import PortHandler, failure_name
 from uavlinkd.io.reader import Datagrams, Reader
-from uavlinkd.io.sockets import BindError, ErrorReports, udp_socket
+from uavlinkd.io.sockets import BindError, udp_socket
 from uavlinkd.io.url import StationUrl
 from uavlinkd.protocol.admission import Admission, CookieRequired, Message
 from uavlinkd.protocol.constants import NEVER
@@ -33,6 +33,8 @@ MAVLINK_PORT: Final = 14550
 """The port of the daemon's inner address: ground stations answer there, and a client may begin there."""
 ANSWERS_PER_S: Final = 10
 """Ping requests of one station that are answered."""
+MOST_AT_ONCE: Final = 32
+"""Datagrams of one read, of which each may be a stranger's: less than 1 ms, then the sockets of peers have a turn."""
 _SOCKET: Final = -1  # the number of the socket in paths: none of the daemon's own
 
 
@@ -73,8 +75,7 @@ class Stations(Feature):
             self._sock = udp_socket(self._config.listen, may_come_later=True)
         except BindError as error:
             raise BindError(f"stations.listen: {error}") from None
-        self._reader = Reader(self._sock, self._receive, self._on_failure, self._stall)
-        self._reports = ErrorReports(self._sock)
+        self._reader = Reader(self._sock, self._receive, self._on_failure, self._stall, most=MOST_AT_ONCE)
 
     def endpoint(self, config: EndpointConfig, handler: PortHandler) -> StationEndpoint:
         """The endpoint of a station. The first one opens the socket. Raises BindError."""
@@ -218,8 +219,7 @@ class Stations(Feature):
                 station.endpoint.failures[failure_name(error)] += 1
 
     def _on_failure(self, error: OSError) -> None:
-        self._reports.take()
-        self._reader.renew()
+        """A read failed. On Linux the kernel reports no ICMP errors here: a stranger could cause them."""
 
     # Time.
 
@@ -244,7 +244,6 @@ class Stations(Feature):
 
     def do_housekeeping(self, now: float) -> None:
         """Once a second."""
-        self._reports.renew()
         places = {tunnel.key: remote_of(at) for tunnel in self._stations if (at := tunnel.address) is not None}
         self._places = set(places.values())
         self._disk.follow(places)
