@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import select
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from struct import unpack_from
 from time import monotonic
@@ -20,7 +20,6 @@ from tests.waiting import Stopwatch
 
 INTERVAL_S = 0.1
 DAEMON = ("10.66.0.1", 14550)
-INITIATION = 1
 
 
 class Arrival(NamedTuple):
@@ -33,18 +32,12 @@ class Arrival(NamedTuple):
 
 
 class Middle:
-    """The station's software, the man in the middle and the autopilot. ``delay_s``: what he adds to the station's.
-
-    ``passes``: whether he lets a datagram of the daemon through.
-    """
+    """The station's software, the man in the middle and the autopilot. ``delay_s``: what he adds to the station's."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
         self.delay_s = 0.0
-        self.passes: Callable[[bytes], bool] = lambda datagram: True
         self.arrivals: list[Arrival] = []
-        self.heartbeats = 0
-        """What the station's software received of the vehicle."""
         self.recorded: list[bytes] = []
         self.sent: dict[int, tuple[float, Stopwatch]] = {}
         self._held: list[tuple[float, bytes]] = []
@@ -114,11 +107,9 @@ class Middle:
             self._held.append((now, datagram))
             self._release(now)
         elif sock is self._to_daemon:
-            if self._app_at is not None and self.passes(datagram):
+            if self._app_at is not None:
                 self._to_app.sendto(datagram, self._app_at)
-        elif sock is self._software:
-            self.heartbeats += sum(name_of(frame) == "HEARTBEAT" for frame in frames_in(datagram))
-        else:
+        elif sock is self._autopilot:
             for frame in frames_in(datagram):
                 if name_of(frame) == "COMMAND_LONG":
                     number = int(unpack_from("<f", frame, 10)[0])  # its first parameter

@@ -65,7 +65,7 @@ class App:
         )
         self.address = str(re.findall(r"^Address = ([^/\n]+)", text, re.MULTILINE)[0])
         self._host = host
-        self._process = host.start(["wireguard-go", "-f", self.device], log=folder / f"{self.device}.log")
+        host.start(["wireguard-go", "-f", self.device], log=folder / f"{self.device}.log")
         until(lambda: self.device in host.run("ip", "-o", "link", "show"), "the interface is there")
         file = folder / f"{self.device}.conf"
         file.touch(0o600)
@@ -80,15 +80,6 @@ class App:
         at = monotonic()
         self._host.ip(f"route add 10.66.0.1/32 dev {self.device}")
         return at
-
-    def switch_off(self) -> None:
-        """The tunnel ends, and its system forgets what it kept."""
-        self._host.end(self._process)
-
-    def use(self, endpoint: str) -> None:
-        """The daemon is elsewhere, such as behind a man in the middle."""
-        peer = self._host.run("wg", "show", self.device, "peers").strip()
-        self._host.run("wg", "set", self.device, "peer", peer, "endpoint", endpoint)
 
 
 class Scene:

@@ -10,18 +10,15 @@ from itertools import count
 import pytest
 
 from tests import waiting
-from tests.mavlink.parsers.captured_member import setup_signing
-from tests.processes.frames import command_long, heartbeat
+from tests.processes.frames import command_long
 from tests.processes.harness import Stage
 from tests.processes.udp import open_socket
 from tests.stations.test_daemon import ARM, Setup
 from uavlinkd.config import keys
 from uavlinkd.stations import handshake
-from uavlinkd.stations.session import MOST_AGE_S
 
 pytestmark = pytest.mark.long
 ATTEMPTS = 200
-OLDEST_S = MOST_AGE_S + 0.5
 
 
 class Middle:
@@ -208,65 +205,3 @@ async def test_no_attack_delivers_a_command(attacked: Attacked) -> None:
         middle.pass_on()
         await attacked.until_one_passes()
         attacked.check()
-
-
-async def test_recorded_initiations_after_a_restart_deliver_nothing(attacked: Attacked) -> None:
-    """The daemon has forgotten the timestamps, answers one, and accepts nothing under it. The station is back."""
-    middle, setup = attacked.middle, attacked.setup
-    await setup.connect()
-    await attacked.until_one_passes()
-    recorded = list(middle.of_station)
-    await setup.daemon.kill()
-    middle.kept = []
-    await setup.daemon.start()
-    await setup.daemon.ready()
-    for datagram in recorded:
-        middle.inject(datagram)
-    await setup.daemon.until(lambda status: status["drops"].get("unknown_index", 0) >= len(recorded) // 2)
-    status = await setup.daemon.status()
-    assert not status["endpoints"]["tablet"]["clients"]
-    middle.pass_on()
-    setup.tablet.send(setup.tablet.client.initiation())
-    await setup.until_commands_pass()
-    await attacked.until_one_passes()
-    attacked.check()
-
-
-async def test_delayed_commands_are_dropped(attacked: Attacked) -> None:
-    """The middle keeps what the station sends for longer than the bound: none of the old commands arrives."""
-    middle, setup = attacked.middle, attacked.setup
-    await setup.connect()
-    await attacked.until_one_passes()
-    middle.kept = []
-    loop = asyncio.get_running_loop()
-    begun, old = loop.time(), list[bytes]()
-    while loop.time() < begun + OLDEST_S + 2.0:
-        frame = attacked.command()
-        if loop.time() < begun + 2.0:
-            old.append(frame)
-        await asyncio.sleep(0.1)
-    middle.pass_on()
-    await attacked.until_one_passes()
-    assert not set(old) & set(setup.autopilot.frames)
-    attacked.check()
-
-
-async def test_captured_station_is_bounded_by_its_role(attacked: Attacked) -> None:
-    """Its keys are the attacker's: another system in both versions of MAVLink, a signing key, another destination."""
-    setup, client = attacked.setup, attacked.setup.tablet.client
-    await setup.connect()
-    forbidden = [
-        command_long(ARM, 1, param1=1.0),
-        heartbeat(1),
-        heartbeat(1, version=1),
-        heartbeat(254, version=1),
-        setup_signing(255),
-        setup_signing(1),
-    ]
-    for frame in forbidden:
-        setup.tablet.send(client.udp(frame))
-        setup.tablet.send(client.udp(frame, port=14999))
-    setup.tablet.send(client.udp(b"".join(forbidden)))
-    await attacked.until_one_passes()
-    assert not set(forbidden) & set(setup.autopilot.frames)
-    attacked.check()

@@ -23,14 +23,15 @@ ROUNDS = 3
 
 
 def attempts(system: int) -> list[bytes]:
-    """A frame of each message, and one for each command."""
+    """A frame of each message, one for each command, and a heartbeat in MAVLink 1."""
     messages = [build(msgid, bytes(facts[2]), system) for msgid, facts in MESSAGES.items()]
-    return messages + [command_long(number, system, (0, 0)) for number in COMMANDS.values()]
+    commands = [command_long(number, system, (0, 0)) for number in COMMANDS.values()]
+    return [*messages, *commands, heartbeat(system, version=1)]
 
 
 def kind(frame: bytes) -> tuple[int, int, int]:
     """The sender of a frame, its message, and its command if it is one."""
-    msgid = int.from_bytes(frame[7:10], "little")
+    msgid = int.from_bytes(frame[7:10], "little") if frame[0] == 0xFD else 1 << 24 | frame[5]
     is_command = msgid == 76 and frame[1] >= 30
     return sender_of(frame), msgid, int.from_bytes(frame[38:40], "little") if is_command else 0
 

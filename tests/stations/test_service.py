@@ -74,12 +74,17 @@ def test_authentic_data_with_the_greatest_counter_passes() -> None:
         assert outside.drops == [DropReason.REPLAYED]
 
 
-@pytest.mark.parametrize("size", [0, 1, 15, 16, 17, 20, 28, 1500])
-def test_inner_packets_of_any_length_are_counted(size: int) -> None:
-    """Zeros are no packet; empty is a keepalive."""
+def test_packets_that_are_not_for_the_daemon_are_counted() -> None:
+    """Zeros, TCP, and UDP to another port or from the address of another station. An empty one is a keepalive."""
     outside = Outside()
     with alone(outside):
         attacked = Attacked(outside, has_session=True)
-        attacked.offer(attacked.client.data(bytes(size)), THERE)
+        client = attacked.client
+        strange = [client.data(bytes(size)) for size in (1, 15, 16, 17, 20, 28, 1500)]
+        strange += [client.data(client.packet(6, bytes(20))), client.udp(heartbeat(), to_port=14551)]
+        client.host = "10.66.0.3"
+        for datagram in (*strange, client.udp(heartbeat()), client.data(b"")):
+            attacked.offer(datagram, THERE)
+        assert attacked.endpoint.failures["inner_packet"] == len(strange) + 1
+        assert not outside.frames
         assert not outside.drops
-        assert attacked.endpoint.failures["inner_packet"] == (size > 0)

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from tests.stations.client import Client
 from tests.stations.world import THERE, World
-from uavlinkd.protocol.drops import Drop, DropReason
-from uavlinkd.stations import handshake
+from uavlinkd.protocol.drops import DropReason
 from uavlinkd.stations.session import MOST_AGE_S, REJECT_AFTER_S
 from uavlinkd.stations.tunnel import ASK_S, REKEY_ATTEMPT_S
 
@@ -26,17 +24,6 @@ def test_station_connects_and_its_commands_pass(host: str, daemon: str) -> None:
     assert [is_new for _, is_new, _ in world.delivered].count(False) == 1  # the one that begins the questions
     assert max(world.ages) < 0.1
     assert world.drops == []
-
-
-def test_daemon_initiates_where_the_station_was() -> None:
-    """After a restart it knows the address, and the station confirms nothing until the daemon sends."""
-    world = World()
-    world.tunnel.address = THERE
-    world.from_daemon(world.tunnel.initiate(world.now))
-    world.run(world.now + 0.2)
-    assert world.tunnel.is_open
-    world.commands(5.0)
-    assert len(world.ages) >= 8
 
 
 def test_keys_are_renewed_and_nothing_is_lost() -> None:
@@ -79,24 +66,6 @@ def test_nothing_that_answers_nothing_commands() -> None:
     world.commands(30.0)
     assert len(world.delivered) == 60
     assert world.ages == []
-
-
-def test_packets_that_the_system_kept_for_the_next_keys_are_not_new() -> None:
-    """The station has no valid keys, so its system keeps a command. New keys of the station are no evidence."""
-    world = World()
-    world.connect()
-    world.commands(5.0)
-    kept = repr(world.now).encode()
-    world.to_client = world.to_daemon = lambda datagram: None
-    world.run(world.now + REJECT_AFTER_S + REKEY_ATTEMPT_S)
-    assert not world.tunnel.is_open
-    world.delivered.clear()
-    world.to_client = world.to_daemon = lambda datagram: 0.02
-    world.from_client(world.client.initiation())
-    world.run(world.now + 0.05)  # the response has arrived
-    world.command(kept)
-    world.run(world.now + 5.0)
-    assert [(payload, is_new) for payload, is_new, _ in world.delivered] == [(kept, False)]
 
 
 def test_replayed_and_altered_messages_change_nothing() -> None:
@@ -202,15 +171,3 @@ def test_nothing_is_due_without_keys_to_send_it() -> None:
     world.command(b"newer")
     world.run(world.now + 50.0)
     assert [payload for payload, _, _ in world.delivered] == [b"older", b"newer"]
-
-
-def test_stranger_gets_no_answer() -> None:
-    """One with another key, or that does not know the daemon's."""
-    world = World()
-    stranger = Client(world.own.key.public)
-    initiation = handshake.read_initiation(world.own, stranger.initiation())
-    assert initiation.static != world.client.key
-    other = Client(handshake.StationKey(bytes(range(32))).key.public)
-    assert not world.own.macs.has_valid_mac1(other.initiation())
-    with pytest.raises(Drop):
-        handshake.read_initiation(world.own, other.initiation())

@@ -58,8 +58,8 @@ class Reader:
     """
 
     __slots__ = (
-        *("_burst_until", "_busy_until", "_calm_in", "_deliver", "_is_watched", "_loop", "_most", "_on_failure", "_pause_s"),
-        *("_sock", "_stall", "_timer", "_waiting", "backlog", "gather_s"),
+        *("_burst_until", "_busy_until", "_calm_in", "_deliver", "_is_watched", "_loop", "_most", "_on_failure"),
+        *("_pause_s", "_sock", "_stall", "_timer", "_waiting", "backlog", "gather_s"),
     )
 
     def __init__(
