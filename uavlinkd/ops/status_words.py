@@ -39,6 +39,7 @@ ENDPOINT_FAILURES: Final[Mapping[str, str]] = {
     "unsigned": "unsigned frames",
     "bad_signature": "frames with a wrong signature",
     "replayed": "signed frames with an old timestamp",
+    "reflected": "own frames that came back",
     "not_proven": "frames before the autopilot proved its key",
     "mavlink1_not_signed": "MAVLink 1 frames, which have no signatures",
     "too_many_senders": "frames of more senders than an autopilot remembers",
