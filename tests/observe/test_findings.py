@@ -6,6 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import replace
+from math import inf
 from types import SimpleNamespace
 from typing import Any
 
@@ -29,7 +30,6 @@ from uavlinkd.mavlink.frames import SplitCounters, split_payload
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.mavlink.routing import Router
-from uavlinkd.mavlink.signing.endpoint_signing import Heard
 from uavlinkd.observe.facts import ICMP_S, SECURITY_S, is_contested
 from uavlinkd.observe.finding import Finding, Severity, Subject
 from uavlinkd.observe.findings import find, has_no_client, own_codes, stop_frames
@@ -517,12 +517,12 @@ def test_autopilot_that_does_not_prove_its_key(
     """Once it lasts. What others send to an endpoint whose autopilot signs is only counted."""
     daemon.parts.config.endpoints.append(config := EndpointConfig("autopilot", parse_url("udpin:127.0.0.1:14550")))
     daemon.local.append(endpoint := made_up_endpoint(config))
-    endpoint.signing = SimpleNamespace(is_open=False, is_proven=is_proven, signers=[1], autopilots={})
+    endpoint.signing = SimpleNamespace(is_open=False, is_proven=is_proven, signers=[1], verified_at=-inf)
     for _ in range(7):
         daemon.now += 1.0
         endpoint.counters.frames += 1
         endpoint.failures[drop] += 1
-        endpoint.signing.autopilots = {1: Heard(daemon.now, False, True)} if is_heard else {}
+        endpoint.signing.verified_at = daemon.now if is_heard else -inf
         daemon.sample()
     finding = daemon.findings().get("autopilot_unverified")
     assert (finding is not None) == bool(says)
@@ -536,7 +536,7 @@ def test_senders_and_keys_that_are_too_many(daemon: Daemon) -> None:
     config = EndpointConfig("autopilot", parse_url("udpin:127.0.0.1:14550"))
     daemon.parts.config.endpoints.append(config)
     daemon.local.append(endpoint := made_up_endpoint(config))
-    endpoint.signing = SimpleNamespace(is_open=False, is_proven=True, signers=[1, 2], autopilots={})
+    endpoint.signing = SimpleNamespace(is_open=False, is_proven=True, signers=[1, 2], verified_at=-inf)
     endpoint.failures["too_many_senders"] += 3
     daemon.sample()
     findings = daemon.findings()

@@ -17,7 +17,7 @@ from uavlinkd.config.model import EndpointConfig, SigningConfig
 from uavlinkd.daemon.local_endpoints import LocalEndpoints
 from uavlinkd.io.ports import Endpoint, LocalPort
 from uavlinkd.mavlink.frames import Frame
-from uavlinkd.mavlink.signing.endpoint_signing import EndpointSigning, Heard
+from uavlinkd.mavlink.signing.endpoint_signing import EndpointSigning
 from uavlinkd.protocol.crypto import Secret
 from uavlinkd.system.clock import monotonic
 
@@ -126,8 +126,7 @@ class AutopilotSigning:
         began_at = monotonic()
 
         def is_cleared() -> bool:
-            heard = signing.autopilots[system]
-            return heard.at > began_at and not heard.is_signed
+            return signing.unsigned_at > began_at
 
         await _repeat(lambda: signing.set_up(None, system), is_cleared)
         signing.is_clearing = False
@@ -137,13 +136,13 @@ class AutopilotSigning:
         return {"problem": "", "is_changed": True, "system": system, "accepts_unsigned": True}
 
 
-def _heard(signing: EndpointSigning) -> dict[int, Heard]:
-    """The autopilots behind an endpoint now."""
-    since = monotonic() - HEARD_S
-    return {system: heard for system, heard in signing.autopilots.items() if heard.at >= since}
+def _heard(signing: EndpointSigning) -> dict[int, bool]:
+    """The autopilots behind an endpoint now: whether each is armed, by its system."""
+    vehicles = signing.vehicles.status(monotonic())
+    return {one["system"]: one["is_armed"] for one in vehicles if one["heartbeat_s"] < HEARD_S}
 
 
-def _problem(signing: EndpointSigning, heard: Mapping[int, Heard]) -> str | None:
+def _problem(signing: EndpointSigning, heard: Mapping[int, bool]) -> str | None:
     """Why the autopilot cannot get a key now."""
     if signing.is_open and signing.has_foreign_key:
         return OTHER_KEY
@@ -154,7 +153,7 @@ def _problem(signing: EndpointSigning, heard: Mapping[int, Heard]) -> str | None
     if len(heard) > 1:
         systems = " and ".join(map(str, sorted(heard)))
         return f"several autopilots are behind this endpoint (systems {systems}): give each an endpoint of its own"
-    if any(one.is_armed for one in heard.values()):
+    if any(heard.values()):
         return "the autopilot is armed, and takes no key then: disarm it, and run the command again"
     return None
 
@@ -166,7 +165,7 @@ async def _done(signing: EndpointSigning) -> dict[str, object]:
     return {
         "problem": "",
         "is_changed": True,
-        "system": next(iter(signing.autopilots), 0),
+        "system": next(iter(_heard(signing)), 0),
         "accepts_unsigned": signing.accepts_unsigned,
     }
 

@@ -239,7 +239,7 @@ def autopilot_unverified(endpoint: EndpointFacts) -> Signs:
     signing, lasting = endpoint.endpoint.signing, endpoint.history.failures.lasting(endpoint.now)
     if signing is None or signing.is_open:
         return
-    is_signed = any(heard.is_signed and endpoint.now - heard.at < SILENT_S for heard in signing.autopilots.values())
+    is_signed = endpoint.now - signing.verified_at < SILENT_S
     if not is_signed and "bad_signature" in lasting:
         yield {
             "what": "signs with another key",
@@ -260,7 +260,7 @@ def autopilot_unverified(endpoint: EndpointFacts) -> Signs:
 def too_many_senders(endpoint: EndpointFacts) -> Signs:
     """More systems and components send to the autopilot than it can tell apart."""
     drops = endpoint.history.failures.within(REFUSED_S, endpoint.now)
-    if count := sum(drops.get(reason, 0) for reason in ("too_many_senders", "too_many_reporters")):
+    if count := drops.get("too_many_senders", 0):
         yield {"count": count}
 
 

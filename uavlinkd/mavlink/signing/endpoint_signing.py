@@ -16,13 +16,14 @@ from collections import Counter
 from collections.abc import Callable, Hashable, Sequence
 from enum import StrEnum
 from itertools import count
+from math import inf
 from struct import Struct
-from typing import Final, NamedTuple
+from typing import Final
 
 from uavlinkd.mavlink.dialect import IDS
 from uavlinkd.mavlink.frames import MAVLINK2, SIGNATURE_BYTES, Frame, pack, payload_bytes
 from uavlinkd.mavlink.own_frames import RADIO_COMPONENT, RADIO_SYSTEM
-from uavlinkd.mavlink.payloads import HEARTBEAT, claims_to_be_ground_station, may_be_old
+from uavlinkd.mavlink.payloads import HEARTBEAT, may_be_old
 from uavlinkd.mavlink.signing.signature import (
     LAST_TIMESTAMP,
     Signer,
@@ -31,6 +32,7 @@ from uavlinkd.mavlink.signing.signature import (
     timestamp_of,
     without_signature,
 )
+from uavlinkd.mavlink.vehicles import Vehicles
 from uavlinkd.protocol.crypto import Secret
 
 MOST_SENDERS: Final = 14
@@ -50,8 +52,6 @@ QUESTIONS: Final = 8
 TIMESYNC: Final = IDS["TIMESYNC"]
 SETUP_SIGNING: Final = IDS["SETUP_SIGNING"]
 _AUTOPILOT: Final = 1  # MAV_COMP_ID_AUTOPILOT1
-_ARMED: Final = 128  # MAV_MODE_FLAG_SAFETY_ARMED, in base_mode
-_BASE_MODE_AT: Final = 6  # in HEARTBEAT
 _TIMES: Final = Struct("<qq")  # tc1: 0 in a question; ts1: the number, which the answer repeats
 _SETUP: Final = Struct("<QBB32s")  # initial_timestamp, target_system, target_component, secret_key
 
@@ -68,14 +68,6 @@ class SigningDrop(StrEnum):
     TOO_MANY_SENDERS = "too_many_senders"
     TOO_MANY_REPORTERS = "too_many_reporters"
     NO_TIMESTAMP = "no_timestamp"  # the autopilot's is the last that there is
-
-
-class Heard(NamedTuple):
-    """An autopilot's last HEARTBEAT."""
-
-    at: float
-    is_armed: bool
-    is_signed: bool
 
 
 class EndpointSigning:
@@ -106,8 +98,10 @@ class EndpointSigning:
         """Whether a signed frame came that none of the keys made."""
         self.accepts_unsigned = False
         """Whether the autopilot answered :meth:`ask_unsigned`."""
-        self.autopilots: dict[int, Heard] = {}
-        """By system; those without a signature only while they need none."""
+        self.vehicles = Vehicles()
+        """The autopilots behind the endpoint; those without a signature only while they need none."""
+        self.verified_at = self.unsigned_at = -inf
+        """When the last frame with a valid signature came; and while none is needed, the last HEARTBEAT without."""
         self.timestamp = 0
         """The greatest of all verified frames and of this end."""
         self.link_id = link_id
@@ -186,8 +180,9 @@ class EndpointSigning:
                 asks = signer
                 continue
             self.timestamp = max(self.timestamp, timestamp)
+            self.verified_at = now
             if header.msgid == HEARTBEAT:
-                self._note(frame, now)
+                self.vehicles.note(frame, now)
             if header.msgid == TIMESYNC and self._questions and self._is_answer(frame, signer):
                 self._prove(signer, stream, timestamp)
             elif not is_current:
@@ -212,17 +207,12 @@ class EndpointSigning:
         has_signature = is_signed(frame.raw)
         self.has_foreign_key |= has_signature
         if frame.header.msgid == HEARTBEAT and not has_signature and (self.is_open or self.is_clearing):
-            self._note(frame, now)
+            self.vehicles.note(frame, now)
+            self.unsigned_at = now
         if self.is_open:
             passed.append(frame)
         else:
             self._drops[SigningDrop.BAD_SIGNATURE if has_signature else SigningDrop.UNSIGNED] += 1
-
-    def _note(self, frame: Frame, now: float) -> None:
-        header = frame.header
-        if header.component == _AUTOPILOT and header.is_known and not claims_to_be_ground_station(frame):
-            base_mode = payload_bytes(frame, _BASE_MODE_AT, 1) or b"\0"
-            self.autopilots[header.system] = Heard(now, bool(base_mode[0] & _ARMED), is_signed(frame.raw))
 
     # Questions.
 
