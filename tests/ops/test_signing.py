@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import json
 import os
 import signal
@@ -172,6 +173,24 @@ def test_key_that_the_autopilot_may_have_is_kept(tmp_path: Path, capsys: pytest.
         assert run("setup", path) == 0
         assert seen()["key"] == kept
     assert key_files(tmp_path) == {"autopilot.key": kept}
+
+
+def test_disk_that_refuses_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The autopilot has the key then: another run ends it."""
+    path = write(tmp_path)
+
+    def refuse(one: Path, _: Path) -> None:
+        raise OSError(errno.EROFS, "Read-only file system", str(one))
+
+    with made_up_daemon(tmp_path) as seen:
+        with monkeypatch.context() as patch:
+            patch.setattr(Path, "replace", refuse)
+            assert run("setup", path) == 1
+        assert "autopilot.key.new: Read-only file system: mend that" in capsys.readouterr().err
+        assert run("setup", path) == 0
+        assert key_files(tmp_path) == {"autopilot.key": seen()["key"]}
 
 
 @pytest.mark.parametrize(

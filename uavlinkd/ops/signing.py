@@ -49,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for name, text in _ACTIONS.items():
         action = actions.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
-        action.set_defaults(command=_clear if name == "clear" else _give, action=name, socket=None)
+        action.set_defaults(command=_run, action=name, socket=None)
         action.add_argument("--config", metavar="FILE", type=Path, required=True, help="the daemon's configuration")
         action.add_argument("--endpoint", metavar="NAME", help="(default: autopilot, or the only endpoint)")
         action.add_argument("--keys", metavar="DIR", type=Path, help="for a service: the folder of its keys")
@@ -123,10 +123,20 @@ def _endpoint(config: Config, name: str | None) -> str:
     return name
 
 
-def _give(options: argparse.Namespace) -> int:
+def _run(options: argparse.Namespace) -> int:
     place = _Place(options)
+    try:
+        if options.action == "clear":
+            _clear(place)
+        else:
+            _give(place, is_rotation=options.action == "rotate")
+    except OSError as error:
+        raise CommandError(f"{error.filename}: {error.strerror}: mend that, and run this command again") from None
+    return OK
+
+
+def _give(place: _Place, *, is_rotation: bool) -> None:
     ask(place.socket, "status")  # no file is made if no daemon answers
-    is_rotation = options.action == "rotate"
     if is_rotation and not place.is_written:
         raise UsageError(f"{place.path}: {place.endpoint} has no key: run `uavlinkd signing setup`")
     is_made = not os.path.lexists(place.new) and (is_rotation or not os.path.lexists(place.file))
@@ -142,7 +152,7 @@ def _give(options: argparse.Namespace) -> int:
         if is_made:
             used.unlink()
         raise
-    answer = place.ask(options.action, key)
+    answer = place.ask("rotate" if is_rotation else "setup", key)
     if problem := answer["problem"]:
         if answer["is_changed"] is not False:
             problem = f"{problem}. The autopilot may have the key in {used}"
@@ -156,11 +166,9 @@ def _give(options: argparse.Namespace) -> int:
         place.write(place.name)
     text = f"{place.endpoint}: system {answer.get('system')} and the daemon sign, with the key in {place.file}."
     print(printable(f"{text} No restart is needed.{_OPEN if answer.get('accepts_unsigned') else ''}"))
-    return OK
 
 
-def _clear(options: argparse.Namespace) -> int:
-    place = _Place(options)
+def _clear(place: _Place) -> None:
     files = [file for file in (place.file, place.new) if os.path.lexists(file)]
     if not (place.is_written or files):
         raise UsageError(f"{place.path}: {place.endpoint} has no key")
@@ -181,4 +189,3 @@ def _clear(options: argparse.Namespace) -> int:
         file.unlink()
     sync_folder(place.file.parent)
     print(printable(f"{place.endpoint}: the autopilot has no key, and takes frames of anyone who reaches it."))
-    return OK
