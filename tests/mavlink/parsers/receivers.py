@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import re
 import shutil
 import subprocess
@@ -65,21 +66,26 @@ _kept: list[tempfile.TemporaryDirectory[str]] = []
 @cache
 def build(dialect: str, library: str) -> Path:
     """The shared library of one dialect and version. Raises BuildError if there is no compiler, or it fails."""
-    cc = compiler()
-    if cc is None:
-        raise BuildError("a C compiler (cc) is missing")
-    version = library.partition("-")[0]
-    headers = _generate(dialect, version)
-    target = build_folder() / f"{dialect}-{library}.so"
     others = {msgid: extras[0] for msgid, extras in OTHER_EXTRAS.items()} | PRIVATE_EXTRAS
     rows = ",".join(f"{{{msgid},{extra}}}" for msgid, extra in others.items())
     variants = {"unknown": ("-DACCEPTS_UNKNOWN",), "other": (f"-DOTHER_DEFINITIONS={{{rows}}}",)}
-    variant = variants.get(library.partition("-")[2], ())
-    command = (cc, *_FLAGS, *variant, f"-I{headers}", f"-I{headers / dialect}", str(_SOURCE), "-o", str(target))
+    version, _, variant = library.partition("-")
+    return compile_shared(_SOURCE, dialect, version, *variants.get(variant, ()))
+
+
+def compile_shared(source: Path, dialect: str, version: str, *flags: str) -> Path:
+    """The shared library of a source beside the headers of a dialect. Raises BuildError."""
+    cc = compiler()
+    if cc is None:
+        raise BuildError("a C compiler (cc) is missing")
+    headers = _generate(dialect, version)
+    handle, target = tempfile.mkstemp(suffix=".so", prefix=f"{source.stem}-{dialect}-", dir=build_folder())
+    os.close(handle)
+    command = (cc, *_FLAGS, *flags, f"-I{headers}", f"-I{headers / dialect}", str(source), "-o", target)
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         raise BuildError(done.stderr)
-    return target
+    return Path(target)
 
 
 @cache

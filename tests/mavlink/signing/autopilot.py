@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from typing import Any
 
 from pymavlink.dialects.v20 import all as mavlink
 
 ARMED = 128
-_NO_KEY = bytes(32)
-_MINUTE = 6_000_000
-_ALWAYS_UNSIGNED = {"ardupilot": {109, 166}, "px4": {0, 109, 246, 247}}
+NO_KEY = bytes(32)
+MINUTE = 6_000_000
+ALWAYS_UNSIGNED = {"ardupilot": {109, 166}, "px4": {0, 109, 246, 247}}
 
 
 class Autopilot:
@@ -30,7 +31,7 @@ class Autopilot:
         self.accepted: list[Any] = []
         """The messages that came, without questions and keys."""
         self.rejected = Counter[str]()
-        self._stored = (_NO_KEY, 0)
+        self._stored = (NO_KEY, 0)
         self._saved = 0
         self._sequence = 0
         self._start()
@@ -43,13 +44,13 @@ class Autopilot:
         self._use(*self._stored)
 
     def _use(self, key: bytes, timestamp: int) -> None:
-        has_key = key != _NO_KEY or timestamp != 0
+        has_key = key != NO_KEY or timestamp != 0
         signing = self._codec.signing
         signing.secret_key, signing.sign_outgoing = key if has_key else None, has_key
         signing.timestamp = self._saved = timestamp
 
     def _accepts_unsigned(self, _: Any, msgid: int) -> bool:
-        return self.is_usb or msgid in _ALWAYS_UNSIGNED[self._kind]
+        return self.is_usb or msgid in ALWAYS_UNSIGNED[self._kind]
 
     @property
     def key(self) -> bytes | None:
@@ -71,7 +72,7 @@ class Autopilot:
     def restart(self) -> None:
         """Restart with what is stored."""
         key, first = self._stored
-        saved = self._saved + _MINUTE if self._kind == "ardupilot" and key != _NO_KEY else first
+        saved = self._saved + MINUTE if self._kind == "ardupilot" and key != NO_KEY else first
         self._start()
         self._codec.signing.timestamp = saved
         self._saved = max(self._saved, saved)
@@ -90,12 +91,9 @@ class Autopilot:
         if self.is_deaf:
             return []
         answers: list[bytes] = []
-        for message in self._codec.parse_buffer(data) or ():
+        for message in self._judged(data):
             kind = message.get_type()
-            if kind == "BAD_DATA":
-                is_unsigned = message.data[:1] == b"\xfd" and not message.data[2] & 1
-                self.rejected["unsigned" if is_unsigned else message.reason] += 1
-            elif kind == "TIMESYNC" and message.tc1 == 0:
+            if kind == "TIMESYNC" and message.tc1 == 0:
                 answers.append(self.send(mavlink.MAVLink_timesync_message(7, message.ts1)))
             elif kind == "SETUP_SIGNING":
                 if not self.is_armed:
@@ -104,3 +102,12 @@ class Autopilot:
             else:
                 self.accepted.append(message)
         return answers
+
+    def _judged(self, data: bytes) -> Iterator[Any]:
+        """The messages that it accepts. The others are counted."""
+        for message in self._codec.parse_buffer(data) or ():
+            if message.get_type() == "BAD_DATA":
+                is_unsigned = message.data[:1] == b"\xfd" and not message.data[2] & 1
+                self.rejected["unsigned" if is_unsigned else message.reason] += 1
+            else:
+                yield message

@@ -20,8 +20,8 @@ from uavlinkd.protocol.crypto import Secret
 KINDS = pytest.mark.parametrize("kind", ["ardupilot", "px4"])
 
 
-def with_key(kind: str = "ardupilot", key: Secret = KEY) -> Autopilot:
-    autopilot = Autopilot(kind)
+def with_key(judge: type[Autopilot], kind: str = "ardupilot", key: Secret = KEY) -> Autopilot:
+    autopilot = judge(kind)
     autopilot.receive(pack(mavlink.MAVLink_setup_signing_message(1, 1, list(key.reveal()), 5)))
     return autopilot
 
@@ -36,9 +36,9 @@ def report(system: int, component: int = 1) -> bytes:
 
 
 @KINDS
-def test_nothing_passes_before_an_answer(kind: str) -> None:
+def test_nothing_passes_before_an_answer(judge: type[Autopilot], kind: str) -> None:
     """Until the autopilot answers a question, nothing passes in either direction; then everything that it signs."""
-    autopilot = with_key(kind)
+    autopilot = with_key(judge, kind)
     wire = Wire(autopilot)
     assert not wire.to_autopilot(command())
     autopilot.is_deaf = True
@@ -57,33 +57,33 @@ def test_nothing_passes_before_an_answer(kind: str) -> None:
     assert set(wire.drops) == {SigningDrop.NOT_PROVEN}
 
 
-def test_unsigned_forged_and_replayed_frames() -> None:
+def test_unsigned_forged_and_replayed_frames(judge: type[Autopilot]) -> None:
     """A frame of the autopilot counts once, with a valid signature."""
-    wire = Wire(with_key())
+    wire = Wire(with_key(judge))
     wire.second()
     wire.second()
     passed = len(wire.passed)
     for raw in wire.recorded[-2:]:
         assert not wire.to_daemon(raw)
     assert not wire.to_daemon(pack(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3)))
-    assert not wire.to_daemon(with_key(key=OTHER).heartbeat())
+    assert not wire.to_daemon(with_key(judge, key=OTHER).heartbeat())
     assert len(wire.passed) == passed
     assert wire.drops[SigningDrop.REPLAYED] == 2
     assert wire.drops[SigningDrop.UNSIGNED] == wire.drops[SigningDrop.BAD_SIGNATURE] == 1
 
 
-def test_frames_that_somebody_on_the_cable_returns() -> None:
+def test_frames_that_somebody_on_the_cable_returns(judge: type[Autopilot]) -> None:
     """What this end signed is no frame of the autopilot."""
-    wire = Wire(with_key())
+    wire = Wire(with_key(judge))
     wire.second()
     assert wire.to_autopilot(command())
     assert not wire.to_daemon(wire.sent[-1])
     assert wire.drops[SigningDrop.REFLECTED] == 1
 
 
-def test_recorded_frames_prove_nothing_after_a_restart() -> None:
+def test_recorded_frames_prove_nothing_after_a_restart(judge: type[Autopilot]) -> None:
     """A new daemon accepts no frame that was recorded before it, earlier answers included."""
-    wire = Wire(with_key())
+    wire = Wire(with_key(judge))
     for _ in range(50):
         wire.second()
     recorded = list(wire.recorded)
@@ -102,9 +102,9 @@ def test_recorded_frames_prove_nothing_after_a_restart() -> None:
 
 
 @KINDS
-def test_restarts(kind: str) -> None:
+def test_restarts(judge: type[Autopilot], kind: str) -> None:
     """After a restart of either end, frames pass again with the autopilot's next HEARTBEATs, and none is rejected."""
-    autopilot = with_key(kind)
+    autopilot = with_key(judge, kind)
     wire = Wire(autopilot)
     wire.second()
     for number in range(100):
@@ -122,9 +122,9 @@ def test_restarts(kind: str) -> None:
 
 
 @pytest.mark.parametrize("timestamp", [10, 2**40, LAST_TIMESTAMP - 1_000_000])
-def test_clocks(timestamp: int) -> None:
+def test_clocks(judge: type[Autopilot], timestamp: int) -> None:
     """The autopilot's clock may jump to any time: the daemon follows its next frame."""
-    wire = Wire(with_key())
+    wire = Wire(with_key(judge))
     wire.second()
     wire.autopilot.set_time(timestamp)
     wire.second()
@@ -134,9 +134,9 @@ def test_clocks(timestamp: int) -> None:
     assert not wire.autopilot.rejected
 
 
-def test_the_last_timestamp() -> None:
+def test_the_last_timestamp(judge: type[Autopilot]) -> None:
     """Behind the last timestamp nothing can be signed: frames are dropped, and counted."""
-    wire = Wire(with_key())
+    wire = Wire(with_key(judge))
     wire.second()
     wire.autopilot.set_time(LAST_TIMESTAMP)
     wire.second()
@@ -144,9 +144,9 @@ def test_the_last_timestamp() -> None:
     assert wire.drops[SigningDrop.NO_TIMESTAMP] == 1
 
 
-def test_a_station_cannot_move_the_timestamp() -> None:
+def test_a_station_cannot_move_the_timestamp(judge: type[Autopilot]) -> None:
     """The timestamp in a station's own signature is replaced with the signature."""
-    wire = Wire(with_key())
+    wire = Wire(with_key(judge))
     wire.second()
     before = wire.signing.timestamp
     codec = mavlink.MAVLink(None, 255, 190)
@@ -156,17 +156,17 @@ def test_a_station_cannot_move_the_timestamp() -> None:
     assert len(wire.autopilot.accepted) == 1
 
 
-def test_mavlink_1() -> None:
+def test_mavlink_1(judge: type[Autopilot]) -> None:
     """A MAVLink 1 frame cannot be signed."""
-    wire = Wire(with_key())
+    wire = Wire(with_key(judge))
     wire.second()
     assert not wire.to_autopilot(pack(mavlink.MAVLink_param_request_list_message(1, 1), 255, 190, version=1))
     assert wire.drops[SigningDrop.MAVLINK1] == 1
 
 
-def test_places() -> None:
+def test_places(judge: type[Autopilot]) -> None:
     """An autopilot keeps few senders. Other vehicles' reports and one peer that invents senders leave room."""
-    wire = Wire(with_key())
+    wire = Wire(with_key(judge))
     wire.second()
     for system in range(1, 50):
         wire.to_autopilot(report(system), f"vehicle {system}")
@@ -182,16 +182,16 @@ def test_places() -> None:
     assert not wire.autopilot.rejected
 
 
-def test_strangers() -> None:
+def test_strangers(judge: type[Autopilot]) -> None:
     """A stranger becomes a client by a frame with the key's signature, also before an answer."""
-    wire = Wire(with_key())
+    wire = Wire(with_key(judge))
     assert not wire.signing.admits([read(command())])
     assert wire.signing.admits([read(wire.autopilot.heartbeat())])
 
 
-def test_set_up() -> None:
+def test_set_up(judge: type[Autopilot]) -> None:
     """An autopilot without a key is used unsigned until it has proven the new one."""
-    autopilot = Autopilot()
+    autopilot = judge()
     wire = Wire(autopilot, is_open=True)
     wire.second()
     assert wire.to_autopilot(command())
@@ -207,9 +207,9 @@ def test_set_up() -> None:
 
 
 @pytest.mark.parametrize("arrives", [False, True])
-def test_a_rotation_that_is_interrupted(*, arrives: bool) -> None:
+def test_a_rotation_that_is_interrupted(judge: type[Autopilot], *, arrives: bool) -> None:
     """A daemon that starts with two keys uses the one that the autopilot has, and the new one ends the old one."""
-    autopilot = with_key()
+    autopilot = with_key(judge)
     wire = Wire(autopilot)
     wire.second()
     if arrives:
@@ -223,15 +223,15 @@ def test_a_rotation_that_is_interrupted(*, arrives: bool) -> None:
         wire.second()
     wire.second()
     assert wire.signing.signer.secret == OTHER
-    assert not wire.to_daemon(with_key().heartbeat())
+    assert not wire.to_daemon(with_key(judge).heartbeat())
     assert wire.drops[SigningDrop.BAD_SIGNATURE] == 1
     assert wire.to_autopilot(command())
 
 
 @KINDS
-def test_rotations_under_traffic(kind: str) -> None:
+def test_rotations_under_traffic(judge: type[Autopilot], kind: str) -> None:
     """At each of 1,000 disarms the key changes. No frame is rejected, and the old key is void at once."""
-    autopilot = with_key(kind)
+    autopilot = with_key(judge, kind)
     wire = Wire(autopilot)
     wire.second()
     keys = [Secret(bytes([1 + number % 250, number // 250]) * 16) for number in range(1000)]
