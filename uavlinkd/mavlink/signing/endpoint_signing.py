@@ -48,6 +48,11 @@ ASK_S: Final = 0.25
 """Between two questions."""
 QUESTIONS: Final = 8
 """The latest questions that may still be answered."""
+LEAP: Final = 12_000_000
+"""Two minutes in timestamps, from the greatest to that of a question. Of a sender that it does not know, an autopilot
+accepts timestamps that are up to a minute old, and after a restart it knows none: behind a leap these are void."""
+STEP: Final = 100_000
+"""A greater step of the autopilot's timestamp (a restart of ArduPilot, satellites, an old frame) has to be proven."""
 
 TIMESYNC: Final = IDS["TIMESYNC"]
 SETUP_SIGNING: Final = IDS["SETUP_SIGNING"]
@@ -179,6 +184,9 @@ class EndpointSigning:
                 self._drops[SigningDrop.REPLAYED] += 1
                 asks = signer
                 continue
+            if is_current and timestamp > self.timestamp + STEP:
+                self.is_proven = is_current = False
+                self._questions.clear()
             self.timestamp = max(self.timestamp, timestamp)
             self.verified_at = now
             if header.msgid == HEARTBEAT:
@@ -218,6 +226,8 @@ class EndpointSigning:
 
     def ask(self, signer: Signer | None, now: float) -> None:
         """Ask the autopilot to prove that it has this key; None: whether it accepts what is unsigned."""
+        if self.is_proven or not self._questions:  # frames may have been signed since the last leap
+            self.timestamp += LEAP
         number = int.from_bytes(self._random(8), "little") >> 1 | 1
         self._questions[number] = signer
         if len(self._questions) > QUESTIONS:
@@ -252,7 +262,8 @@ class EndpointSigning:
         """The autopilot has this key, and all of its frames from now on have greater timestamps."""
         self.signer, self.is_proven, self.is_open = signer, True, False
         self.signers = self.signers[self.signers.index(signer) :]
-        self._floor, self._streams = timestamp, {stream: timestamp}
+        later = {one: last for one, last in self._streams.items() if last > timestamp}
+        self._floor, self._streams = timestamp, later | {stream: timestamp}
         self._questions.clear()
         self._own.clear()
 
