@@ -21,8 +21,7 @@ CLIENT_IDLE_S: Final = 60.0
 class StationEndpoint(DatagramEndpoint):
     """The clients of one station. It has those at the ports in the file while the station has a session.
 
-    ``send`` sends a payload to a port of the station, and raises OSError. ``begin`` and ``finish`` start and end the
-    tunnel.
+    ``send`` sends a payload to a client, and raises OSError. ``begin`` and ``finish`` start and end the tunnel.
     """
 
     is_station = True
@@ -33,7 +32,7 @@ class StationEndpoint(DatagramEndpoint):
         name: str,
         url: StationUrl,
         handler: PortHandler,
-        send: Callable[[int, bytes], None],
+        send: Callable[[bytes, SocketAddress], None],
         begin: Callable[[], None],
         finish: Callable[[], None],
     ) -> None:
@@ -42,8 +41,7 @@ class StationEndpoint(DatagramEndpoint):
         """Whether the station has a session."""
         self._host = url.host
         self._first = [(url.host, port) for port in url.ports]
-        self._send, self._begin, self._finish = send, begin, finish
-        self.sendto = self._send_to
+        self.sendto, self._begin, self._finish = send, begin, finish
 
     def start(self) -> None:
         self._begin()
@@ -94,9 +92,6 @@ class StationEndpoint(DatagramEndpoint):
         for port in self.ports:
             if port.address not in self._first and now - (port.received_at or 0.0) >= CLIENT_IDLE_S:
                 self._forget(port)
-
-    def _send_to(self, payload: bytes, address: SocketAddress) -> None:
-        self._send(address[1], payload)
 
     def _admit(self, address: SocketAddress, now: float) -> UdpPort | None:
         if len(self._ports) >= CLIENTS_PER_ENDPOINT:

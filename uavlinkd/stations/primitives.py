@@ -33,7 +33,7 @@ def mac(key: bytes, data: bytes) -> bytes:
 
 
 def hkdf(key: bytes, material: bytes, outputs: int) -> list[bytes]:
-    """TunnelKeys of 32 bytes from a chaining key: HKDF (RFC 5869) with HMAC-BLAKE2s, as Noise uses it."""
+    """Keys of 32 bytes from a chaining key: HKDF (RFC 5869) with HMAC-BLAKE2s, as Noise uses it."""
     secret, block, blocks = hmac.digest(key, material, "blake2s"), b"", list[bytes]()
     for number in range(1, outputs + 1):
         block = hmac.digest(secret, block + bytes([number]), "blake2s")

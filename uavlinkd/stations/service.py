@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import partial
 from typing import Final, NamedTuple
 
@@ -63,14 +63,14 @@ class Stations(Feature):
         self._stations: dict[Tunnel, Station] = {}
         self._by_key: dict[bytes, Station] = {}
         self._disk = StationDisk(config.state_file)
-        self._places: set[SocketAddress] = set()  # where stations are, or were before a restart
+        self._places: Mapping[bytes, SocketAddress] = {}  # where stations are, or were before a restart
         self._is_started = False
 
     # Life.
 
     def _open(self) -> None:
         """Bind the socket and read the file. Raises BindError."""
-        self._was_at = self._disk.open()
+        self._places = self._disk.open()
         try:
             self._sock = udp_socket(self._config.listen, may_come_later=True)
         except BindError as error:
@@ -85,8 +85,7 @@ class Stations(Feature):
         assert isinstance(url, StationUrl)
         ends = inner.Ends.of(url.host, self._config.address)
         tunnel = Tunnel(self._own, url.key, ends, os.urandom, self._indices, self._disk.timestamp)
-        tunnel.address = self._was_at.get(url.key)
-        self._places.update([] if tunnel.address is None else [tunnel.address])
+        tunnel.address = self._places.get(url.key)
         send = partial(self._send_frames, tunnel)
         endpoint = StationEndpoint(config.name, url, handler, send, partial(self._start, tunnel), self._close)
         answers = TokenBucket(ANSWERS_PER_S, ANSWERS_PER_S, monotonic())
@@ -192,13 +191,13 @@ class Stations(Feature):
             (endpoint.open if tunnel.is_open else endpoint.end)()
 
     def _is_known(self, place: SocketAddress) -> bool:
-        return place in self._places
+        return place in self._places.values()
 
     # Datagrams out.
 
-    def _send_frames(self, tunnel: Tunnel, port: int, payload: bytes) -> None:
-        """Send frames to a port of a station. Raises OSError."""
-        sealed = tunnel.seal(inner.udp(tunnel.ends, MAVLINK_PORT, port, payload), monotonic())
+    def _send_frames(self, tunnel: Tunnel, payload: bytes, client: SocketAddress) -> None:
+        """Send frames to a client of a station. Raises OSError."""
+        sealed = tunnel.seal(inner.udp(tunnel.ends, MAVLINK_PORT, client[1], payload), monotonic())
         if not sealed or tunnel.address is None:
             raise OSError(errno.ENOTCONN, "no session")
         self._sock.sendto(sealed[0], tunnel.address)
@@ -244,9 +243,8 @@ class Stations(Feature):
 
     def do_housekeeping(self, now: float) -> None:
         """Once a second."""
-        places = {tunnel.key: remote_of(at) for tunnel in self._stations if (at := tunnel.address) is not None}
-        self._places = set(places.values())
-        self._disk.follow(places)
+        self._places = {tunnel.key: remote_of(at) for tunnel in self._stations if (at := tunnel.address) is not None}
+        self._disk.follow(self._places)
 
 
 def _index(datagram: bytes, at: int) -> int:

@@ -26,7 +26,7 @@ _PADDING: Final = bytes(15)
 
 
 class TunnelSession:
-    """TunnelKeys of one handshake. All times are monotonic seconds."""
+    """The keys of one handshake and what they carry. All times are monotonic seconds."""
 
     __slots__ = ("_proofs", "_sent", "_window", "born_at", "ends_at", "index", "is_initiator", "keys")
 

@@ -37,8 +37,6 @@ RESPONDER_REKEY_S: Final = REJECT_AFTER_S - KEEPALIVE_S
 """The age at which this daemon makes new keys if the station should have, and did not."""
 COOKIE_S: Final = 120.0
 """How long a cookie of the station is used (section 6.6)."""
-INITIATIONS_S: Final = 0.02
-"""Between two initiations of a station that are answered, as in wireguard-go (device/constants.go)."""
 
 ASK_S: Final = 1.0
 """Between two questions while the station sends. A question and its answer take 148 bytes each, with IPv4 and UDP."""
@@ -99,7 +97,7 @@ class Tunnel:
         self._previous: TunnelSession | None = None
         self._next: TunnelSession | None = None  # answered by this daemon, and not used by the station yet
         self._pending: Initiating | None = None
-        self._initiated_at = self._trying_since = self._responded_at = -NEVER
+        self._initiated_at = self._trying_since = -NEVER
         self._received_at = -NEVER  # its last frames
         self._commanded_at = -NEVER  # the last frame that must be new, whether it was or not
         self._doubted_at = -NEVER  # the last one that was dropped because nothing showed that it is new
@@ -126,9 +124,9 @@ class Tunnel:
 
         After a restart it may be a recorded one: it changes nothing until the station uses the session.
         """
-        if initiation.timestamp <= self._newest_timestamp or now - self._responded_at < INITIATIONS_S:
+        if initiation.timestamp <= self._newest_timestamp:
             raise Drop(DropReason.REPLAYED_INITIATION)
-        self._newest_timestamp, self._responded_at = initiation.timestamp, now
+        self._newest_timestamp = initiation.timestamp
         index = self._new_index()
         datagram, keys = respond(initiation, KeyPair(self._entropy(KEY_BYTES)), index)
         self._forget(self._next)
