@@ -103,7 +103,7 @@ class Attacked:
     def __init__(self, outside: Outside, *, has_session: bool) -> None:
         self.outside = outside
         own = handshake.StationKey(_PRIVATE)
-        self.macs = own.macs
+        self.daemon_key, self.macs = own.key.public, own.macs
         self.client = client = Client(own.key.public)
         outside.station_key = client.key
         config = StationsConfig(Address("0.0.0.0", 51820), Secret(_PRIVATE), "10.66.0.1", Path("state"))

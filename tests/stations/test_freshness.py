@@ -118,23 +118,6 @@ def test_keys_that_the_station_never_used_are_no_evidence(*, answers: bool) -> N
     assert oldest(world) <= MOST_AGE_S
 
 
-@pytest.mark.parametrize("answers", [True, False])
-def test_station_that_was_switched_off_meanwhile(*, answers: bool) -> None:
-    """The attacker blocks it from then on, and lets the daemon's next handshake pass."""
-    world = KeepingWorld(2, answers_pings=answers)
-    world.commands(10.0)
-    world.to_daemon = lambda datagram: 0.02 if datagram[0] == 2 else None
-    world.to_client = lambda datagram: None
-    world.keeping.switch_on()
-    world.commands(70.0)
-    world.to_client = lambda datagram: 0.02
-    world.run(world.now + 0.1)
-    world.to_daemon = lambda datagram: 0.02
-    world.commands(10.0)
-    assert world.ages
-    assert oldest(world) <= MOST_AGE_S
-
-
 @pytest.mark.long
 @pytest.mark.parametrize("answers", [True, False])
 @pytest.mark.parametrize("seed", range(12))

@@ -27,15 +27,6 @@ def middle() -> Iterator[Middle]:
         middle.close()
 
 
-def begin(middle: Middle, rules: str = "") -> None:
-    """Connect, until commands pass or for some seconds."""
-    printed = middle.scene.add("tablet")
-    if rules:
-        middle.scene.tablet.nft(rules)
-    middle.scene.start_daemon()
-    middle.open(printed)
-
-
 def until_commands(middle: Middle) -> None:
     """Run until a command arrives that is sent from now on."""
     first = len(middle.sent)
@@ -51,7 +42,11 @@ def until_commands(middle: Middle) -> None:
 @pytest.mark.parametrize("answers", [True, False])
 def test_delayed_commands_are_new_or_dropped(middle: Middle, delay_s: float, *, answers: bool) -> None:
     """None is older than the bound, none comes twice, and they are back soon after the delay ends."""
-    begin(middle, "" if answers else REFUSING)
+    printed = middle.scene.add("tablet")
+    if not answers:
+        middle.scene.tablet.nft(REFUSING)
+    middle.scene.start_daemon()
+    middle.open(printed)
     until_commands(middle)
     middle.run(3.0)
     middle.delay_s = delay_s

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
 
 from tests.fuzz.stations import THERE, Attacked, Outside, alone
 from tests.processes.frames import heartbeat
+from tests.stations.client import Client
 from uavlinkd.protocol.drops import DropReason
+from uavlinkd.protocol.path import Path
 from uavlinkd.stations import handshake
 from uavlinkd.system.stall import STALE
 
@@ -35,6 +39,40 @@ def test_responses_to_nothing_take_no_budget() -> None:
         attacked.offer(attacked.genuine[0], THERE)
         assert not outside.drops
         assert attacked.endpoint.is_open
+
+
+def test_strangers_get_no_answer() -> None:
+    """One with a key that the daemon does not have, and one that does not have the daemon's."""
+    outside = Outside()
+    with alone(outside):
+        attacked = Attacked(outside, has_session=False)
+        initiation = Client(attacked.daemon_key).initiation()
+        attacked.offer(initiation, STRANGER)
+        attacked.offer(initiation[:-32] + bytes(32), STRANGER)
+    assert outside.drops == [DropReason.UNKNOWN_PEER, DropReason.BAD_MAC1]
+    assert not outside.sent
+
+
+def test_cookie_proves_one_address_for_two_minutes() -> None:
+    macs, there = handshake.Macs(bytes(32)), Path(0, THERE)
+    cookies = handshake.StationCookies(macs, os.urandom, 0.0)
+    message = macs.add(bytes(116), None)
+    cookie = macs.open(cookies.reply(message, 1, there, 0.0), handshake.mac1_of(message))
+    proof = macs.add(bytes(116), cookie)
+    assert cookies.has_valid_mac2(proof, there, 119.0)
+    assert not cookies.has_valid_mac2(proof, Path(0, STRANGER), 119.0)
+    assert not cookies.has_valid_mac2(proof, there, 121.0)
+
+
+def test_few_pings_of_a_station_are_answered() -> None:
+    outside = Outside()
+    with alone(outside):
+        attacked = Attacked(outside, has_session=True)
+        for _ in range(50):
+            ping = attacked.client.packet(1, b"\x08\0\xf7\xff" + bytes(4))
+            attacked.offer(attacked.client.data(ping), THERE)
+    assert len(outside.sent) == 10
+    assert outside.sent[0][1] == THERE
 
 
 def test_strangers_with_the_right_mac1_are_limited() -> None:
