@@ -106,9 +106,8 @@ class Middle:
             self.recorded.append(datagram)
             self._held.append((now, datagram))
             self._release(now)
-        elif sock is self._to_daemon:
-            if self._app_at is not None:
-                self._to_app.sendto(datagram, self._app_at)
+        elif sock is self._to_daemon and self._app_at is not None:
+            self._to_app.sendto(datagram, self._app_at)
         elif sock is self._autopilot:
             for frame in frames_in(datagram):
                 if name_of(frame) == "COMMAND_LONG":

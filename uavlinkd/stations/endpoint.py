@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
-from uavlinkd.io.ports import CLIENTS_PER_ENDPOINT, PortHandler, failure_name
+from uavlinkd.io.ports import PortHandler, failure_name
 from uavlinkd.io.udp_clients import DatagramEndpoint, UdpPort
 from uavlinkd.io.url import StationUrl
 from uavlinkd.mavlink.frames import split_payload
@@ -14,6 +14,9 @@ from uavlinkd.protocol.drops import DropReason
 from uavlinkd.protocol.path import SocketAddress
 from uavlinkd.stations.inner import MOST_PAYLOAD_BYTES
 
+CLIENTS: Final = 8
+"""Most clients of one station. Each gets all frames, along the same radio or Internet link: a captured station could
+multiply them."""
 CLIENT_IDLE_S: Final = 60.0
 """A client at a port that the file does not name is forgotten after this silence."""
 
@@ -94,7 +97,7 @@ class StationEndpoint(DatagramEndpoint):
                 self._forget(port)
 
     def _admit(self, address: SocketAddress, now: float) -> UdpPort | None:
-        if len(self._ports) >= CLIENTS_PER_ENDPOINT:
+        if len(self._ports) >= CLIENTS:
             self.failures["too_many_clients"] += 1
             return None
         return self._open(address, now)

@@ -257,11 +257,11 @@ class Tunnel:
                 self._ask_at = NEVER
         if now >= self._keepalive_at:
             out += self.seal(b"", now)
+        if now >= self._gives_up_at:
+            self._give_up()
         if now >= self._initiate_at(now):
             self._silent_at = NEVER
             out += self.initiate(now)
-        elif now >= self._gives_up_at:
-            self._give_up()
         self._set_next(now)
         return out
 
