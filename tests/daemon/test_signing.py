@@ -258,3 +258,40 @@ async def test_a_daemon_with_a_key() -> None:
             stranger.sendto(pack(mavlink.MAVLink_system_time_message(1, 1)), pair.endpoint._sock.getsockname())  # type: ignore[attr-defined]
             await pair.commands_pass()
         assert len(pair.endpoint.ports) == 1
+
+
+async def test_an_autopilot_that_lost_its_key() -> None:
+    """It was erased, or replaced: setup hands the same key over again, and clear ends what it began."""
+    autopilot = Autopilot()
+    autopilot.receive(pack(mavlink.MAVLink_setup_signing_message(1, 1, list(KEY.reveal()), 5)))
+    async with flying("udpin", autopilot, KEY) as pair:
+        await pair.commands_pass()
+        autopilot.erase()
+        assert (await pair.ask("setup"))["is_changed"]
+        assert autopilot.key == KEY.reveal()
+        await pair.commands_pass()
+        autopilot.erase()
+        assert (await pair.ask("clear", None))["is_changed"]
+        await pair.commands_pass()
+        assert pair.endpoint.signing is None
+
+
+async def test_a_reload_knows_the_key() -> None:
+    """The running configuration has what the command writes into the file."""
+    async with flying("udpin", Autopilot()) as pair:
+        for action, key in (("setup", KEY), ("rotate", OTHER), ("clear", None)):
+            assert (await pair.ask(action, key))["is_changed"]
+            (endpoint,) = pair.vehicle.parts.config.endpoints
+            assert endpoint.signing.keys == (() if key is None else (key,))
+
+
+async def test_timestamps_that_the_autopilot_remembers() -> None:
+    """A new key after a cleared one: the daemon forgot its timestamps, and the autopilot did not."""
+    autopilot = Autopilot()
+    async with flying("udpin", autopilot) as pair:
+        assert (await pair.ask("setup"))["is_changed"]
+        autopilot.set_time(2**45)  # satellites: the year 2026
+        await pair.commands_pass()
+        assert (await pair.ask("clear", None))["is_changed"]
+        assert (await pair.ask("setup", OTHER))["is_changed"]
+        await pair.commands_pass()

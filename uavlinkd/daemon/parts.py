@@ -6,13 +6,14 @@ This is the one module that imports the features, and only those that the config
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 from structlog.typing import FilteringBoundLogger
 
 from uavlinkd.config.members import most_members
-from uavlinkd.config.model import Config
+from uavlinkd.config.model import Config, SigningConfig
 from uavlinkd.daemon.evidence import Evidence
 from uavlinkd.daemon.features import Feature, PathKind
 from uavlinkd.daemon.journal import DaemonJournal
@@ -166,7 +167,13 @@ class DaemonParts:
         """The signatures between this daemon and its autopilots: made when an endpoint or a person wants them."""
         from uavlinkd.daemon.signing import AutopilotSigning  # noqa: PLC0415
 
-        return AutopilotSigning(self.local)
+        return AutopilotSigning(self.local, self._keep_signing)
+
+    def _keep_signing(self, name: str, signing: SigningConfig) -> None:
+        """The keys of an endpoint have changed, and those in the file too: a reload compares the two."""
+        endpoints = self.config.endpoints
+        changed = (replace(one, signing=signing) if one.name == name else one for one in endpoints)
+        self.config = replace(self.config, endpoints=tuple(changed))
 
     def _tls(self) -> WebRelays | None:
         if not any(written.address.resource for relay in self.config.relays for written in relay.addresses):

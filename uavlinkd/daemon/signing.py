@@ -10,6 +10,7 @@ import asyncio
 import json
 import os
 from collections.abc import Callable, Mapping
+from itertools import count
 from typing import Final
 
 from uavlinkd.config.keys import decode_key
@@ -29,6 +30,8 @@ LISTENS_S: Final = 2.5
 """How long to listen before the first key: there may be several autopilots."""
 REPEAT_S: Final = 0.5
 """Between two SETUP_SIGNING."""
+FIRST_JUMP: Final = 40
+"""The second SETUP_SIGNING begins with this power of two as its timestamp. The next ones double it."""
 _LOOK_S: Final = 0.02
 
 OTHER_KEY: Final = (
@@ -45,8 +48,9 @@ _UNKNOWN: Final[dict[str, object]] = {
 class AutopilotSigning:
     """The signing at the endpoints of one daemon: each has an :class:`.EndpointSigning`, or none."""
 
-    def __init__(self, local: LocalEndpoints) -> None:
+    def __init__(self, local: LocalEndpoints, keep: Callable[[str, SigningConfig], object]) -> None:
         self._local = local
+        self._keep = keep  # in the running configuration: the file has it too
         self._is_changing = False
 
     def install(self, endpoint: Endpoint, config: EndpointConfig) -> None:
@@ -87,9 +91,15 @@ class AutopilotSigning:
         self._is_changing = True
         try:
             key = Secret(decode_key(asked["key"])) if asked["key"] else None
-            return await self._change(endpoint, asked["action"], key, asked["link_id"])
+            answer = await self._change(endpoint, asked["action"], key, asked["link_id"])
         finally:
             self._is_changing = False
+            if endpoint.signing is not None:
+                endpoint.signing.may_lack_key = False
+        if answer["is_changed"]:
+            link_id = asked["link_id"] if endpoint.signing is None else endpoint.signing.link_id
+            self._keep(endpoint.name, SigningConfig(() if key is None else (key,), link_id))
+        return answer
 
     async def _change(self, endpoint: Endpoint, action: str, key: Secret | None, link_id: int) -> dict[str, object]:
         signing = endpoint.signing
@@ -100,8 +110,11 @@ class AutopilotSigning:
         is_new = signing.is_open
         if is_new:
             await _until(lambda: signing.is_proven, LISTENS_S)
+        elif await _answers(signing):
+            await _until(lambda: bool(_heard(signing)), HEARD_S)
         else:
-            await _until(lambda: signing.is_proven and bool(_heard(signing)), HEARD_S)
+            signing.is_proven, signing.has_foreign_key, signing.may_lack_key = False, False, True
+            await asyncio.sleep(LISTENS_S)
         if key is not None and signing.is_proven and signing.signer.secret == key:
             return await _done(signing)
         heard = _heard(signing)
@@ -113,9 +126,12 @@ class AutopilotSigning:
         (system,) = heard
         if key is None:
             return await self._clear(endpoint, signing, system)
-        newest = signing.add(key)
+        newest, attempts = signing.add(key), count()
 
         def set_up() -> None:
+            # Until it restarts, the autopilot refuses timestamps below those that this daemon used with another key.
+            if attempt := next(attempts):
+                signing.timestamp = max(signing.timestamp, 1 << (FIRST_JUMP - 1 + attempt))
             signing.set_up(key, system)
             signing.ask(newest, monotonic())
 
@@ -128,12 +144,20 @@ class AutopilotSigning:
         def is_cleared() -> bool:
             return signing.unsigned_at > began_at
 
-        await _repeat(lambda: signing.set_up(None, system), is_cleared)
-        signing.is_clearing = False
-        if not is_cleared():
-            return _UNKNOWN
+        if signing.is_proven:
+            signing.may_lack_key = True
+            await _repeat(lambda: signing.set_up(None, system), is_cleared)
+            if not is_cleared():
+                return _UNKNOWN
         self._remove(endpoint)
         return {"problem": "", "is_changed": True, "system": system, "accepts_unsigned": True}
+
+
+async def _answers(signing: EndpointSigning) -> bool:
+    """Whether the autopilot proves its key now: one that was erased since its last proof does not."""
+    began_at = monotonic()
+    await _repeat(lambda: signing.ask(signing.signer, monotonic()), lambda: signing.proven_at >= began_at, HEARD_S)
+    return signing.proven_at >= began_at
 
 
 def _heard(signing: EndpointSigning) -> dict[int, bool]:
@@ -144,11 +168,12 @@ def _heard(signing: EndpointSigning) -> dict[int, bool]:
 
 def _problem(signing: EndpointSigning, heard: Mapping[int, bool]) -> str | None:
     """Why the autopilot cannot get a key now."""
-    if signing.is_open and signing.has_foreign_key:
+    is_unsigned = monotonic() - signing.unsigned_at < HEARD_S
+    if not signing.is_proven and signing.has_foreign_key:
         return OTHER_KEY
     if not heard:
         return f"no autopilot was heard for {HEARD_S:g} s: is it on, and does `uavlinkd status` show its frames?"
-    if not signing.is_open and not signing.is_proven:
+    if not (signing.is_open or signing.is_proven or is_unsigned):
         return "the autopilot has not proven that it has this endpoint's key: see `uavlinkd status`"
     if len(heard) > 1:
         systems = " and ".join(map(str, sorted(heard)))

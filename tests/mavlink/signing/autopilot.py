@@ -77,6 +77,11 @@ class Autopilot:
         self._codec.signing.timestamp = saved
         self._saved = max(self._saved, saved)
 
+    def erase(self) -> None:
+        """Restart without a key."""
+        self._stored, self._saved = (NO_KEY, 0), 0
+        self._start()
+
     def heartbeat(self) -> bytes:
         mode = ARMED if self.is_armed else 0
         return self.send(mavlink.MAVLink_heartbeat_message(2, 3, mode, 0, 4, 3))

@@ -243,6 +243,7 @@ def test_strangers(judge: type[Autopilot]) -> None:
     """A stranger becomes a client by a frame with the key's signature, also before an answer."""
     wire = Wire(with_key(judge))
     assert not wire.signing.admits([read(command())])
+    assert wire.drops[SigningDrop.UNSIGNED] == 1
     assert wire.signing.admits([read(wire.autopilot.heartbeat())])
 
 

@@ -97,16 +97,17 @@ class EndpointSigning:
         """Signs; proven if :attr:`is_proven`."""
         self.is_proven = False
         self.is_open = is_open
-        self.is_clearing = False
-        """Whether the autopilot was told to use no key."""
+        self.may_lack_key = False
+        """Whether to hear HEARTBEATs without a signature: the autopilot was told to use no key, or has lost it."""
         self.has_foreign_key = False
         """Whether a signed frame came that none of the keys made."""
         self.accepts_unsigned = False
         """Whether the autopilot answered :meth:`ask_unsigned`."""
         self.vehicles = Vehicles()
         """The autopilots behind the endpoint; those without a signature only while they need none."""
-        self.verified_at = self.unsigned_at = -inf
-        """When the last frame with a valid signature came; and while none is needed, the last HEARTBEAT without."""
+        self.proven_at = self.verified_at = self.unsigned_at = -inf
+        """When the last answer and the last frame with a valid signature came; and while none is needed, the last
+        HEARTBEAT without."""
         self.timestamp = 0
         """The greatest of all verified frames and of this end."""
         self.link_id = link_id
@@ -162,7 +163,13 @@ class EndpointSigning:
 
     def admits(self, frames: Sequence[Frame]) -> bool:
         """Whether a stranger that sent these may become a client."""
-        return self.is_open or any(is_signed(frame.raw) and self._signer_of(frame.raw) for frame in frames)
+        if self.is_open or self.may_lack_key:
+            return True
+        if any(is_signed(frame.raw) and self._signer_of(frame.raw) for frame in frames):
+            return True
+        for frame in frames:
+            self._drops[SigningDrop.BAD_SIGNATURE if is_signed(frame.raw) else SigningDrop.UNSIGNED] += 1
+        return False
 
     def accept(self, frames: Sequence[Frame], now: float) -> list[Frame]:
         """Those that are signed and new, without their signatures."""
@@ -193,6 +200,7 @@ class EndpointSigning:
                 self.vehicles.note(frame, now)
             if header.msgid == TIMESYNC and self._questions and self._is_answer(frame, signer):
                 self._prove(signer, stream, timestamp)
+                self.proven_at = now
             elif not is_current:
                 self._drops[SigningDrop.NOT_PROVEN] += 1
                 asks = signer
@@ -214,7 +222,7 @@ class EndpointSigning:
     def _pass_unsigned(self, frame: Frame, passed: list[Frame], now: float) -> None:
         has_signature = is_signed(frame.raw)
         self.has_foreign_key |= has_signature
-        if frame.header.msgid == HEARTBEAT and not has_signature and (self.is_open or self.is_clearing):
+        if frame.header.msgid == HEARTBEAT and not has_signature and (self.is_open or self.may_lack_key):
             self.vehicles.note(frame, now)
             self.unsigned_at = now
         if self.is_open:
@@ -239,7 +247,6 @@ class EndpointSigning:
         """Send SETUP_SIGNING, signed with the key in force if there is one. None: the autopilot is to use no key."""
         secret, first = (bytes(32), 0) if key is None else (key.reveal(), self.timestamp + 1)
         signer = self.signer if self.is_proven else None
-        self.is_clearing = key is None
         self._send(SETUP_SIGNING, _SETUP.pack(first, system, _AUTOPILOT, secret), signer)
 
     def _send(self, message: int, payload: bytes, signer: Signer | None) -> None:
