@@ -21,12 +21,20 @@ from tests.samples import pack
 from tests.waiting import until
 from uavlinkd.config.keys import encode_key
 from uavlinkd.config.model import LINK_ID
+from uavlinkd.daemon import signing
 from uavlinkd.daemon.daemon import Daemon
 from uavlinkd.io.url import EndpointKind, NetworkUrl, SerialUrl
 from uavlinkd.protocol.crypto import Secret
 
 HEARTBEAT_S = 0.1
 """Between two of the autopilot: a real one sends one a second."""
+
+
+@pytest.fixture(autouse=True)
+def _listens_for_less_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The autopilot here sends ten times as many HEARTBEATs."""
+    monkeypatch.setattr(signing, "LISTENS_S", 0.5)
+    monkeypatch.setattr(signing, "HEARD_S", 1.0)
 
 
 class Cable:
@@ -118,8 +126,8 @@ async def flying(kind: str, autopilot: Autopilot, *keys: Secret) -> AsyncIterato
     else:
         url = NetworkUrl(EndpointKind.UDPIN, ANY_PORT)
     of_vehicle = config("left", url)
-    signing = replace(of_vehicle.endpoints[0].signing, keys=keys)
-    vehicle = Daemon(replace(of_vehicle, endpoints=(replace(of_vehicle.endpoints[0], signing=signing),)))
+    signs = replace(of_vehicle.endpoints[0].signing, keys=keys)
+    vehicle = Daemon(replace(of_vehicle, endpoints=(replace(of_vehicle.endpoints[0], signing=signs),)))
     await vehicle.start()
     address = tuple(vehicle.parts.peer_sockets.addresses)
     ground = Daemon(config("right", NetworkUrl(EndpointKind.UDPIN, ANY_PORT), address))
