@@ -121,7 +121,7 @@ def test_what_is_to_be_done_is_on_standard_error(
     assert main(["fleet", "sign", "--replace", "v7"]) == 0
     error = capsys.readouterr().err
     assert error.startswith("paste the line of `uavlinkd enroll NAME`, then press Enter\n")
-    assert "serial 2 is revoked: `enroll --finish`, then `uavlinkd fleet publish`, then restart v7\n" in error
+    assert "serial 2 is revoked: `enroll --finish`, `uavlinkd fleet publish`, then restart it\n" in error
     monkeypatch.setattr("sys.stdin", Terminal(say("fleet sign v7")))
     assert main(["enroll", "--finish"]) == 0
     assert "compare the fleet's eight characters with those that `fleet sign` printed" in capsys.readouterr().err
@@ -186,7 +186,7 @@ def test_lines_that_cannot_be_used_are_refused(
         assert "to change it, sign the line of `uavlinkd enroll` with --replace v7" in say(f"fleet sign v7 {change}")
     assert "is not a name" in say("enroll V7")
     monkeypatch.chdir(other)
-    assert "the line is for v7, and there is no v7.key: run `uavlinkd enroll NAME` here" in say(
+    assert "the line is for v7, and there is no v7.key: for another machine, card or folder, add --replace" in say(
         "enroll --finish", line
     )
     monkeypatch.chdir(place)

@@ -13,6 +13,7 @@ import tomllib
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -121,6 +122,11 @@ def test_second_run_keeps_the_key_and_says_so(hosts: Hosts, say: Say) -> None:
     say("fleet enroll pi@v7 --id 7")
     before = read_manifest(Path("fleet"))
     hosts.commands.clear()
+    url = "udpin:127.0.0.1:14999"
+    say(f"fleet enroll pi@v7 --url {url}")
+    endpoints = tomllib.loads((hosts.home("v7") / "v7.toml").read_text())["endpoint"]
+    assert [(one["url"], one["system_ids"]) for one in endpoints] == [(url, [7])]
+    hosts.commands.clear()
     assert "v7 is a member already: it keeps its key" in say("fleet enroll pi@v7 --id 7")
     assert hosts.commands == [("pi@v7", "uavlinkd enroll --finish --config v7.toml")]
     assert read_manifest(Path("fleet")) == before
@@ -137,7 +143,7 @@ def test_new_card_needs_replace(hosts: Hosts, say: Say) -> None:
         path.unlink()
     error = say("fleet enroll v7")
     assert "there is no v7.key" in error
-    assert "For another machine, card or folder, add --replace" in error
+    assert "for another machine, card or folder, add --replace" in error
     say("fleet enroll v7 --replace")
     assert certified(hosts, "v7")
 
@@ -249,7 +255,12 @@ def test_machine_gets_its_own_name_only(hosts: Hosts, say: Say) -> None:
 
 def test_service_is_started_and_its_link_awaited(hosts: Hosts, say: Say, monkeypatch: pytest.MonkeyPatch) -> None:
     """Files are where the unit has them, the unit is linked if there is none, and root restarts the daemon."""
-    status = {"peers": {"gs": {"state": "up"}, "v8": {"state": "waiting"}}, "relays": {"relay": {"state": "up"}}}
+    status: dict[str, Any] = {
+        "peers": {"gs": {"state": "up"}, "v8": {"state": "waiting"}},
+        "relays": {"relay": {"state": "up"}},
+        "findings": [],
+        "process": {"uptime_s": 7.0},
+    }
     hosts.answers |= {f"systemctl {verb}": (0, "", "") for verb in ("cat", "link", "enable", "restart")}
     hosts.answers["uavlinkd status"] = (1, json.dumps(status), "")
     hosts.answers["id -u"] = (0, "1000\n", "")
@@ -272,10 +283,18 @@ def test_service_is_started_and_its_link_awaited(hosts: Hosts, say: Say, monkeyp
     status["peers"]["gs"]["state"] = "waiting"
     hosts.answers["uavlinkd status"] = (1, json.dumps(status), "")
     assert "v7 has a link with relay\n" in say("fleet enroll pi@v7 --service")
+    no_device = {"subject": "endpoint", "name": "autopilot", "text": "it cannot be opened", "remedy": "plug it in"}
+    status["findings"] = [{"subject": "peer", "name": "gs", "text": "slow", "remedy": "wait"}, no_device]
+    hosts.answers["uavlinkd status"] = (1, json.dumps(status), "")
+    assert say("fleet enroll pi@v7 --service").endswith("pi@v7: autopilot: it cannot be opened: plug it in\n")
     hosts.answers["uavlinkd status"] = (1, "0 of 1 peers up", "")
     hosts.commands.clear()
     assert "without a link for 0 s:\n0 of 1 peers up" in say("fleet enroll pi@v7 --service")
     assert not [command for _, command in hosts.commands if "systemctl link" in command]
+    hosts.answers["systemctl restart"] = (1, "", "Job for uavlinkd@v7.service failed. See journalctl.")
+    hosts.answers["journalctl _SYSTEMD_UNIT=uavlinkd@v7.service"] = (0, "v7.toml: link.suites: is empty\n", "")
+    said = say("fleet enroll pi@v7 --service")
+    assert said.endswith("failed. See journalctl.\nIts log ends with: v7.toml: link.suites: is empty\n")
     hosts.answers["systemctl cat"] = (1, "", "No files found for uavlinkd@v7.service.")
     hosts.answers["systemctl link"] = (1, "", "Failed to link unit: No such file")
     assert "Install uavlinkd there in /opt/uavlinkd, or its package" in say("fleet enroll pi@v7 --service")

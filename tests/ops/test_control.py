@@ -105,7 +105,7 @@ async def test_stopped_server_leaves_no_socket(path: Path) -> None:
 
 async def test_socket_of_a_running_daemon_is_kept(server: ControlServer, path: Path) -> None:
     """A second server does not start, and the first one still answers."""
-    with pytest.raises(ControlError, match="another daemon answers there"):
+    with pytest.raises(ControlError, match="a daemon runs here already"):
         await ControlServer(path, lambda _: {}).start()
     assert await asyncio.to_thread(ask, path, "status") == {"name": "drone0"}
 

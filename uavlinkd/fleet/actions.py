@@ -75,18 +75,18 @@ def _sign(options: argparse.Namespace) -> None:
     ask = passphrase_from(options.passphrase_file)
     before, fleet = operations.sign(options.out, request, _identity(options), ask, replaces=replaces)
     print(operations.line_of(fleet, request.name))
-    _note_signed(before, fleet, request.name, replaces="`enroll --finish`, then " if replaces else None)
+    _note_signed(before, fleet, request.name, then="`enroll --finish`, `uavlinkd fleet publish`, then restart it")
     _note(f"fleet {fingerprint_of(fleet.authority.public)}: `enroll --finish` prints the same on {request.name}")
 
 
-def _note_signed(before: Fleet, fleet: Fleet, name: str, *, replaces: str | None) -> None:
-    """Print what was signed. ``replaces``: what comes before `publish`, for a new key of a member; else None."""
+def _note_signed(before: Fleet, fleet: Fleet, name: str, *, then: str) -> None:
+    """Print what was signed. ``then``: what is left to do if a serial was revoked by that."""
     member = fleet.member(name)
     role, serial = member.role.name.lower(), member.certificate.serial
     _note(f"signed {name}: {role}, system id {member.ids}, serial {serial}")
-    former = [each.certificate.serial for each in fleet.members if each.name == name][:-1]
-    if replaces is not None and former:
-        _note(f"serial {former[-1]} is revoked: {replaces}`uavlinkd fleet publish`, then restart {name}")
+    former = next((each for each in before.current if each.name == name), None)
+    if former is not None and fleet.is_revoked(former):
+        _note(f"serial {former.certificate.serial} is revoked: {then}")
     _note_contacts(before, fleet)
 
 
@@ -211,7 +211,8 @@ def _enroll_machine(
         operations.check_signing(options.out, name, identity, ask, replaces=options.replace)
         request = machine.request()
         before, fleet = operations.sign(options.out, request, identity, ask, replaces=options.replace)
-        _note_signed(before, fleet, name, replaces="" if options.replace else None)
+        restart = "" if options.service else ", then restart it"
+        _note_signed(before, fleet, name, then=f"`uavlinkd fleet publish`{restart}")
     elif not identity.is_of(known):
         raise FleetError(f"{name} is {known.role.name.lower()}, system id {known.ids}: --replace changes that")
     else:
@@ -223,7 +224,10 @@ def _enroll_machine(
     if options.service:
         machine.start_service()
         if fleet.calls(fleet.member(name).role):
-            _say(f"{name} has a link with {', '.join(machine.wait_for_link())}")
+            peers, problems = machine.wait_for_link()
+            _say(f"{name} has a link with {', '.join(peers)}")
+            if problems:
+                raise CommandError("\n".join(problems))
 
 
 def _exchange(options: argparse.Namespace) -> None:

@@ -43,7 +43,7 @@ def add_fleet(fleet: argparse.ArgumentParser) -> None:
     enroll.add_argument("--name", metavar="NAME", help="the member's name (default: HOST up to its first dot)")
     enroll.add_argument("--replace", action="store_true", help="a new key for each, and revoke the old one")
     _add_identity(enroll)
-    enroll.add_argument("--url", metavar="URL", help="endpoint of a new configuration")
+    enroll.add_argument("--url", metavar="URL", help="where the autopilot or the ground control software is")
     enroll.add_argument("--service", action="store_true", help="files, start and link of the service uavlinkd@NAME")
     sign = add("sign", "read the line of `uavlinkd enroll NAME`, and print the one for `uavlinkd enroll --finish`")
     sign.add_argument("name", nargs="?", metavar="NAME", help="print the line of this member once more")
@@ -86,7 +86,7 @@ def add_enroll(enroll: argparse.ArgumentParser) -> None:
     enroll.add_argument("--finish", nargs="?", const="", metavar="LINE", help="(default: from standard input)")
     enroll.add_argument("--config", metavar="FILE", type=Path, help="the configuration (default: NAME.toml)")
     enroll.add_argument("--keys", metavar="DIR", type=Path, help="for a service: the folder of its keys")
-    enroll.add_argument("--url", metavar="URL", help="endpoint of a new configuration")
+    enroll.add_argument("--url", metavar="URL", help="where the autopilot or the ground control software is")
     enroll.add_argument("--control-socket", metavar="FILE", help="of a new configuration (default: NAME.sock)")
 
 

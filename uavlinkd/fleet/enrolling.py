@@ -98,8 +98,10 @@ def finish(line: str, config: Path | None, folder: Path | None, url: str | None,
     former = own if own != key else _numbered(key, -1)
     is_replaced = "fleet" in table and former != key and place.key(former).exists()
     if table:
-        if url is not None and repr(url) not in str(table.get("endpoint")):
-            raise FleetError(f"{place.config} exists: write the url into its [[endpoint]], and leave --url out")
+        if url is not None and repr(url) not in str(endpoints := table.get("endpoint")):
+            if not (isinstance(endpoints, list) and len(endpoints) == 1 and isinstance(endpoints[0], dict)):
+                raise FleetError(f"{place.config} has not one [[endpoint]]: write the url there, and leave --url out")
+            table["endpoint"] = [endpoints[0] | {"url": url}]
         table = {**({"listen": listen} if listen else {}), **table, "private_key_file": key}
     else:
         socket = socket or (f"{name}.sock" if folder is None else f"/run/uavlinkd/{folder.name}/control.sock")
@@ -110,12 +112,13 @@ def finish(line: str, config: Path | None, folder: Path | None, url: str | None,
             place.key(former).unlink()
     contacts = ", ".join(certificate_in(contact).name for contact in reply.contacts)
     of_vehicle = certificate.role is MemberRole.VEHICLE
+    ids = ids_of(certificate)
     what = f"{SYSTEM_ID} of the autopilot" if of_vehicle else "the id of the ground control station"
     start = f"uavlinkd {'relay' if daemon.is_only_relay else 'run'} --config {place.config}"
     return [
         f"{name} is a member of fleet {fingerprint_of(reply.authority)}.",
         f"{place.config}: {certificate.role.name.lower()}, contacts {contacts or 'none'}",
-        *([f"Set {what} to system id {ids_of(certificate)}."] if ids_of(certificate) else []),
+        *([f"Set {what} to {'one of ' if '-' in ids else ''}system id {ids}."] if ids else []),
         *([f"Then: {start}; if it runs already, restart it."] if folder is None else []),
         *([f"The former key, {place.key(former)}, was deleted."] if is_replaced else []),
     ]
@@ -177,8 +180,9 @@ def _certified_key(reply: Reply, place: MemberFiles, files: Sequence[str]) -> st
     paths = [place.key(file) for file in files]
     if not any(path.exists() for path in paths):
         raise FleetError(
-            f"the line is for {certificate.name}, and there is no {paths[-1]}: run `uavlinkd enroll NAME` here, and"
-            " sign its line"
+            f"the line is for {certificate.name}, and there is no {paths[-1]}: for another machine, card or folder,"
+            f" add --replace (by hand: `uavlinkd enroll {certificate.name}` here, and `fleet sign --replace"
+            f" {certificate.name}`)"
         )
     for file, path in zip(files, paths, strict=True):
         if path.exists():
@@ -186,4 +190,4 @@ def _certified_key(reply: Reply, place: MemberFiles, files: Sequence[str]) -> st
             if is_certified(from_base64(reply.fleet["certificate"]), public, authority):
                 return file
     text = f"the line has the certificate of another key, named {certificate.name}, or is not signed"
-    raise FleetError(f"{text}: use the line for this one")
+    raise FleetError(f"{text}: use the line for this one, or for another machine, card or folder add --replace")

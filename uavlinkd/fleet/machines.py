@@ -25,6 +25,8 @@ from uavlinkd.system.terminal import CommandError
 
 LINK_WAIT_S: Final = 30.0
 """How long a started daemon may take until its first link is up."""
+SETTLED_S: Final = 6.0
+"""The age from which a daemon's findings name an absent autopilot, which was silent for 5 s then."""
 _POLL_S: Final = 1.0
 _UNITS: Final = "/opt/uavlinkd/lib/systemd/system"  # where pip puts them; a package's are where systemd looks
 _FAILED_SSH: Final = 255  # ssh(1): an error of ssh itself; else the status is that of the command there
@@ -33,10 +35,6 @@ _REMEDIES: Final = (
     (r"Failed to link unit", "Install uavlinkd there in /opt/uavlinkd, or its package"),
     (r"not found|Unknown command", "Install uavlinkd there, with its link in /usr/local/bin"),
     (r"invalid choice|unrecognized arguments", "Install the version of uavlinkd there that is here"),
-    (
-        r"there is no .*\.key|certificate of another key",
-        "For another machine, card or folder, add --replace",
-    ),
 )
 """What to do about words of a shell, sudo, systemctl or another version, which name no remedy for this command."""
 
@@ -93,24 +91,34 @@ class Machine:
             template = "".join(self.unit.partition("@")[:2])
             self._run("systemctl", "link", f"{_UNITS}/{template}.service")
         self._run("systemctl", "enable", self.unit)
-        self._run("systemctl", "restart", self.unit)
+        try:
+            self._run("systemctl", "restart", self.unit)
+        except CommandError as error:
+            last = ("journalctl", f"_SYSTEMD_UNIT={self.unit}.service", "--lines=1", "--output=cat")
+            raise CommandError(
+                f"{error}\nIts log ends with: {self._run(*last, accepted=range(256)).strip()}"
+            ) from None
 
-    def wait_for_link(self) -> list[str]:
-        """The names of the peers whose links are up, once there are any; else, in the end, of the relays.
+    def wait_for_link(self) -> tuple[list[str], list[str]]:
+        """The names of the peers whose links are up, once there are any, else of the relays; and endpoints' problems.
 
         Raises CommandError with the status there if nothing is up.
         """
         status, give_up_at = (*self._uavlinkd, "status", "--config", self._config), time.monotonic() + LINK_WAIT_S
         while True:
             up: dict[str, list[str]] = {"peers": [], "relays": []}
-            with suppress(ValueError, LookupError, AttributeError):  # the daemon does not answer yet
+            age_s, problems = 0.0, list[str]()
+            with suppress(ValueError, LookupError, TypeError, AttributeError):  # the daemon does not answer yet
                 facts = json.loads(self._run(*status, "--json", accepted=(0, 1)))
                 up = {kind: [name for name, one in facts[kind].items() if one["state"] == "up"] for kind in up}
-            if up["peers"] or time.monotonic() >= give_up_at:
+                found = [one for one in facts["findings"] if one["subject"] == "endpoint"]
+                problems = [f"{one['name']}: {one['text']}: {one['remedy']}" for one in found]
+                age_s = float(facts["process"]["uptime_s"])
+            if (up["peers"] and age_s >= SETTLED_S) or time.monotonic() >= give_up_at:
                 break
             time.sleep(_POLL_S)
         if names := up["peers"] or up["relays"]:
-            return names
+            return names, problems
         said = self._run(*status, accepted=(0, 1))
         raise CommandError(f"it is enrolled and its service runs, without a link for {LINK_WAIT_S:.0f} s:\n{said}")
 

@@ -65,16 +65,17 @@ def certify(
 ) -> Fleet:
     """Sign a certificate for a new member, or a new key of one: then its former serial is revoked too."""
     role, ids, addresses = identity
+    again = f"--replace {name}"
     former = next((member for member in fleet.current if member.name == name), None)
     if former is not None and not replaces:
         raise FleetError(
-            f'this fleet has a "{name}" already: choose another name, or replace its key (--replace {name})'
+            f'this fleet has a "{name}" already: choose another name, or add --replace (`sign`: {again})'
         )
     gone = fleet.former(name)
     if gone is not None and not replaces:
         raise FleetError(
             f"{name} was revoked, as serial {gone.certificate.serial}: if it is to come back with a new key,"
-            f" --replace {name}; else choose another name"
+            f" add --replace (`sign`: {again}); else choose another name"
         )
     model = former or gone
     if model is not None:

@@ -384,7 +384,7 @@ def no_answer(peer: PeerFacts) -> Signs:
     if peer.link.is_overdue(peer.now) and (was_up or config.addresses or config.relays):
         bound = [name for name, relay in peer.daemon.relay_links.items() if relay.state_for(peer.link) == "bound"]
         via = f" through the {titled('relay', bound[0])}, which answers" if bound else ""
-        more = ", or it has a bulletin that revokes this daemon (`uavlinkd fleet list` shows whether)"
+        more = ", or it has a bulletin that revokes this daemon (on the laptop: `uavlinkd fleet list`)"
         yield {
             "places": f"it any more{via}" if was_up else peer.addresses or f"it{via}",
             "more": more if peer.is_certified else "",

@@ -97,7 +97,7 @@ OF_DAEMON: Final = (
     Row(
         *("own_certificate_revoked", FAULT, signs.own_certificate_revoked),
         "the bulletin {number} revokes the certificate of this daemon (serial {serial}): members refuse it",
-        "if this machine was not captured, run `uavlinkd enroll` here again and let the authority sign its line",
+        "if this machine was not captured, on the laptop: uavlinkd fleet enroll {here} --replace --service",
     ),
     Row(
         *("bulletin_awaited", FAULT, signs.bulletin_awaited),

@@ -59,7 +59,7 @@ class ControlServer:
         """Listen on the socket. Raises ControlError if the path cannot be used."""
         start = f"cannot listen on the control socket {self._path}"
         if _is_served(self._path):
-            raise ControlError(f"{start}: another daemon answers there: choose another path")
+            raise ControlError(f"{start}: a daemon runs here already, and answers there")
         sock = _unix_socket()
         try:
             if self._path.is_socket():
