@@ -9,6 +9,7 @@ from contextlib import suppress
 import pytest
 
 from tests import waiting
+from tests.kernel_queues import receive_queue
 from tests.processes.frames import command_long, ground_heartbeat, heartbeat
 from tests.processes.harness import Stage
 from tests.processes.process import DaemonProcess
@@ -166,3 +167,14 @@ async def test_station_that_answers_nothing_is_named_with_its_remedy(setup: Setu
     assert "remoteip=10.66.0.1" in finding["remedy"]
     assert heartbeat() in tablet.payloads
     assert arm not in setup.autopilot.frames
+
+
+async def test_errors_of_answers_to_closed_ports_do_not_stay(setup: Setup) -> None:
+    """The socket would be readable for good, and the daemon busy."""
+    await setup.connect()
+    port = setup.tablet.daemon[1]
+    for count in range(2, 20):
+        with open_socket("127.0.0.1") as closed:
+            for _ in range(count):
+                closed.sendto(setup.tablet.client.initiation(), setup.tablet.daemon)
+        await waiting.until(lambda: receive_queue(port).waiting_bytes == 0)

@@ -56,16 +56,6 @@ async def test_disk_that_takes_nothing_stops_no_handshake(tmp_path: Path) -> Non
     assert opened(folder / "state").timestamp() > stamps[-1]
 
 
-async def test_numbers_are_reserved_before_they_run_out(tmp_path: Path) -> None:
-    disk = opened(tmp_path / "state")
-    for _ in range(BLOCK // 2 + 1):
-        disk.timestamp()
-    disk.follow({})
-    await waiting.until(lambda: disk.left >= BLOCK)
-    for _ in range(BLOCK // 2):
-        disk.timestamp()
-
-
 @pytest.mark.parametrize(
     "content",
     [

@@ -105,7 +105,4 @@ async def test_none_is_accepted() -> None:
             assert list(after["endpoints"]["tablet"]["clients"]) == ["10.66.0.2:14550"]
             talk.number += 1
             await setup.until_commands_pass(ground_heartbeat(talk.number))
-        used_s = cpu_s(setup.daemon.pid)
-        await asyncio.sleep(1.0)
-        assert cpu_s(setup.daemon.pid) - used_s < 0.5  # cookies to ports that are closed now cost nothing afterwards
         tablet.close()
