@@ -41,29 +41,32 @@ def missing_tools() -> list[str]:
     return tools or ([] if Path("/usr/include/valgrind/callgrind.h").exists() else ["valgrind/callgrind.h"])
 
 
-def count(folder: Path, *, python: str = sys.executable, idle_s: float = 0.0) -> dict[str, Cost]:
+def count(folder: Path, *, python: str = sys.executable, idle_s: float = 0.0, signs: bool = False) -> dict[str, Cost]:
     """Count what frames cost, by the side, and ``idle``: what a second costs one of both without frames.
 
-    ``idle_s``: for so many seconds. The folder gets callgrind's files. Raises RuntimeError: the daemons failed.
+    ``idle_s``: for so many seconds. ``signs``: at both endpoints. The folder gets callgrind's files. Raises
+    RuntimeError: the daemons failed.
     """
     subprocess.run(["gcc", "-O2", "-shared", "-fPIC", "-o", folder / "counting.so", SOURCE, "-ldl"], check=True)
-    dumps = _dumps(folder, python, FRAMES, 0.0, slower=SLOWER)
+    dumps = _dumps(folder, python, FRAMES, 0.0, slower=SLOWER, signs=signs)
     costs = {
         side: Cost(*(round(median(values)) for values in zip(*dumps[at * FRAMES : (at + 1) * FRAMES], strict=True)))
         for at, side in enumerate(SIDES)
     }
     if idle_s:
-        (totals,) = _dumps(folder, python, 0, idle_s, slower=1)
+        (totals,) = _dumps(folder, python, 0, idle_s, slower=1, signs=signs)
         costs["idle"] = Cost(*(round(total / (2 * idle_s)) for total in totals))
     return costs
 
 
-def _dumps(folder: Path, python: str, frames: int, idle_s: float, *, slower: int) -> list[tuple[int, int]]:
+def _dumps(
+    folder: Path, python: str, frames: int, idle_s: float, *, slower: int, signs: bool
+) -> list[tuple[int, int]]:
     """What one run of :mod:`.pair` counted, in its order."""
     library, out = folder / "counting.so", folder / "out"
     command = [*VALGRIND, f"--callgrind-out-file={out}", python, "-m", "tests.bench.cost.pair"]
     environment = {**os.environ, "LD_PRELOAD": str(library), "PYTHONPATH": str(ROOT), "COUNTING_SLOWER": str(slower)}
-    arguments = [str(library), str(frames), str(idle_s)]
+    arguments = [str(library), str(frames), str(idle_s), *(["signs"] if signs else [])]
     done = subprocess.run(
         [*command, *arguments], env=environment, cwd=folder, capture_output=True, text=True, check=False
     )

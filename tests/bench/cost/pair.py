@@ -13,10 +13,17 @@ import socket
 import sys
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any, Final
 
+from pymavlink.dialects.v20 import all as mavlink
+
 from tests.daemon_pair import ANY_PORT, are_linked, attitude, config
+from tests.mavlink.signing.autopilot import Autopilot
+from tests.mavlink.signing.wire import KEY
+from tests.samples import pack
 from tests.waiting import until
+from uavlinkd.config.model import Config, SigningConfig
 from uavlinkd.daemon.daemon import Daemon
 from uavlinkd.io.url import EndpointKind, NetworkUrl
 from uavlinkd.system.addresses import Address
@@ -59,11 +66,19 @@ def open_client() -> socket.socket:
     return sock
 
 
-class Pair:
-    """The daemons ``left`` and ``right``, and a client of each."""
+def with_key() -> Autopilot:
+    """A client that signs."""
+    autopilot = Autopilot()
+    autopilot.receive(pack(mavlink.MAVLink_setup_signing_message(1, 1, list(KEY.reveal()), 5)))
+    return autopilot
 
-    def __init__(self, loop: Loop, counting: Counting) -> None:
-        self._loop, self._counting = loop, counting
+
+class Pair:
+    """The daemons ``left`` and ``right``, and a client of each. ``signs``: both clients are autopilots with a key."""
+
+    def __init__(self, loop: Loop, counting: Counting, *, signs: bool) -> None:
+        self._loop, self._counting, self._signs = loop, counting, signs
+        self._signer = with_key()
         self._client, self._ground = open_client(), open_client()
         self._number = 0
 
@@ -71,22 +86,45 @@ class Pair:
         """Link the daemons."""
         callbacks = self._loop.callbacks
         ground = NetworkUrl(EndpointKind.UDPOUT, Address(*self._ground.getsockname()))
-        right = Daemon(config("right", ground))
+        right = Daemon(self._config(config("right", ground)))
         await right.start()
         (called,) = right.parts.peer_sockets.addresses
         before = set(callbacks)
-        left = Daemon(config("left", NetworkUrl(EndpointKind.UDPIN, ANY_PORT), (called,)))
+        left = Daemon(self._config(config("left", NetworkUrl(EndpointKind.UDPIN, ANY_PORT), (called,))))
         await left.start()
         await until(lambda: are_linked(left, right))
         own = {address.port for address in left.parts.peer_sockets.addresses}
         (self._client_port,) = set(callbacks) - before - own
         self._receive = {"sending": callbacks[self._client_port], "receiving": callbacks[called.port]}
+        if self._signs:
+            (outgoing,) = set(callbacks) - own - {self._client_port, called.port}
+            await self._prove(left, self._client, self._client_port, self._signer)
+            await self._prove(right, self._ground, outgoing, with_key())
+
+    def _config(self, plain: Config) -> Config:
+        keys = SigningConfig((KEY,)) if self._signs else SigningConfig()
+        return replace(plain, endpoints=tuple(replace(one, signing=keys) for one in plain.endpoints))
+
+    async def _prove(self, daemon: Daemon, sock: socket.socket, port: int, autopilot: Autopilot) -> None:
+        (endpoint,) = daemon.parts.local.endpoints
+        while endpoint.signing is not None and not endpoint.signing.is_proven:
+            sock.sendto(autopilot.heartbeat(), ("127.0.0.1", port))
+            await asyncio.sleep(0.05)
+            with suppress(BlockingIOError):
+                for answer in autopilot.receive(sock.recv(2048)):
+                    sock.sendto(answer, ("127.0.0.1", port))
+            await asyncio.sleep(0.05)
+
+    def _frame(self) -> bytes:
+        if not self._signs:
+            return attitude(self._number)
+        return self._signer.send(mavlink.MAVLink_attitude_message(self._number, 1.5, 0.5, 0.25, 0.1, 0.1, 0.1))
 
     async def carry(self, frames: int, counted: str) -> None:
         """Carry frames, and count what one side does; none if it is empty."""
         for _ in range(frames):
             self._number += 1
-            self._client.sendto(attitude(self._number), ("127.0.0.1", self._client_port))
+            self._client.sendto(self._frame(), ("127.0.0.1", self._client_port))
             for side in SIDES:
                 self._call(self._receive[side], is_counted=side == counted)
             with suppress(BlockingIOError):
@@ -105,9 +143,9 @@ class Pair:
         self._counting.dump("frame")
 
 
-async def run(loop: Loop, counting: Counting, frames: int, idle_s: float) -> None:
+async def run(loop: Loop, counting: Counting, frames: int, idle_s: float, *, signs: bool) -> None:
     """Count each side, and then both while nothing is sent."""
-    pair = Pair(loop, counting)
+    pair = Pair(loop, counting, signs=signs)
     await pair.start()
     await asyncio.sleep(0.2)
     gc.collect()
@@ -124,11 +162,11 @@ async def run(loop: Loop, counting: Counting, frames: int, idle_s: float) -> Non
 
 
 def main() -> None:
-    """``pair LIBRARY FRAMES IDLE_S``."""
+    """``pair LIBRARY FRAMES IDLE_S [signs]``."""
     loop = Loop()
-    library, frames, idle_s = sys.argv[1:]
+    library, frames, idle_s, *signs = sys.argv[1:]
     gc.disable()
-    loop.run_until_complete(run(loop, Counting(library), int(frames), float(idle_s)))
+    loop.run_until_complete(run(loop, Counting(library), int(frames), float(idle_s), signs=bool(signs)))
 
 
 if __name__ == "__main__":
