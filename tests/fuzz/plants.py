@@ -17,6 +17,7 @@ from uavlinkd.lab.mitm import anatomy
 from uavlinkd.lab.mitm import proxy_settings as mitm_settings
 from uavlinkd.mavlink import frames, routing
 from uavlinkd.mavlink.policy import gate
+from uavlinkd.mavlink.signing import endpoint_signing, signature
 from uavlinkd.ops import control
 from uavlinkd.protocol import counters, handshake, path_state, receive, reports, session, wire
 from uavlinkd.protocol.drops import Drop, DropReason
@@ -188,6 +189,9 @@ def _always(result: object) -> Callable[[Any], Any]:
 
 
 PLANTS: Final = {
+    "any signature is accepted": Plant("signing", signature.Signer, "verifies", _always(True)),
+    "a signature stays": Plant("signing", endpoint_signing, "without_signature", lambda right: lambda raw: raw),
+    "any answer proves": Plant("signing", endpoint_signing.EndpointSigning, "_is_answer", _always(True)),
     "a bare MAVLink frame is answered": Plant("idle", receive.DatagramReceiver, "receive", _answers_strangers),
     "an exception at one length": Plant("session", receive.DatagramReceiver, "receive", _index_error_at(43)),
     "a drop is counted twice": Plant("initiator", receive.DatagramReceiver, "receive", _counts_twice),

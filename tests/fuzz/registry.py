@@ -18,6 +18,7 @@ from tests.fuzz import (
     packets,
     relays,
     requests,
+    signatures,
     stations,
 )
 from tests.fuzz.engine import Target
@@ -43,6 +44,7 @@ _TARGETS: Final = (
     Target("messages", "HTTP and WebSocket inside TLS, cut anywhere", messages.make, 2048, messages.WORDS),
     Target("frames", "a client's datagrams, and a peer's payloads", frames.make_datagrams),
     Target("gate", "frames at a policy", frames.make_gate),
+    Target("signing", "the wire to an autopilot that signs", signatures.make),
     Target("switch", "frames from six ports through policies and router", frames.make_switch),
     Target("control", "the control socket", requests.make_control, 512, _CONTROL),
     Target("config", "the configuration", files.make_config, 4096, files.WORDS, True, files.config_seeds),

@@ -101,7 +101,7 @@ class Storm:
         self._settled = 0  # the event after which the daemon has passed a frame
         self._since = 0.0  # when the last restart or jump was, of either end
         self._is_new_life = False  # the autopilot was restarted, and no question reached it since
-        self._signed = self._made = 0
+        self._signed = self._made = self._first_of_life = 0
         self._records: dict[bool, list[Sent]] = {True: [], False: []}  # by: goes to the daemon
         self._recent: dict[bool, deque[Sent]] = {True: deque(maxlen=50), False: deque(maxlen=50)}
         self._withheld: list[tuple[bool, Sent]] = []
@@ -192,7 +192,7 @@ class Storm:
             self._taken[sender] = max(last, sent.number)
             self._taken_ever[sent.number] = 1
             if verdict.message == ID["TIMESYNC"]:
-                self._is_new_life = self._is_new_life and is_late
+                self._is_new_life = self._is_new_life and sent.number < self._first_of_life
                 (question,) = mavlink.MAVLink(None).parse_buffer(sent.raw)
                 self._make(ID["TIMESYNC"], (7).to_bytes(8, "little") + question.ts1.to_bytes(8, "little"))
         elif is_late:
@@ -290,7 +290,7 @@ class Storm:
     def restart_autopilot(self) -> None:
         self.counts["restarts of the autopilot"] += 1
         self.autopilot.restart()
-        self._taken, self._is_new_life = {}, True
+        self._taken, self._is_new_life, self._first_of_life = {}, True, self._signed
         self._event, self._since = self._event + 1, self._now
 
     def power_off(self) -> None:
