@@ -147,6 +147,7 @@ def test_a_misspelt_word_is_named(words: str, wrong: str, meant: str, capsys: py
         ([], "run the daemon"),
         (["fleet"], "revoke a member"),
         (["run", "x.toml"], "write `uavlinkd run --config x.toml`"),
+        (["station", "remove", "tab2"], "write `uavlinkd station remove --config FILE tab2`"),
     ],
 )
 def test_an_incomplete_command_line_shows_what_to_write(

@@ -188,7 +188,8 @@ class CommandParser(argparse.ArgumentParser):
             if not is_short and (likely := meant(written, known)):
                 message = f"there is no {written!r}: did you mean {likely!r}?"
         if message.endswith("required: --config") and not self.words[0].startswith("-"):
-            message = f"write `{self.prog} --config {self.words[0]}`"
+            has_name = any(not action.option_strings for action in self._actions)
+            message = f"write `{self.prog} --config {'FILE ' if has_name else ''}{self.words[0]}`"
         super().error(message)
 
 

@@ -365,6 +365,9 @@ def test_remedy_for_a_missing_key_fits_its_kind(tmp_path: Path) -> None:
     assert f"make it with `uavlinkd keygen --out {tmp_path}/drone0.key`" in private
     assert "copy it from the peer, or make it on one of the two with `uavlinkd psk --out" in psk
     assert "a service's keys with `uavlinkd check --keys DIR`" in private
+    (tmp_path / "drone0").mkdir()
+    (tmp_path / "drone0" / "drone0.key").touch()
+    assert f"the keys of its service are in {tmp_path}/drone0: add --keys {tmp_path}/drone0" in problems({})[0]
     for problem in problems({"CREDENTIALS_DIRECTORY": str(tmp_path / "credentials")}):
         assert re.search("LoadCredential=.*next start", problem)
         assert not re.search("keygen|uavlinkd psk", problem)

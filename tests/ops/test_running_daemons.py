@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
+import socket
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ from tests.ops.test_status_screen import peer, status_of
 from uavlinkd.cli import main
 from uavlinkd.ops import commands, control
 from uavlinkd.ops.control import ask
+from uavlinkd.system import services
 from uavlinkd.system.terminal import FAILED, OK, WRONG
 
 
@@ -44,6 +47,7 @@ def daemons(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Daemons:
     """A folder in place of /run/uavlinkd."""
     daemons = Daemons(tmp_path / "run")
     monkeypatch.setattr(commands, "RUNTIME_FOLDER", daemons.folder)
+    monkeypatch.setattr(services, "FOLDER", tmp_path / "etc")
     monkeypatch.setattr(control, "ask", daemons.ask)
     return daemons
 
@@ -105,6 +109,38 @@ def test_a_daemon_that_does_not_answer_does_not_hide_others(
     out, err = capsys.readouterr()
     assert "drone1  1 of 1 peers up" in out
     assert f"no daemon answers at {path}" in err
+
+
+def test_services_that_are_stopped_are_named(
+    daemons: Daemons, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To root, which sees every control socket: others learn that root would."""
+    services.FOLDER.mkdir()
+    for name in ("uavlinkd", "relay", "v8"):
+        (services.FOLDER / f"{name}.toml").touch()
+    monkeypatch.setattr(os, "geteuid", lambda: 0)
+    assert main(["status"]) == FAILED
+    said = capsys.readouterr().err
+    assert [line.split()[0] for line in said.splitlines()] == ["uavlinkd-relay", "uavlinkd", "uavlinkd@v8"]
+    assert said.endswith(": sudo systemctl start uavlinkd@v8; its log: journalctl -u uavlinkd@v8\n")
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    assert main(["status"]) == FAILED
+    assert "that this user may see (use sudo)" in capsys.readouterr().err
+
+
+def test_daemon_of_this_folder_is_found(daemons: Daemons, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By its control socket, if no service runs and the socket is this user's."""
+    monkeypatch.chdir(daemons.folder.parent)
+    with socket.socket(socket.AF_UNIX) as sock:
+        sock.bind("gs.sock")
+        daemons.answers[Path("gs.sock")] = status("gs")
+        assert main(["status"]) == OK
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "geteuid", lambda: Path("gs.sock").stat().st_uid + 1)
+            assert main(["status"]) == FAILED
+        daemons.add(status("drone1"))
+        assert main(["status"]) == OK
+    assert [path.name for path, _ in daemons.requests] == ["gs.sock", "control.sock"]
 
 
 def test_reload_of_several_daemons_needs_a_name(daemons: Daemons, capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,14 +7,19 @@ import socket
 import tomllib
 from pathlib import Path
 
+import cryptography.hazmat.primitives.serialization  # noqa: F401  a module without a specification stays loaded
 import pytest
 
+from tests.fleet.folders import create, join
 from uavlinkd.cli import main
 from uavlinkd.config import keys
 from uavlinkd.config.load import load_config
 from uavlinkd.config.model import ConfigError, EndpointConfig
+from uavlinkd.fleet.signing import Identity
 from uavlinkd.io.url import StationUrl
 from uavlinkd.mavlink.policy.settings import PolicyError
+from uavlinkd.system import services
+from uavlinkd.system.addresses import Address
 
 CONFIG = """name = "drone1"
 private_key_file = "drone1.key"  # a comment that stays
@@ -51,12 +56,31 @@ def test_station_is_added_and_removed(config: Path, capsys: pytest.CaptureFixtur
     assert (lines["Address"], lines["AllowedIPs"]) == ("10.66.0.2/32", "10.66.0.1/32")
     assert lines["Endpoint"] == "203.0.113.7:51820"
     assert lines["PrivateKey"] not in config.read_text()
-    assert main(("station", "add", "second", "--config", str(config), "--at", "h", "--system-id", "254")) == 0
-    assert [one["address"] for one in tomllib.loads(config.read_text())["station"]] == ["10.66.0.2", "10.66.0.3"]
+    assert main(("station", "add", "second", "--config", str(config), "--at", "h")) == 0
+    stations = tomllib.loads(config.read_text())["station"]
+    assert [(one["address"], one["system_ids"]) for one in stations] == [("10.66.0.2", [255]), ("10.66.0.3", [254])]
     for name in ("tablet", "second"):
         assert main(("station", "remove", name, "--config", str(config))) == 0
     assert config.read_text() == CONFIG
     assert sorted(path.name for path in config.parent.iterdir()) == ["drone1.key", "drone1.toml", "stations.key"]
+
+
+def test_station_of_a_fleets_ground_station(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its id is one of the certificate, which the error widens. The ground station keeps its own."""
+    create(tmp_path / "fleet", at=(Address("192.0.2.1", 5790),), stations=1)
+    config = tmp_path / "fleet" / "ground-station" / "ground-station.toml"
+    monkeypatch.setattr(services, "FOLDER", config.parent)
+    add = ("station", "add", "tab2", "--config", str(config), "--at", "h")
+    assert main(add) == 2
+    widen = "`uavlinkd fleet enroll --here ground-station --replace --id A-B`"
+    assert f"whose certificate has 255 to 255: write one that no [[endpoint]] has; {widen}" in capsys.readouterr().err
+    join(tmp_path / "fleet", "ground-station", Identity(ids=(253, 255)), replaces=True)
+    assert main(add) == 0
+    assert "Restart the daemon: sudo systemctl restart uavlinkd@ground-station\n" in capsys.readouterr().out
+    table = tomllib.loads(config.read_text())
+    assert [one["system_ids"] for one in (*table["endpoint"], *table["station"])] == [[255], [254]]
 
 
 def test_key_of_a_tunnel_that_the_app_made(config: Path, capsys: pytest.CaptureFixture[str]) -> None:

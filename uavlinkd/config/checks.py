@@ -124,12 +124,12 @@ def _stations(file: File) -> Found:
             yield station.at("system_ids"), text
         # A vehicle's own station commands this vehicle. At others, the certificate of this member decides.
         if role_of(fleet := file.one("fleet")) is MemberRole.OPERATOR:
-            first, last = fleet.get("certificate").certificate.system_ids
-            if any(not first <= system <= last for system in ids):
-                text = (
-                    f"has an id that vehicles refuse from this member, whose certificate has {first} to {last}: write"
-                )
-                yield station.at("system_ids"), f"{text} one of these, or `uavlinkd fleet enroll --replace --id A-B`"
+            own = fleet.get("certificate").certificate
+            if any(system not in own.systems for system in ids):
+                had = f"{own.system_ids[0]} to {own.system_ids[1]}"
+                text = f"has an id that vehicles refuse from this member, whose certificate has {had}: write one that"
+                remedy = f"`uavlinkd fleet enroll --here {own.name} --replace --id A-B` gives it more"
+                yield station.at("system_ids"), f"{text} no [[endpoint]] has; {remedy}"
 
 
 def _signing(file: File) -> Found:

@@ -148,7 +148,7 @@ def _read_secret(file: File, section: Values, key: str, environ: Mapping[str, st
         section.valid[key] = read_secret_file(path, credential=is_credential)
     except KeyFileError as error:
         is_of_service = bool(environ.get(CREDENTIALS)) and not is_credential
-        missing = "" if os.path.lexists(path) else _how_to_get(key, path)
+        missing = "" if os.path.lexists(path) else _how_to_get(key, path, file.path)
         remedy = _FOR_A_SERVICE if is_of_service else missing
         file.add(section.at(key), f"{error}; {remedy}" if remedy else str(error))
 
@@ -173,7 +173,10 @@ _FOR_A_SERVICE = (
 )
 
 
-def _how_to_get(key: str, path: Path) -> str:
+def _how_to_get(key: str, path: Path, config: Path) -> str:
+    for folder in (path.parent / config.stem, path.parent / "keys"):
+        if os.path.lexists(folder / path.name):
+            return f"the keys of its service are in {folder}: add --keys {shlex.quote(str(folder))}"
     where = shlex.quote(str(path))
     if key == "psk_file":
         return f"copy it from the peer, or make it on one of the two with `uavlinkd psk --out {where}`"

@@ -118,7 +118,7 @@ def finish(line: str, config: Path | None, folder: Path | None, url: str | None,
     return [
         f"{name} is a member of fleet {fingerprint_of(reply.authority)}.",
         f"{place.config}: {certificate.role.name.lower()}, contacts {contacts or 'none'}",
-        *([f"Set {what} to {'one of ' if '-' in ids else ''}system id {ids}."] if ids else []),
+        *([f"Set {what} to {'one of the system ids' if '-' in ids else 'system id'} {ids}."] if ids else []),
         *([f"Then: {start}; if it runs already, restart it."] if folder is None else []),
         *([f"The former key, {place.key(former)}, was deleted."] if is_replaced else []),
     ]

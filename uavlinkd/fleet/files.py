@@ -77,7 +77,8 @@ def new_table(
 def with_fleet(table: Table, reply: Reply) -> Table:
     """A configuration with the fleet's present facts and contacts.
 
-    Endpoints with the ids of the certificate before get those of the present one. A file that gets its first
+    Endpoints with the ids of the certificate before get those of the present one; an operator's, which leaves others
+    to stations, keep them while it has them. A file that gets its first
     ``[fleet]`` also gets ``confidential``: relays could read the frames otherwise.
     """
     sections = [table.get(section, {}) for section in ("fleet", "link", "relay_server")]
@@ -119,6 +120,8 @@ def _endpoints(table: Table, reply: Reply) -> Any:
     try:
         before = list(certificate_in(table["fleet"]).systems)
         now = list(reply.certificate.systems)
+        if reply.certificate.role is MemberRole.OPERATOR and set(before) <= set(now):
+            return endpoints
         return [each | {"system_ids": now} if each.get("system_ids") == before else each for each in endpoints]
     except (LookupError, TypeError, ValueError, AttributeError, Drop):
         return endpoints

@@ -15,6 +15,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
 
+from uavlinkd.system.services import units
 from uavlinkd.system.terminal import FAILED, OK, CommandError, UsageError, add_json, printable
 
 RUNTIME_FOLDER: Final = Path("/run/uavlinkd")  # where the systemd units put the control sockets
@@ -44,7 +45,8 @@ def add_netcheck(parser: argparse.ArgumentParser) -> None:
 
 def add_daemon(parser: argparse.ArgumentParser) -> None:
     """Add the options that name a running daemon."""
-    parser.description = f"{parser.description} Without an option it finds the running service and its instances."
+    services = "the running service and its instances, else daemons of this folder"
+    parser.description = f"{parser.description} Without an option it finds {services}."
     daemon = parser.add_mutually_exclusive_group()
     daemon.add_argument("--config", metavar="FILE", type=Path, help="the daemon's configuration")
     daemon.add_argument("--socket", metavar="PATH", type=Path, help="the daemon's control socket")
@@ -55,6 +57,8 @@ def add_daemon(parser: argparse.ArgumentParser) -> None:
 
 def control_sockets(options: argparse.Namespace) -> list[Path]:
     """The control socket of the daemon that the options name, or those of the service and its instances, by name.
+
+    Without a service, those in this folder, of this user: another one could pose as a daemon.
 
     Raises CommandError if no service runs, or the configuration names no socket or cannot be read.
     """
@@ -67,11 +71,15 @@ def control_sockets(options: argparse.Namespace) -> list[Path]:
             raise CommandError(f'{options.config} names no control_socket: add control_socket = "NAME.sock"')
         return [path]
     candidates = [RUNTIME_FOLDER / SOCKET_NAME, *sorted(RUNTIME_FOLDER.glob(f"*/{SOCKET_NAME}"))]
-    if not (sockets := [path for path in candidates if os.path.lexists(path)]):
+    here = (path for path in sorted(Path().glob("*.sock")) if path.is_socket() and path.stat().st_uid == os.geteuid())
+    if not (sockets := [path for path in candidates if os.path.lexists(path)] or list(here)):
+        if os.geteuid() == 0 and (stopped := units()):
+            start = "is stopped, or has no control_socket: sudo systemctl start"
+            raise CommandError("\n".join(f"{unit} {start} {unit}; its log: journalctl -u {unit}" for unit in stopped))
+        hidden = "" if os.geteuid() == 0 else " that this user may see (use sudo)"
         raise CommandError(
-            "name the daemon: --config FILE or --socket PATH. No service has a control socket in"
-            f" {RUNTIME_FOLDER}{'' if os.geteuid() == 0 else ' that this user may see: use sudo'}, or start it with"
-            f' control_socket = "{candidates[0]}" in its file'
+            f"no daemon runs in this folder, nor a service{hidden}: start it, with control_socket in its file,"
+            " or name it: --config FILE or --socket PATH"
         )
     return sockets
 

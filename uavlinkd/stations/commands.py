@@ -13,12 +13,15 @@ from ipaddress import ip_address, ip_network
 from pathlib import Path
 from typing import Final
 
+from uavlinkd.authority.certificates import MemberRole
 from uavlinkd.config import keys
 from uavlinkd.config.edit import environ_of, replace_valid
 from uavlinkd.config.load import load_config, read_toml
+from uavlinkd.config.model import Config
 from uavlinkd.config.schema import SECTIONS
 from uavlinkd.stations.inner import MTU
 from uavlinkd.system.addresses import Address, AddressError, parse_address
+from uavlinkd.system.services import unit_of
 from uavlinkd.system.terminal import OK, CommandError, UsageError
 
 _KEY_FILE: Final = "stations.key"
@@ -48,7 +51,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = action("add", "add a station to a daemon's file, and print its code for the WireGuard app", _add)
     add.add_argument("--at", metavar="HOST", help="where the station reaches this machine (default: its own address)")
     add.add_argument("--role", choices=("operator", "observer"), default="operator", help="(default: operator)")
-    add.add_argument("--system-id", type=int, default=255, metavar="N", help="of its software (default: 255)")
+    text = "of its software (default: the highest one that this file, and a fleet's ground station, has left: 255)"
+    add.add_argument("--system-id", type=int, metavar="N", help=text)
     text = "of a tunnel that the app made; without it, the code has a private key that is kept nowhere else"
     add.add_argument("--public-key", metavar="KEY", help=text)
     action("remove", "remove a station from a daemon's file", _remove)
@@ -61,7 +65,8 @@ def _add(options: argparse.Namespace) -> int:
         parse_address(str(Address(host, _ANYWHERE[1])), allow_names=True)
     except AddressError as error:
         raise UsageError(f"--at {error}") from None
-    load_config(path, environ_of(options.keys))  # it is valid before
+    free = _free_id(load_config(path, environ_of(options.keys)))  # it is valid before
+    system_id = free if options.system_id is None else options.system_id
     table = read_toml(path)
     stations, settings = table.get("station", []), table.get("stations", {})
     if any(station.get("name") == name for station in stations):
@@ -81,7 +86,7 @@ def _add(options: argparse.Namespace) -> int:
             keys.write_secret_file(key_file, keys.generate_private_key())
     text += (
         f'\n[[station]]\nname = {json.dumps(name)}\npublic_key = {json.dumps(public)}\naddress = "{address}"\n'
-        f'role = "{options.role}"\nsystem_ids = [{options.system_id}]\n'
+        f'role = "{options.role}"\nsystem_ids = [{system_id}]\n'
     )
     config = replace_valid(path, path.read_text().rstrip("\n") + "\n" + text, options.keys)
     assert config.stations is not None
@@ -89,10 +94,21 @@ def _add(options: argparse.Namespace) -> int:
     port = config.stations.listen.port
     place = str(Address(host, port))
     _print_code(name, private, own, (address, config.stations.address), place)
-    print(
-        f"Restart the daemon of {path}; UDP port {port} must be open. Compare: the tunnel's peer has the key\n  {own}"
-    )
+    print(f"Set the system id of its software to {system_id}. UDP port {port} must be open here.")
+    print(f"Compare: the tunnel's peer has the key\n  {own}\nRestart the daemon: {_restart(path)}")
     return OK
+
+
+def _free_id(config: Config) -> int:
+    """A system id that no endpoint or station of the file has: one of an operator's certificate, if that has one."""
+    own = None if config.fleet is None else config.fleet.own.certificate
+    first = () if own is None or own.role is not MemberRole.OPERATOR else reversed(own.systems)
+    used = set[int]().union(*(endpoint.systems for endpoint in config.endpoints))
+    return next((system for system in (*first, *range(255, 0, -1)) if system not in used), 255)
+
+
+def _restart(path: Path) -> str:
+    return f"sudo systemctl restart {unit}" if (unit := unit_of(path)) else f"uavlinkd run --config {path}"
 
 
 def _print_code(name: str, private: str | None, own: str, inner: tuple[str, str], place: str) -> None:
@@ -119,7 +135,7 @@ def _remove(options: argparse.Namespace) -> int:
     if not any(block.lstrip().startswith("[[station]]") for block in kept):
         kept = [block for block in kept if not block.lstrip().startswith("[stations]")]
     replace_valid(path, "".join(kept).rstrip("\n") + "\n", options.keys)
-    print(f"Restart the daemon of {path}: then {name} gets no answer any more")
+    print(f"Restart the daemon, and {name} gets no answer any more: {_restart(path)}")
     return OK
 
 
