@@ -17,13 +17,15 @@ from pymavlink.dialects.v20 import all as mavlink
 from tests.daemon_pair import ANY_PORT, are_linked, config
 from tests.mavlink.signing.autopilot import Autopilot
 from tests.mavlink.signing.wire import KEY, OTHER
-from tests.samples import pack
+from tests.samples import pack, read
 from tests.waiting import until
 from uavlinkd.config.keys import encode_key
 from uavlinkd.config.model import LINK_ID
 from uavlinkd.daemon import signing
 from uavlinkd.daemon.daemon import Daemon
 from uavlinkd.io.url import EndpointKind, NetworkUrl, SerialUrl
+from uavlinkd.mavlink.policy.delivery import Source
+from uavlinkd.mavlink.signing.endpoint_signing import MOST_OF_SOURCE
 from uavlinkd.protocol.crypto import Secret
 
 HEARTBEAT_S = 0.1
@@ -254,6 +256,69 @@ async def test_a_setup_that_is_not_confirmed() -> None:
         assert (await pair.ask("setup"))["is_changed"]
         assert (await pair.ask("setup"))["is_changed"]  # a command that was killed behind it
         await pair.commands_pass()
+
+
+class Halved(Autopilot):
+    """Its first key is the last that it receives: the direction to it is cut then, until ``is_mended``."""
+
+    is_mended = False
+
+    def receive(self, data: bytes) -> list[bytes]:
+        self.is_deaf = self.has_key and not self.is_mended
+        return super().receive(data)
+
+
+async def test_clear_after_a_setup_that_was_not_confirmed() -> None:
+    """The autopilot has the key, and has not proven it: the file with the only copy must not be deleted."""
+    autopilot = Halved()
+    async with flying("udpin", autopilot) as pair:
+        assert (await pair.ask("setup"))["is_changed"] is None
+        answer = await pair.ask("clear", None)
+        assert answer["is_changed"] is False
+        assert "has not proven" in answer["problem"]
+        autopilot.is_mended = True
+        assert (await pair.ask("clear", None))["is_changed"]
+        assert not autopilot.has_key
+
+
+async def test_a_key_reaches_one_client_only() -> None:
+    """Another client that was there before would get the key in clear."""
+    autopilot = Autopilot()
+    async with flying("udpin", autopilot) as pair:
+        with socket.socket(type=socket.SOCK_DGRAM) as other:
+            other.sendto(pack(mavlink.MAVLink_system_time_message(1, 1)), pair.endpoint._sock.getsockname())  # type: ignore[attr-defined]
+            await until(lambda: len(pair.endpoint.ports) == 2)
+            answer = await pair.ask("setup")
+        assert answer["is_changed"] is False
+        assert "several clients" in answer["problem"]
+        assert not autopilot.has_key
+
+
+async def test_another_key_is_only_for_the_autopilot_that_proves_this_one() -> None:
+    """Somebody that sends HEARTBEATs without signatures must not get the place of an autopilot that is off."""
+    autopilot = Autopilot()
+    async with flying("udpin", autopilot, KEY) as pair:
+        pair.endpoint.signing.admits = lambda _: True  # type: ignore[method-assign, union-attr]
+        answer = await pair.ask("rotate", OTHER)
+        assert answer["is_changed"] is False
+        assert "no autopilot was heard" in answer["problem"]
+        assert not autopilot.has_key
+
+
+async def test_all_clients_of_a_station_are_one_source() -> None:
+    """A captured station opens new clients: each would have places at the autopilot of its own."""
+    autopilot = Autopilot()
+    autopilot.receive(pack(mavlink.MAVLink_setup_signing_message(1, 1, list(KEY.reveal()), 5)))
+    async with flying("serial", autopilot, KEY) as pair:
+        await pair.commands_pass()
+        (port,) = pair.endpoint.ports
+        assert port.delivered.sign is not None
+        gate = pair.vehicle.parts.local.policies["client"].incoming
+        signed = 0
+        for component in range(1, 50):
+            raw = pack(mavlink.MAVLink_command_long_message(1, 1, 400, 0, 1, 1, 0, 0, 0, 0, 0), 200, component)
+            signed += port.delivered.sign(read(raw), Source("captured", gate)) is not None
+        assert signed == MOST_OF_SOURCE
 
 
 async def test_a_daemon_with_a_key() -> None:

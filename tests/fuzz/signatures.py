@@ -65,7 +65,7 @@ class Wire:
         frame = parse_frame(raw)
         assert frame is not None
         was_proven, before = self._signing.is_proven, self._drops.total()
-        signed = self._signing.sign(frame, raw[5:6])
+        signed = self._signing.sign(frame, str(raw[5]))
         if signed is None:
             assert self._drops.total() == before + 1, "a frame is missing, and not counted"
             return

@@ -202,7 +202,7 @@ def test_disk_that_refuses_is_named(
         ("rotate", CONFIG, (), "has no key"),
         ("clear", CONFIG, (), "has no key"),
         ("setup", CONFIG.replace("14551", "14550"), (), "has the port of"),
-        ("setup", CONFIG.replace('name = "autopilot"', 'name = """autopilot"""'), (), "a line of its own"),
+        ("setup", CONFIG.replace('name = "autopilot"', 'name = """autopilot"""'), (), "a line of its own\n"),
         ("setup", CONFIG.replace('"autopilot"', '"drone1"'), ("--endpoint", "drone1"), "another key of this file"),
     ],
 )

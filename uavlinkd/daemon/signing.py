@@ -18,6 +18,7 @@ from uavlinkd.config.model import EndpointConfig, SigningConfig
 from uavlinkd.daemon.local_endpoints import LocalEndpoints
 from uavlinkd.io.ports import Endpoint, LocalPort
 from uavlinkd.mavlink.frames import Frame
+from uavlinkd.mavlink.policy.delivery import Source
 from uavlinkd.mavlink.signing.endpoint_signing import EndpointSigning
 from uavlinkd.protocol.crypto import Secret
 from uavlinkd.system.clock import monotonic
@@ -37,6 +38,10 @@ _LOOK_S: Final = 0.02
 OTHER_KEY: Final = (
     "the autopilot signs with a key that this daemon does not have: give the key's file, or remove the key there"
     " (ArduPilot: over USB; PX4: delete mavlink/mavlink-signing-key.bin on its card, and restart it)"
+)
+_SEVERAL_CLIENTS: Final = (
+    "several clients are connected to this endpoint, and each would get the key: leave the autopilot alone there"
+    " (a client is forgotten after a minute of silence)"
 )
 _UNKNOWN: Final[dict[str, object]] = {
     "problem": f"the autopilot did not confirm it within {CONFIRMED_S:g} s, and may have done it or not: run the same"
@@ -66,8 +71,11 @@ class AutopilotSigning:
             if passed := signing.accept(frames, now):
                 deliver(port, passed, now, epoch, waited_s)
 
+        def sign(frame: Frame, source: Source) -> Frame | None:
+            return signing.sign(frame, source.name)  # not by client: a captured station opens more of them
+
         endpoint.signing, endpoint.on_frames = signing, on_frames
-        endpoint.delivered.set_sign(signing.sign)
+        endpoint.delivered.set_sign(sign)
         return signing
 
     def _remove(self, endpoint: Endpoint) -> None:
@@ -102,23 +110,25 @@ class AutopilotSigning:
         return answer
 
     async def _change(self, endpoint: Endpoint, action: str, key: Secret | None, link_id: int) -> dict[str, object]:
-        signing = endpoint.signing
+        signing, is_new = endpoint.signing, endpoint.signing is None
         if signing is None:
             if key is None or action != "setup":
                 return _nothing(f"the daemon does not sign at {endpoint.name}: `uavlinkd signing setup` begins it")
             signing = self._install(endpoint, SigningConfig((key,), link_id), is_open=True)
-        is_new = signing.is_open
-        if is_new:
+        if signing.is_open:
             await _until(lambda: signing.is_proven, LISTENS_S)
         elif await _answers(signing):
             await _until(lambda: bool(_heard(signing)), HEARD_S)
         else:
-            signing.is_proven, signing.has_foreign_key, signing.may_lack_key = False, False, True
+            # Another key is only for the autopilot that proves this one: its file would be replaced.
+            signing.is_proven, signing.has_foreign_key, signing.may_lack_key = False, False, action != "rotate"
             await asyncio.sleep(LISTENS_S)
         if key is not None and signing.is_proven and signing.signer.secret == key:
             return await _done(signing)
         heard = _heard(signing)
         problem = _problem(signing, heard)
+        if problem is None and key is not None and len(endpoint.ports) > 1:
+            problem = _SEVERAL_CLIENTS
         if problem is not None:
             if is_new:
                 self._remove(endpoint)
@@ -168,12 +178,12 @@ def _heard(signing: EndpointSigning) -> dict[int, bool]:
 
 def _problem(signing: EndpointSigning, heard: Mapping[int, bool]) -> str | None:
     """Why the autopilot cannot get a key now."""
-    is_unsigned = monotonic() - signing.unsigned_at < HEARD_S
+    lacks_key = monotonic() - signing.unsigned_at < HEARD_S <= monotonic() - signing.verified_at
     if not signing.is_proven and signing.has_foreign_key:
         return OTHER_KEY
     if not heard:
         return f"no autopilot was heard for {HEARD_S:g} s: is it on, and does `uavlinkd status` show its frames?"
-    if not (signing.is_open or signing.is_proven or is_unsigned):
+    if not (signing.is_proven or lacks_key):
         return "the autopilot has not proven that it has this endpoint's key: see `uavlinkd status`"
     if len(heard) > 1:
         systems = " and ".join(map(str, sorted(heard)))

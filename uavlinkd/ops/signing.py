@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from uavlinkd.config import keys
-from uavlinkd.config.edit import environ_of, keep_owner, replace_valid, trial
+from uavlinkd.config.edit import environ_of, replace_valid, trial
 from uavlinkd.config.load import load_config, read_toml
 from uavlinkd.config.model import LINK_ID, Config
 from uavlinkd.io.url import EndpointKind
@@ -71,8 +71,6 @@ class _Place:
         if self._keys is not None and "/" not in self.name:
             folder = self._keys
         self.file, self.new = folder / self.name, folder / f"{self.name}{keys.NEW_KEY}"
-        own_key = self._table["private_key_file"]
-        self.own_key, _ = keys.find_secret_file(own_key, self.path.absolute().parent, environ_of(self._keys))
 
     def check(self, name: str | None) -> None:
         """Raises CommandError if the file would not be valid with the line of a key file, or without it."""
@@ -81,10 +79,10 @@ class _Place:
         sections = [expected if one is self._section else one for one in self._table["endpoint"]]
         with trial(self.path, self._text(name), self._keys) as (new, _):
             if read_toml(new) != self._table | {"endpoint": sections}:
-                wish = f"delete {_KEY}" if name is None else f'write {_KEY} = "{name}"'
+                wish = f", or delete {_KEY} there yourself" if name is None else ""
                 raise CommandError(
                     f"{self.path}: cannot be changed by this command, so nothing was changed: write each [[endpoint]]"
-                    f" as a section with its name on a line of its own, or {wish} there yourself"
+                    f" as a section with its name on a line of its own{wish}"
                 )
 
     def write(self, name: str | None) -> None:
@@ -144,7 +142,6 @@ def _give(place: _Place, *, is_rotation: bool) -> None:
         keys.write_secret_file(place.new, keys.generate_psk())
     used = place.new if os.path.lexists(place.new) else place.file
     try:
-        keep_owner(place.own_key, used)
         if not place.is_written:
             place.check(used.name)
         key = keys.encode_key(keys.read_secret_file(used).reveal())

@@ -116,10 +116,10 @@ class Storm:
 
     def _start_daemon(self) -> None:
         self._signing = EndpointSigning([KEY], LINK_ID, self._random.randbytes, self.drops)
-        self._signing.send = lambda raw: self._sign(read(raw), self)
+        self._signing.send = lambda raw: self._sign(read(raw), "daemon")
         self._settled, self._since = -1, self._now
 
-    def _sign(self, frame: Frame, source: object) -> None:
+    def _sign(self, frame: Frame, source: str) -> None:
         signed = self._signing.sign(frame, source)
         if signed is not None:
             self._signed += 1
@@ -235,7 +235,7 @@ class Storm:
         chosen = random()
         if chosen < 0.5:
             frame = self._stations[int(random() * len(self._stations))]
-            self._sign(frame, frame.header.system)
+            self._sign(frame, str(frame.header.system))
             if chosen < 0.02:
                 self._sign(frame, "another path")
         elif chosen < 0.55:

@@ -159,7 +159,7 @@ def test_an_answer_that_somebody_kept(judge: type[Autopilot]) -> None:
     kept: list[bytes] = []
 
     def keep(question: bytes) -> None:
-        signed = wire.signing.sign(read(question), wire)
+        signed = wire.signing.sign(read(question), "daemon")
         assert signed is not None
         kept.extend(wire.autopilot.receive(signed.raw))
 
@@ -262,6 +262,15 @@ def test_set_up(judge: type[Autopilot]) -> None:
     assert not wire.to_daemon(pack(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3)))
     assert wire.to_autopilot(command())
     assert len(autopilot.accepted) == 2
+
+
+def test_a_heartbeat_that_is_not_the_autopilots(judge: type[Autopilot]) -> None:
+    """A gimbal or a station that does not sign says nothing about the autopilot's key."""
+    wire = Wire(judge(), is_open=True)
+    wire.to_daemon(pack(mavlink.MAVLink_heartbeat_message(26, 8, 0, 0, 4, 3), 1, 154))
+    assert wire.signing.unsigned_at < 0
+    wire.second()
+    assert wire.signing.unsigned_at == wire.now
 
 
 @pytest.mark.parametrize("arrives", [False, True])

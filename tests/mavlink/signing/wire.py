@@ -14,7 +14,7 @@ from uavlinkd.mavlink.signing.endpoint_signing import EndpointSigning
 from uavlinkd.protocol.crypto import Secret
 
 KEY, OTHER = Secret(b"1" * 32), Secret(b"2" * 32)
-STATION = object()
+STATION = "gcs"
 """A source of frames."""
 
 
@@ -37,11 +37,11 @@ class Wire:
     def daemon_starts(self, keys: Sequence[Secret] = (KEY,), *, is_open: bool = False) -> EndpointSigning:
         """A daemon that remembers nothing of the one before."""
         signing = EndpointSigning(keys, LINK_ID, self._random.randbytes, self.drops, is_open=is_open)
-        signing.send = lambda raw: self.to_autopilot(raw, self)
+        signing.send = lambda raw: self.to_autopilot(raw, "daemon")
         self.signing = signing
         return signing
 
-    def to_autopilot(self, raw: bytes, source: object = STATION) -> bool:
+    def to_autopilot(self, raw: bytes, source: str = STATION) -> bool:
         """Send a frame. Returns whether it left."""
         signed = self.signing.sign(read(raw), source)
         if signed is None:

@@ -13,7 +13,7 @@ Times are monotonic seconds; the caller passes them and the source of random byt
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Sequence
 from enum import StrEnum
 from itertools import count
 from math import inf
@@ -41,7 +41,7 @@ MOST_SENDERS: Final = 14
 MOST_REPORTERS: Final = 4
 """Of these, senders whose first frame asks for nothing: other vehicles must not displace a ground station."""
 MOST_OF_SOURCE: Final = 8
-"""Of these, senders of one peer or client: a captured one invents senders, and takes no place of others."""
+"""Of these, senders of one peer, station or endpoint: a captured one that invents senders leaves room for others."""
 MOST_STREAMS: Final = 64
 """Senders behind the endpoint whose timestamps are kept."""
 ASK_S: Final = 0.25
@@ -117,15 +117,18 @@ class EndpointSigning:
         self._floor = 0
         """Of a sender that is not in ``_streams``, frames above this timestamp are new."""
         self._streams: dict[bytes, int] = {}
-        self._senders: dict[bytes, tuple[Hashable, bool]] = {}  # by system and component: from where, a reporter?
+        self._senders: dict[bytes, tuple[str, bool]] = {}  # by system and component: from where, a reporter?
         self._questions: dict[int, Signer | None] = {}
         self._own: dict[bytes, Signer | None] = {}  # frames of this end: who signs them, or nobody
         self._ask_at = 0.0
 
     # To the autopilot.
 
-    def sign(self, frame: Frame, source: Hashable) -> Frame | None:
-        """The frame with the next timestamp; None if it may not leave. Call it in the order of writing."""
+    def sign(self, frame: Frame, source: str) -> Frame | None:
+        """The frame with the next timestamp; None if it may not leave. Call it in the order of writing.
+
+        ``source``: the peer or endpoint that it comes from, as the configuration names it.
+        """
         raw, header = frame
         if self._own and raw in self._own:
             signer = self._own[raw]
@@ -143,7 +146,7 @@ class EndpointSigning:
         self.timestamp = min(self.timestamp + 1, LAST_TIMESTAMP)
         return Frame(signer.sign(raw, self.link_id, self.timestamp), header)
 
-    def _why_not(self, frame: Frame, source: Hashable) -> SigningDrop | None:
+    def _why_not(self, frame: Frame, source: str) -> SigningDrop | None:
         if frame.raw[0] != MAVLINK2:
             return SigningDrop.MAVLINK1
         if self.timestamp >= LAST_TIMESTAMP:
@@ -154,7 +157,7 @@ class EndpointSigning:
         taken = self._senders.values()
         if reports and sum(is_reporter for _, is_reporter in taken) >= MOST_REPORTERS:
             return SigningDrop.TOO_MANY_REPORTERS
-        if len(taken) >= MOST_SENDERS or sum(one is source for one, _ in taken) >= MOST_OF_SOURCE:
+        if len(taken) >= MOST_SENDERS or sum(one == source for one, _ in taken) >= MOST_OF_SOURCE:
             return SigningDrop.TOO_MANY_SENDERS
         self._senders[frame.raw[5:7]] = source, reports
         return None
@@ -224,7 +227,8 @@ class EndpointSigning:
         self.has_foreign_key |= has_signature
         if frame.header.msgid == HEARTBEAT and not has_signature and (self.is_open or self.may_lack_key):
             self.vehicles.note(frame, now)
-            self.unsigned_at = now
+            if frame.header.component == _AUTOPILOT:
+                self.unsigned_at = now
         if self.is_open:
             passed.append(frame)
         else:
