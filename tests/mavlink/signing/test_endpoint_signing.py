@@ -86,7 +86,8 @@ def test_recorded_frames_prove_nothing_after_a_restart(judge: type[Autopilot]) -
     wire = Wire(with_key(judge))
     for _ in range(50):
         wire.second()
-    recorded = list(wire.recorded)
+    camera = wire.signing.signer.sign(report(1, 154), 3, wire.signing.timestamp)
+    recorded = [*wire.recorded, camera]
     wire.autopilot.is_deaf = True
     wire.daemon_starts()
     for raw in recorded:
