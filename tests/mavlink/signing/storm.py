@@ -102,6 +102,7 @@ class Storm:
         self._since = 0.0  # when the last restart or jump was, of either end
         self._is_new_life = False  # the autopilot was restarted, and no question reached it since
         self._signed = self._made = self._first_of_life = 0
+        self._caught: set[bytes] = set()  # senders of which it accepted a replay, and nothing new since
         self._records: dict[bool, list[Sent]] = {True: [], False: []}  # by: goes to the daemon
         self._recent: dict[bool, deque[Sent]] = {True: deque(maxlen=50), False: deque(maxlen=50)}
         self._withheld: list[tuple[bool, Sent]] = []
@@ -179,8 +180,9 @@ class Storm:
             return
         is_late = sent.number <= last or bool(self._taken_ever[sent.number])
         if is_taken and is_late:
-            if self._is_new_life:
-                self.counts["autopilot: replays accepted between its start and the first question"] += 1
+            if self._is_new_life or sender in self._caught:
+                self._caught.add(sender)
+                self.counts["autopilot: replays accepted, begun between its start and the first question"] += 1
             else:
                 self.faults["the autopilot accepts a replay"] += 1
         elif not is_taken and not is_late and sent.sender == _DAEMON:
@@ -190,6 +192,8 @@ class Storm:
         if is_taken:
             self.counts["autopilot: accepted"] += 1
             self._taken[sender] = max(last, sent.number)
+            if not is_late:
+                self._caught.discard(sender)
             self._taken_ever[sent.number] = 1
             if verdict.message == ID["TIMESYNC"]:
                 self._is_new_life = self._is_new_life and sent.number < self._first_of_life
@@ -290,7 +294,7 @@ class Storm:
     def restart_autopilot(self) -> None:
         self.counts["restarts of the autopilot"] += 1
         self.autopilot.restart()
-        self._taken, self._is_new_life, self._first_of_life = {}, True, self._signed
+        self._taken, self._is_new_life, self._first_of_life, self._caught = {}, True, self._signed, set()
         self._event, self._since = self._event + 1, self._now
 
     def power_off(self) -> None:
