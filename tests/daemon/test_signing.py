@@ -301,7 +301,7 @@ async def test_another_key_is_only_for_the_autopilot_that_proves_this_one() -> N
         pair.endpoint.signing.admits = lambda _: True  # type: ignore[method-assign, union-attr]
         answer = await pair.ask("rotate", OTHER)
         assert answer["is_changed"] is False
-        assert "no autopilot was heard" in answer["problem"]
+        assert "has not proven" in answer["problem"]
         assert not autopilot.has_key
 
 

@@ -541,7 +541,7 @@ def test_senders_and_keys_that_are_too_many(daemon: Daemon) -> None:
     daemon.sample()
     findings = daemon.findings()
     assert findings["too_many_senders"].text.startswith("3 frames to autopilot got no signature")
-    assert "run `uavlinkd signing rotate` again" in findings["key_change_interrupted"].remedy
+    assert "run `uavlinkd signing setup` again" in findings["key_change_interrupted"].remedy
     endpoint.signing.signers = [2]
     assert not {"too_many_senders", "key_change_interrupted"} & set(daemon.findings(daemon.now + 11))
     both = SigningConfig((Secret(bytes(32)), Secret(bytes(31) + b"1")))

@@ -39,6 +39,7 @@ OTHER_KEY: Final = (
     "the autopilot signs with a key that this daemon does not have: give the key's file, or remove the key there"
     " (ArduPilot: over USB; PX4: delete mavlink/mavlink-signing-key.bin on its card, and restart it)"
 )
+_NOT_PROVEN: Final = "the autopilot has not proven that it has this endpoint's key: see `uavlinkd status`"
 _SEVERAL_CLIENTS: Final = (
     "several clients are connected to this endpoint, and each would get the key: leave the autopilot alone there"
     " (a client is forgotten after a minute of silence)"
@@ -119,9 +120,10 @@ class AutopilotSigning:
             await _until(lambda: signing.is_proven, LISTENS_S)
         elif await _answers(signing):
             await _until(lambda: bool(_heard(signing)), HEARD_S)
+        elif action == "rotate":  # another key is for the autopilot that proves this one: its file will be replaced
+            return _nothing(_NOT_PROVEN)
         else:
-            # Another key is only for the autopilot that proves this one: its file would be replaced.
-            signing.is_proven, signing.has_foreign_key, signing.may_lack_key = False, False, action != "rotate"
+            signing.is_proven, signing.has_foreign_key, signing.may_lack_key = False, False, True
             await asyncio.sleep(LISTENS_S)
         if key is not None and signing.is_proven and signing.signer.secret == key:
             return await _done(signing)
@@ -184,7 +186,7 @@ def _problem(signing: EndpointSigning, heard: Mapping[int, bool]) -> str | None:
     if not heard:
         return f"no autopilot was heard for {HEARD_S:g} s: is it on, and does `uavlinkd status` show its frames?"
     if not (signing.is_proven or lacks_key):
-        return "the autopilot has not proven that it has this endpoint's key: see `uavlinkd status`"
+        return _NOT_PROVEN
     if len(heard) > 1:
         systems = " and ".join(map(str, sorted(heard)))
         return f"several autopilots are behind this endpoint (systems {systems}): give each an endpoint of its own"

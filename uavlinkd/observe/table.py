@@ -379,7 +379,7 @@ OF_ENDPOINT: Final = (
     Row(
         *("key_change_interrupted", WARNING, traffic_signs.key_change_interrupted),
         "a change of its signing key did not end, and two keys are in force",
-        "run `uavlinkd signing rotate` again: it uses the same new key",
+        "run `uavlinkd signing setup` again: it uses the same new key",
     ),
     Row(
         *("station_unverified", FAULT, traffic_signs.station_unverified),

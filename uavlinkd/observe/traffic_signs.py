@@ -248,7 +248,7 @@ def autopilot_unverified(endpoint: EndpointFacts) -> Signs:
     elif not is_signed and "unsigned" in lasting:
         yield {
             "what": "does not sign, or its frames are another sender's",
-            "advice": "run `uavlinkd signing setup`, which hands it the key of this endpoint",
+            "advice": "run `uavlinkd signing setup`, which hands it a new key",
         }
     elif is_signed and not signing.is_proven and "not_proven" in lasting:
         yield {

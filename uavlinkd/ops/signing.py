@@ -137,7 +137,8 @@ def _give(place: _Place, *, is_rotation: bool) -> None:
     ask(place.socket, "status")  # no file is made if no daemon answers
     if is_rotation and not place.is_written:
         raise UsageError(f"{place.path}: {place.endpoint} has no key: run `uavlinkd signing setup`")
-    is_made = not os.path.lexists(place.new) and (is_rotation or not os.path.lexists(place.file))
+    # A key in force is never sent again: an autopilot without it may be somebody else.
+    is_made = not os.path.lexists(place.new) and (place.is_written or not os.path.lexists(place.file))
     if is_made:
         keys.write_secret_file(place.new, keys.generate_psk())
     used = place.new if os.path.lexists(place.new) else place.file
