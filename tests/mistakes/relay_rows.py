@@ -24,7 +24,14 @@ RELAY_ROWS = (
     ),
     Mistake("80", scenes.relay_key, signs=_RELAY_KEY),
     Mistake("81", scenes.exchanged_keys, signs=_RELAY_KEY),
-    Mistake("82", scenes.firewall, signs=(Sign("there", "relay_not_answering", r"open its firewall"),)),
+    Mistake(
+        "82",
+        scenes.firewall,
+        signs=(
+            Sign("here", "no_datagram", r"firewalls of this machine and of its provider"),
+            Sign("there", "relay_not_answering", r"open its firewall"),
+        ),
+    ),
     Mistake(
         "83",
         scenes.unknown_name,

@@ -22,6 +22,7 @@ def parts_of(node: Node, links: Mapping[str, PeerLink], evidence: Evidence, rout
         without_socket=set(),
         absent_addresses=list,
         absent_networks=dict,
+        addresses=[Address("0.0.0.0", 5799)],
         networks=SimpleNamespace(networks=[]),
         is_own=lambda address: False,
     )
@@ -42,6 +43,7 @@ def parts_of(node: Node, links: Mapping[str, PeerLink], evidence: Evidence, rout
         journal=DaemonJournal(),
         relay_links={},
         relay=None,
+        line=SimpleNamespace(read_at=1.0),
         serial=None,
         tls=None,
         fleet=None,

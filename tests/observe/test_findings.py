@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from math import inf
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -23,17 +23,18 @@ from uavlinkd.config.keys import encode_key
 from uavlinkd.config.model import EndpointConfig, PeerConfig, SigningConfig
 from uavlinkd.daemon.evidence import EVIDENCE_S, REPORTED
 from uavlinkd.daemon.peer_link import PeerLink
-from uavlinkd.io.url import parse_url
+from uavlinkd.io.url import StationUrl, parse_url
 from uavlinkd.mavlink.egress.lanes import EgressDrop
 from uavlinkd.mavlink.egress.peer_egress import EgressSettings, PeerEgress
 from uavlinkd.mavlink.frames import SplitCounters, split_payload
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.mavlink.routing import Router
-from uavlinkd.observe.facts import ICMP_S, SECURITY_S, is_contested
+from uavlinkd.observe.facts import ICMP_S, SECURITY_S, is_contested, is_reached
 from uavlinkd.observe.finding import Finding, Severity, Subject
 from uavlinkd.observe.findings import find, has_no_client, own_codes, stop_frames
 from uavlinkd.observe.history import HIDDEN_LEAST, History
+from uavlinkd.observe.signs import UNREACHED_S
 from uavlinkd.observe.table import ROWS, Exit
 from uavlinkd.observe.traffic_signs import PROBLEMS
 from uavlinkd.protocol import constants as c
@@ -41,6 +42,7 @@ from uavlinkd.protocol.crypto import Secret
 from uavlinkd.protocol.drops import DropReason
 from uavlinkd.protocol.outputs import Dropped
 from uavlinkd.protocol.path import Path
+from uavlinkd.protocol.path_state import PathCondition
 from uavlinkd.protocol.reports import ProblemClaim
 from uavlinkd.protocol.sessions import Twin
 from uavlinkd.protocol.settings import PeerSettings
@@ -174,6 +176,32 @@ def test_addresses_that_cannot_be_used(daemon: Daemon) -> None:
     assert "address families" in daemon.findings()["no_route"].remedy
 
 
+def test_idle_link_without_a_path_is_not_up(daemon: Daemon) -> None:
+    """It sends every 10 s only. While frames arrive, answers may be held back: that is another finding."""
+    link = daemon.set_up(role="all", system_ids="all")
+    link.peer.received_at = NOW
+    state = link.peer.paths.learn(Path(0, THERE), NOW)
+    for condition, silent_s, is_up in (
+        (PathCondition.DOWN, c.LOST_AFTER_S - 0.1, True),
+        (PathCondition.DOWN, c.LOST_AFTER_S, False),
+        (PathCondition.SUSPECT, c.LOST_AFTER_S, True),
+    ):
+        state.condition = condition
+        assert is_reached(link.peer, NOW + silent_s) is is_up
+        assert ("no_answer" in daemon.findings(NOW + silent_s)) is not is_up
+
+
+def test_relay_that_no_datagram_reaches(daemon: Daemon) -> None:
+    """A closed port of a VPS. Its members may be off: not at once."""
+    daemon.parts.relay, daemon.parts.line = SimpleNamespace(members={}), SimpleNamespace(read_at=0.0)
+    assert "no_datagram" not in daemon.findings(UNREACHED_S - 0.1)
+    finding = daemon.findings(UNREACHED_S)["no_datagram"]
+    assert finding.text == "no datagram has reached UDP port 5799 since the start, 15 s ago"
+    assert stop_frames([finding])
+    daemon.parts.line.read_at = 1.0
+    assert "no_datagram" not in daemon.findings(UNREACHED_S)
+
+
 def test_evidence_from_before_the_link_went_down_does_not_count(daemon: Daemon) -> None:
     """Also what an attacker sent while it was up. After a time, the silence is reported."""
     daemon.dropped(DropReason.BAD_MAC1, THERE)
@@ -288,7 +316,7 @@ def test_system_of_another(daemon: Daemon) -> None:
 
 def made_up_endpoint(config: EndpointConfig) -> Any:
     """An endpoint without a client, which signs nothing."""
-    empty: Any = {"ports": [], "frames_sent": 0, "signing": None}
+    empty: Any = {"ports": [], "frames_sent": 0, "signing": None, "is_station": False}
     return SimpleNamespace(
         name=config.name, failures=Counter(), counters=SplitCounters(), policy=config.make_policy(), **empty
     )
@@ -428,17 +456,37 @@ def test_key_on_two_machines_is_named_for_ten_minutes(daemon: Daemon) -> None:
 def test_frames_cannot_pass_without_any_client(daemon: Daemon, url: str, cause: str) -> None:
     """From 5 s on, unless one endpoint has a client, also one that only listens. A hub has no endpoint."""
     for name in ("autopilot", "companion"):
-        daemon.local.append(SimpleNamespace(name=name, ports=[], signing=None))
+        daemon.local.append(SimpleNamespace(name=name, ports=[], signing=None, is_station=False))
         daemon.parts.config.endpoints.append(SimpleNamespace(name=name, url=parse_url(url), policy={}))
-    assert not has_no_client(find(daemon.parts, daemon.history, 4.9), 2)
+    assert not has_no_client(find(daemon.parts, daemon.history, 4.9), daemon.local)
     found = find(daemon.parts, daemon.history, 5.0)
     assert [one.cause for one in found if one.subject is Subject.ENDPOINT] == [cause, cause]
-    assert has_no_client(found, 2)
+    assert has_no_client(found, daemon.local)
+    off, on = (cast(Any, SimpleNamespace(is_station=True, ports=ports)) for ports in ([], ["10.66.0.2"]))
+    assert has_no_client(found, [*daemon.local, off])
+    assert not has_no_client(found, [*daemon.local, on])
     daemon.local[0].ports = [SimpleNamespace(name="127.0.0.1:40000")]
     found = find(daemon.parts, daemon.history, 5.0)
     assert "client_silent" in {one.cause for one in found}
-    assert not has_no_client(found, 2)
-    assert not has_no_client([], 0)
+    assert not has_no_client(found, daemon.local)
+    assert not has_no_client([], [])
+
+
+def test_ground_control_software_speaks_after_a_vehicle(daemon: Daemon) -> None:
+    """Its silence is normal until a frame went out to it. A station that is off is no problem at all."""
+    station = StationUrl("10.66.0.2", (14550,), bytes(32))
+    for name, url in (("ground", parse_url("udpout:127.0.0.1:14550")), ("tablet", station)):
+        daemon.parts.config.endpoints.append(EndpointConfig(name, url, policy={"role": "all", "system_ids": "all"}))
+        daemon.local.append(made_up_endpoint(daemon.parts.config.endpoints[-1]))
+    ground = daemon.local[0]
+    ground.ports = [SimpleNamespace(name="127.0.0.1:14550")]
+    daemon.set_up(role="vehicle", system_ids="all")
+    assert daemon.findings(52.0) == {}
+    ground.frames_sent = 1
+    assert daemon.findings(52.0)["client_silent"][4:] == (
+        "no ground control software or other client answers on 127.0.0.1:14550",
+        "open or start it; it must send here, not only listen; if serial, look at wiring and baud rate",
+    )
 
 
 # What a peer says about itself.
@@ -452,19 +500,45 @@ def test_a_peer_says_what_its_problems_are(daemon: Daemon) -> None:
         assert daemon.findings()["problems_there"].severity is severity
     text = daemon.findings()["problems_there"].text
     assert text == "it says about itself: an endpoint has no client; problem 200"
+    assert daemon.findings()["problems_there"].remedy.startswith("look whether its autopilot is on")
+    peer.claims.problems = ProblemClaim((200,), NOW)
+    assert daemon.findings()["problems_there"].remedy == "run `uavlinkd status` there"
     assert "problems_there" not in daemon.findings(NOW + c.PROBLEMS_LAST_S + 1)
     peer.is_up = False
     assert "problems_there" not in daemon.findings()
 
 
+@pytest.mark.parametrize(
+    ("role", "codes", "telemetry", "severity", "remedy"),
+    [
+        ("vehicle", (1,), [], Severity.FAULT, "set MAV_SYSID (ArduPilot"),
+        ("vehicle", (2,), [], Severity.FAULT, "look whether its autopilot"),
+        ("vehicle", (2,), [heartbeat(7)], Severity.WARNING, "look whether its autopilot"),
+        ("operator", (1,), [], Severity.FAULT, "set the system id of its ground control software to 7"),
+        ("operator", (2,), [], Severity.WARNING, "look whether its ground control software is on"),
+    ],
+)
+def test_what_a_peer_says_is_mended_without_a_login_there(
+    daemon: Daemon, role: str, codes: tuple[int, ...], telemetry: list[bytes], severity: Severity, remedy: str
+) -> None:
+    """Telemetry contradicts it at once. An operator whose software is closed stops no other one."""
+    link = daemon.set_up(role=role, system_ids=["7"])
+    for frame in split_payload(b"".join(telemetry), link.counters):
+        link.vehicles.note(frame, NOW)
+    link.peer.claims.problems = ProblemClaim(codes, NOW)
+    finding = daemon.findings()["problems_there"]
+    assert finding.severity is severity
+    assert finding.remedy.startswith(remedy)
+
+
 def test_a_daemon_reports_its_own_problems_only(daemon: Daemon) -> None:
     """Not what it finds about peers, nor what they say. Each code is in the specification, with its name."""
-    daemon.local.append(SimpleNamespace(name="autopilot", ports=[], signing=None))
+    daemon.local.append(SimpleNamespace(name="autopilot", ports=[], signing=None, is_station=False))
     url = parse_url("udpin:127.0.0.1:14550")
     daemon.parts.config.endpoints.append(SimpleNamespace(name="autopilot", url=url, policy={}))
     daemon.set_up(role="all", system_ids="all").peer.claims.problems = ProblemClaim((1,), 6.0)
     found = find(daemon.parts, daemon.history, 6.0)
-    assert own_codes(found, is_cut_off=has_no_client(found, 1)) == [2]
+    assert own_codes(found, is_cut_off=has_no_client(found, daemon.local)) == [2]
     text = (
         (ROOT / "uavlinkd/protocol/README.md").read_text().partition("### Problem reports")[2].partition("\n## ")[0]
     )

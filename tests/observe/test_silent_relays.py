@@ -68,7 +68,7 @@ def test_one_relay_alone_shows_only_possibilities(member: Member) -> None:
     assert member.findings(LATER - 0.1) == {}
     finding = member.only()
     assert (finding.cause, finding.severity) == ("relay_not_answering", Severity.FAULT)
-    assert "it is off, its address is wrong, a firewall drops UDP here or there, or keys" in finding.text
+    assert "it is off, its address is wrong, keys or suites differ, or a firewall drops UDP" in finding.text
     assert "this daemon must be a member there" in finding.remedy
 
 
@@ -80,7 +80,7 @@ def test_relay_that_does_not_answer_by_tls_either(member: Member) -> None:
     member.parts.tls = SimpleNamespace(states=lambda addresses: {URL: "ECONNREFUSED"})
     finding = member.only()
     assert f": by TLS ({URL}) no process listens there now (ECONNREFUSED); by UDP it is off" in finding.text
-    assert finding.remedy.startswith("start it, or correct the port; or run `uavlinkd status` at one")
+    assert finding.remedy.startswith("start it, or correct the port; or start one, and open its firewall")
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def test_relay_that_does_not_answer_by_tls_either(member: Member) -> None:
         ("proxy_407", "the proxy wants a name and password (proxy_407)", "write HTTPS_PROXY="),
         ("TimeoutError", "no answer in time (TimeoutError)", "open TCP port 443 at the relay"),
         ("connected", "it is connected, and gets no answer (silent)", "compare the public_key of the"),
-        ("not connected", "not connected", "run `uavlinkd status` at one"),
+        ("not connected", "not connected", "start one, and open its firewall"),
     ],
 )
 def test_relay_with_a_url_alone(member: Member, state: str, text: str, remedy: str) -> None:
@@ -136,6 +136,9 @@ def test_a_relay_that_answered_before(member: Member) -> None:
     relay = member.add_relay("one", FIRST)
     relay.peer.received_at = 0.0
     assert "it did before, so it is off, or UDP to it or back is blocked" in member.only().text
+    assert member.only().remedy == (
+        "start one, and open its firewall and its provider's; `uavlinkd status` there names other causes"
+    )
 
 
 def test_a_peer_that_is_not_bound_may_not_reach_the_relay(member: Member, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -144,7 +147,7 @@ def test_a_peer_that_is_not_bound_may_not_reach_the_relay(member: Member, monkey
     monkeypatch.setattr(relay, "state_for", lambda _: "waiting")
     member.answers(relay, FIRST)
     assert member.only().text.startswith(
-        "drone1 is not bound at the relay one: it is off, cannot reach the relay (UDP"
+        "drone1 is not bound at the relay one: it is off, or cannot reach the relay (UDP"
     )
 
 
@@ -153,6 +156,7 @@ def test_known_reasons_do_not_look_like_a_firewall(member: Member) -> None:
     member.add_relay("two", SECOND)
     member.evidence.add_error("EPERM", SECOND, 1.0)
     assert "firewall, or the service's unit, does not permit it (EPERM)" in member.only().text
+    assert member.only().remedy == "see `sudo nft list ruleset` here", "the certain cause alone"
     member.sockets.unresolved = lambda name: {"b.test"}
     assert (
         "b.test has no address now"
@@ -165,11 +169,14 @@ def test_a_peer_that_was_up_and_is_silent(member: Member, monkeypatch: pytest.Mo
     member.link.peer.received_at = LATER
     assert member.findings(2 * LATER - 0.1) == {}
     text = member.only(2 * LATER).text
-    assert text.startswith("no answer from it any more: it is off or out of range, a firewall drops UDP")
+    assert text.startswith("no answer from it any more: it is off, out of range, or a firewall drops UDP")
     relay = member.add_relay("one", FIRST)
     monkeypatch.setattr(relay, "state_for", lambda _: "bound")
     member.answers(relay, FIRST)
-    assert "from it any more through the relay one, which answers: it is off" in member.only(2 * LATER).text
+    assert member.only(2 * LATER)[4:] == (
+        "no answer from it any more through the relay one, which answers: it is off, or has no network",
+        "it comes back by itself; look at its power and its network",
+    )
 
 
 def test_a_partner_that_closes_may_start_again(member: Member) -> None:

@@ -67,13 +67,21 @@ async def test_text_that_an_attacker_chose_is_text(browser: Browser) -> None:
 
 @pytest.mark.long
 async def test_a_button_copies_the_command_of_a_remedy(browser: Browser) -> None:
-    """Without the backticks, which nothing on the page shows. A text with other signs than ASCII has no button."""
+    """Without the backticks, which nothing on the page shows. A text with other signs than ASCII has no button, nor
+    has a command for another machine.
+    """
     daemon = await make_up(1)
-    daemon.find("drone1", "`a` is wrong", "run `uavlinkd pubkey`, `x` or `uavlinkd \u202eyekbup`")
+    daemon.find(
+        "drone1",
+        "`a` is wrong",
+        "run `uavlinkd pubkey` here, `x` here, `uavlinkd \u202eyekbup` here or `uavlinkd status` there",
+    )
     async with page_of(daemon.answer) as web, window(browser, web.url) as page:
         await page.context.grant_permissions(["clipboard-read", "clipboard-write"])
         problem = page.get_by_role("region", name="Problems", exact=True).get_by_role("listitem")
-        await expect(problem).to_contain_text("Remedy: run uavlinkd pubkey, x or uavlinkd \u202eyekbup.")
+        await expect(problem).to_contain_text(
+            "Remedy: run uavlinkd pubkey here, x here, uavlinkd \u202eyekbup here or"
+        )
         button = problem.get_by_role("button")
         await expect(button).to_have_count(1)
         await button.click()

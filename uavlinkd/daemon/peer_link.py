@@ -237,10 +237,6 @@ class PeerLink:
         """Whether nothing new came from the peer after its close."""
         return not self.peer.is_up and self.closed_at >= (self.peer.received_at or 0.0)
 
-    def is_overdue(self, now: float) -> bool:
-        """Whether to report that the peer is silent."""
-        return not self.peer.is_up and now - self.silent_since >= NOT_ANSWERING_S
-
     def measure(self, now: float) -> LinkFigures:
         """The quality of the link since the last call. Call it once a second or less often."""
         peer = self.peer

@@ -18,6 +18,7 @@ from uavlinkd.observe.history import History
 from uavlinkd.ops.log import shown
 from uavlinkd.protocol.drops import Detail, DropReason
 from uavlinkd.protocol.path import Path, SocketAddress
+from uavlinkd.protocol.path_state import PathCondition
 from uavlinkd.protocol.peer import Peer
 from uavlinkd.protocol.sessions import Twin
 from uavlinkd.system.error_meanings import meaning_of
@@ -52,9 +53,13 @@ class Moment:
         self.daemon = daemon
         self.history = history
         self.now = now
-        self.fields: Fields = {"here": daemon.config.name}
-        self.down = [link for link in daemon.links.values() if not link.peer.is_up]
-        """The peers that are not up."""
+        of_fleet = "on the laptop, run `uavlinkd fleet enroll HOST --replace --service` for one of them"
+        self.fields: Fields = {
+            "here": daemon.config.name,
+            "renew": "run `uavlinkd keygen` on one" if daemon.fleet is None else of_fleet,
+        }
+        self.down = [link for link in daemon.links.values() if not is_reached(link.peer, now)]
+        """The peers that frames do not reach."""
         self.has_sole_waiting = sum(not link.config.addresses for link in self.down) == 1
         """Whether one peer without addresses is not up: a sender at an unknown address may be this one."""
 
@@ -92,7 +97,7 @@ class Moment:
         return [
             relay
             for relay in self.daemon.relay_links.values()
-            if not relay.peer.is_up and self.now - relay.silent_since >= NOT_ANSWERING_S
+            if not is_reached(relay.peer, self.now) and self.now - relay.silent_since >= NOT_ANSWERING_S
         ]
 
 
@@ -126,6 +131,9 @@ class PeerFacts(PartFacts):
         self.is_certified = link.config.settings.is_certified
         self.addresses = listed(map(str, link.config.addresses))
         """Addresses of the peer in the file, as a text."""
+        self.is_up = is_reached(link.peer, self.now)
+        self.is_overdue = not self.is_up and self.now - link.silent_since >= NOT_ANSWERING_S
+        """Whether to report that the peer is silent."""
 
     def seen(self, kind: str) -> Sighting | None:
         """Evidence since the link went down."""
@@ -156,7 +164,7 @@ class PeerFacts(PartFacts):
     @cached_property
     def is_bound(self) -> bool:
         """Whether a relay forwards to the peer."""
-        return any(relay.peer.is_up and relay.state_for(self.link) == "bound" for relay in self.relays)
+        return any(is_reached(one.peer, self.now) and one.state_for(self.link) == "bound" for one in self.relays)
 
 
 class EndpointFacts(PartFacts):
@@ -175,17 +183,21 @@ class EndpointFacts(PartFacts):
         if silent_s < SILENT_S:
             return "", {}
         url, ports = self.config.url, self.endpoint.ports
-        if url.kind is EndpointKind.STATION and not ports:
-            return "station_absent", {}
+        if url.kind is EndpointKind.STATION:  # a tablet may be off
+            return "", {}
         failures = self.history.failures.within(SILENT_S, self.now)
         error = next((name for name in failures if name in KERNEL_ERRORS or name == "connect_timeout"), "")
         # A client of `udpin` has sent MAVLink: the bytes are another sender's.
         is_known = url.kind is EndpointKind.UDPIN and bool(ports)
         if not is_known and self.history.garbage.within(SILENT_S, self.now):
             return "garbage", {}
-        sends_first = url.kind in (EndpointKind.UDPOUT, EndpointKind.STATION)
-        if ports and not (sends_first and error):
-            return "client_silent", {"clients": listed(port.name for port in ports), "silent_s": silent_s}
+        if ports and not (url.kind is EndpointKind.UDPOUT and error):
+            clients = listed(port.name for port in ports)
+            if url.kind is not EndpointKind.UDPOUT:
+                return "client_silent", {"what": f"the client {clients} has sent no MAVLink for {silent_s:.0f} s"}
+            # Ground control software speaks only after a vehicle does.
+            what = f"no ground control software or other client answers on {clients}"
+            return ("client_silent", {"what": what}) if self.endpoint.frames_sent else ("", {})
         if url.kind is EndpointKind.SERIAL:
             error = next(iter(failures), "")
             meaning = meaning_of(error) or "plug the device in"
@@ -226,6 +238,13 @@ def listed(names: Iterable[str], most: int = 4) -> str:
     """The first names of a list that an attacker may make long."""
     first = list(names)
     return ", ".join(first[:most]) + (f" and {len(first) - most} more" if len(first) > most else "")
+
+
+def is_reached(peer: Peer, now: float) -> bool:
+    """Whether frames reach a peer: an idle link notices only after some seconds that no path answers any more."""
+    is_silent = peer.received_at is not None and now - peer.received_at >= peer.lost_after_s
+    states = peer.paths.states
+    return peer.is_up and not (is_silent and states and all(one.condition is PathCondition.DOWN for one in states))
 
 
 def has_twin(peer: Peer, twin: Twin, now: float, within_s: float = SECURITY_S) -> bool:

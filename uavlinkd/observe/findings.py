@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import Final
 
 from uavlinkd.daemon.parts import DaemonParts
+from uavlinkd.io.ports import Endpoint
 from uavlinkd.observe import table, traffic_signs
 from uavlinkd.observe.facts import EndpointFacts, Moment, PartFacts, PeerFacts
 from uavlinkd.observe.finding import Finding, Severity, Subject
@@ -27,9 +28,9 @@ def find(daemon: DaemonParts, history: History, now: float) -> list[Finding]:
     for link in daemon.links.values():
         peer = PeerFacts(moment, link)
         findings += _present(table.OF_PEER, peer, Subject.PEER, link.name)
-        rows = table.OF_PEER_UP if link.peer.is_up else table.OF_PEER_DOWN
+        rows = table.OF_PEER_UP if peer.is_up else table.OF_PEER_DOWN
         of_state = list(_present(rows, peer, Subject.PEER, link.name))
-        if not (of_state or link.peer.is_up or peer.lacks_relay):
+        if not (of_state or peer.is_up or peer.lacks_relay):
             of_state = list(_present(table.OF_PEER_SILENT, peer, Subject.PEER, link.name))
         findings += of_state
     configs = {config.name: config for config in daemon.config.endpoints}
@@ -52,9 +53,10 @@ def _present(rows: Sequence[Row], facts: Moment | PartFacts, subject: Subject, n
                 yield Finding(row.cause, severity, subject, name, text, remedy)
 
 
-def has_no_client(findings: Iterable[Finding], endpoints: int) -> bool:
-    """Whether there are so many endpoints, and by the findings none of them has a client."""
-    return 0 < endpoints == sum(one.cause in _ABSENT_CLIENTS for one in findings)
+def has_no_client(findings: Iterable[Finding], endpoints: Iterable[Endpoint]) -> bool:
+    """Whether by the findings none of the endpoints has a client. A station that is off does not count."""
+    present = sum(not one.is_station or bool(one.ports) for one in endpoints)
+    return 0 < present == sum(one.cause in _ABSENT_CLIENTS for one in findings)
 
 
 def stop_frames(findings: Iterable[Finding]) -> bool:

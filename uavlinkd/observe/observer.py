@@ -59,7 +59,7 @@ class Observer:
         run(self._find, now, most=inf)
         run(self.drops.check, now, most=inf)
         run(self.events.check, now, most=inf)
-        return own_codes(self.findings, is_cut_off=has_no_client(self.findings, len(self.parts.local.endpoints)))
+        return own_codes(self.findings, is_cut_off=has_no_client(self.findings, self.parts.local.endpoints))
 
     def _find(self, now: float) -> None:
         self.findings = find(self.parts, self.history, now)

@@ -25,6 +25,7 @@ from uavlinkd.observe.facts import (
     details_at,
     has_twin,
     hosts_of,
+    is_reached,
     listed,
     places_of,
 )
@@ -40,6 +41,9 @@ if TYPE_CHECKING:
 
 CONFIRM_S: Final = 2.0
 """A handshake that is not complete after this time is reported."""
+UNREACHED_S: Final = 15.0
+"""A relay that no datagram has reached for this time since its start is reported: its members try more often."""
+COMES_BACK: Final = "it comes back by itself; look at its power and its network"
 
 Signs = Iterator[Fields]
 
@@ -236,6 +240,14 @@ def relay_silent(moment: Moment) -> Signs:
             yield _silent_relay(moment, relay) | ({} if relay.config.name in needed else {"severity": "warning"})
 
 
+def no_datagram(moment: Moment) -> Signs:
+    """A relay that nothing has reached since its start."""
+    daemon, waited_s = moment.daemon, moment.now - moment.history.began_at
+    if daemon.relay is not None and not daemon.line.read_at and waited_s >= UNREACHED_S:
+        ports = dict.fromkeys(str(address.port) for address in daemon.peer_sockets.addresses)
+        yield {"ports": listed(ports), "waited_s": waited_s}
+
+
 def _by_udp(moment: Moment, relay: RelayLink) -> tuple[str, str]:
     """Why a relay does not answer by UDP, and the remedy, if there is a certain one."""
     if names := sorted(moment.daemon.peer_sockets.unresolved(relay.name)):
@@ -248,7 +260,8 @@ def _by_udp(moment: Moment, relay: RelayLink) -> tuple[str, str]:
         return f"{shown(path.address)}: {meaning_of(error).partition(':')[0]} ({error}, ICMP)", ""
     if relay.peer.received_at is not None:
         return "it did before, so it is off, or UDP to it or back is blocked", ""
-    return "it is off, its address is wrong, a firewall drops UDP here or there, or keys or suites differ", ""
+    keys = "" if relay.peer.settings.is_certified else "keys or suites differ, "
+    return f"it is off, its address is wrong, {keys}or a firewall drops UDP here or there", ""
 
 
 def _silent_relay(moment: Moment, relay: RelayLink) -> Fields:
@@ -259,28 +272,31 @@ def _silent_relay(moment: Moment, relay: RelayLink) -> Fields:
     if hosts_of(relay) or not problems:
         reasons.append(f"by UDP {why}" if problems else why)
     remedies = dict.fromkeys(remedy for remedy in (advice, *(remedy for _, remedy in problems.values())) if remedy)
+    if not advice:  # nothing is certain on this machine
+        start = f"start {relay.config.name}, and open its firewall and its provider's; `uavlinkd status` there names"
+        keys = "; `uavlinkd pubkey` there must print its public_key here, and this daemon must be a member there"
+        is_known = relay.peer.settings.is_certified or relay.peer.received_at is not None
+        remedies[f"{start} other causes{'' if is_known else keys}"] = None
     return {
         "relay": titled("relay", relay.config.name),
-        "name": relay.config.name,
         "addresses": listed(map(str, relay.config.addresses)),
         "why": "; ".join(reasons),
-        "advice": "".join(f"{remedy}; or " for remedy in remedies),
+        "advice": "; or ".join(remedies),
     }
 
 
 def not_bound(peer: PeerFacts) -> Signs:
-    if not peer.link.is_overdue(peer.now) or peer.link.is_closed or peer.is_bound:
+    if not peer.is_overdue or peer.link.is_closed or peer.is_bound:
         return
     for relay in peer.relays:
-        if not relay.peer.is_up or relay.state_for(peer.link) != "waiting":
+        if not is_reached(relay.peer, peer.now) or relay.state_for(peer.link) != "waiting":
             continue
-        name = relay.config.name
-        advice = (
-            f"compare both public_key with `uavlinkd pubkey`; write a [[relay]] for {name} into its file, and a"
-            f" [[member]] for it into the file of the relay"
-        )
-        if peer.is_certified:
-            advice = "its certificate must not be revoked"
+        name, advice = relay.config.name, COMES_BACK
+        if not peer.is_certified:
+            advice = (
+                f"start it; if it is no member, does not use {name}, or keys differ: compare both public_key with"
+                f" `uavlinkd pubkey`, write a [[relay]] for {name} into its file, and a [[member]] into the relay's"
+            )
         yield {"relay": titled("relay", name), "advice": advice}
 
 
@@ -374,25 +390,31 @@ def not_confirmed(peer: PeerFacts) -> Signs:
 
 
 def closed_by_peer(peer: PeerFacts) -> Signs:
-    if peer.link.is_overdue(peer.now) and peer.link.is_closed:
+    if peer.is_overdue and peer.link.is_closed:
         yield {"age_s": peer.now - peer.link.closed_at}
 
 
 def no_answer(peer: PeerFacts) -> Signs:
-    """A silent peer that has a configured place, or was up before."""
+    """A silent peer that has a configured place, or was up before: then its address and keys were right."""
     config, was_up = peer.link.config, peer.link.peer.received_at is not None
-    if peer.link.is_overdue(peer.now) and (was_up or config.addresses or config.relays):
-        bound = [name for name, relay in peer.daemon.relay_links.items() if relay.state_for(peer.link) == "bound"]
-        via = f" through the {titled('relay', bound[0])}, which answers" if bound else ""
-        more = ", or it has a bulletin that revokes this daemon (on the laptop: `uavlinkd fleet list`)"
-        yield {
-            "places": f"it any more{via}" if was_up else peer.addresses or f"it{via}",
-            "more": more if peer.is_certified else "",
-        }
+    if not peer.is_overdue or not (was_up or config.addresses or config.relays):
+        return
+    bound = [name for name, relay in peer.daemon.relay_links.items() if relay.state_for(peer.link) == "bound"]
+    via = f" through the {titled('relay', bound[0])}, which answers" if bound else ""
+    places = f"it any more{via}" if was_up else peer.addresses or f"it{via}"
+    causes = "it is off, or has no network" if bound else "it is off, out of range, or a firewall drops UDP"
+    if peer.is_certified and not bound:
+        causes += "; or it has a bulletin that revokes this daemon (on the laptop: `uavlinkd fleet list`)"
+    elif not was_up and not peer.is_certified:
+        causes += "; or addresses, keys, PSKs or protocol versions differ"
+    start = f"start {peer.name}, and open its firewall; `uavlinkd status` there names other causes"
+    radio = "; of a serial radio, compare the baud rate, NETID and air speed of both modems, and set MAVLINK=0"
+    advice = (COMES_BACK if was_up else start) + ("" if peer.daemon.serial is None else radio)
+    yield {"places": places, "causes": causes, "advice": advice}
 
 
 def not_connecting(peer: PeerFacts) -> Signs:
     config = peer.link.config
     is_passive = not config.addresses and not config.relays and peer.link.peer.received_at is None
-    if peer.link.is_overdue(peer.now) and is_passive:
+    if peer.is_overdue and is_passive:
         yield {}

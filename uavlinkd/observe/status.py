@@ -18,7 +18,7 @@ from uavlinkd.io.ports import Endpoint
 from uavlinkd.mavlink.dialect import command_name, name_of
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import ANY_OTHER, REFUSALS, Refusal
-from uavlinkd.observe.facts import is_contested
+from uavlinkd.observe.facts import is_contested, is_reached
 from uavlinkd.observe.finding import Finding
 from uavlinkd.observe.findings import find, has_no_client, stop_frames
 from uavlinkd.observe.observer import Observer
@@ -51,10 +51,10 @@ def overview(observer: Observer, now: float, detailed: Collection[str]) -> dict[
 def daemon_status(observer: Observer, now: float) -> dict[str, object]:
     """The status of the whole daemon. Times are ages in seconds. A client computes rates from two of these.
 
-    ``frames_pass``: every peer is up, within the last 10 s no traffic was wholly refused (``blocked`` names it),
-    clients are not all absent (``has_no_client``), and no two machines contend with one key for a link
-    (``contested``). ``stopped_there``: peers that say so of themselves; that is a claim, and health checks act on
-    ``frames_pass``.
+    ``frames_pass``: every peer is up with a path that works, within the last 10 s no traffic was wholly refused
+    (``blocked`` names it), clients are not all absent (``has_no_client``), and no two machines contend with one key
+    for a link (``contested``). ``stopped_there``: peers that say so of themselves and send no telemetry; that is a
+    claim, and health checks act on ``frames_pass``.
     """
     daemon = observer.parts
     status = _status(observer, now, find(daemon, observer.history, now), daemon.links)
@@ -79,10 +79,10 @@ def _status(
 ) -> dict[str, object]:
     daemon, node = observer.parts, observer.parts.node
     blocked = observer.history.blocked(now)
-    is_cut_off = has_no_client(findings, len(daemon.local.endpoints))
+    is_cut_off = has_no_client(findings, daemon.local.endpoints)
     contested = [name for name, link in daemon.links.items() if is_contested(link.peer, now)]
     all_up = (bool(daemon.links) or daemon.config.is_only_relay) and all(
-        link.peer.is_up for link in daemon.links.values()
+        is_reached(link.peer, now) for link in daemon.links.values()
     )
     return {
         "schema": STATUS_SCHEMA,
@@ -93,7 +93,7 @@ def _status(
         "blocked": [dict(zip(("subject", "name", "direction"), key, strict=True)) for key in blocked],
         "has_no_client": is_cut_off,
         "contested": contested,
-        "stopped_there": [name for name, link in daemon.links.items() if stops_frames(link.peer, now)],
+        "stopped_there": [name for name, link in daemon.links.items() if stops_frames(link, now)],
         "findings": [finding.as_json() for finding in findings],
         "peers": {
             name: (peer_status if name in detailed else _few_facts)(link, now, daemon.peer_sockets.way_of)
@@ -163,7 +163,7 @@ def _few_facts(link: PeerLink, now: float, way_of: WayOf) -> dict[str, object]:
 def _peer_now(link: PeerLink, now: float) -> dict[str, object]:
     peer, figures, (bytes_in_s, bytes_out_s) = link.peer, link.figures, link.rates.of(link.peer)
     return {
-        "state": state_of(peer),
+        "state": state_of(peer, now),
         "path": None if peer.path is None else shown(peer.path.address),
         "last_received_s": _age(peer.received_at, now),
         "freshness_unverified_s": _age(peer.unverified_since, now),
@@ -240,9 +240,9 @@ def _claims(link: PeerLink, now: float) -> list[dict[str, object]]:
     ]
 
 
-def state_of(peer: Peer) -> str:
+def state_of(peer: Peer, now: float) -> str:
     """``up``, ``lost`` (was up) or ``waiting`` (was never up)."""
-    return "up" if peer.is_up else "lost" if peer.received_at is not None else "waiting"
+    return "up" if is_reached(peer, now) else "lost" if peer.received_at is not None else "waiting"
 
 
 def used_relay_status(relay: RelayLink, daemon: DaemonParts, now: float) -> dict[str, object]:
@@ -252,7 +252,7 @@ def used_relay_status(relay: RelayLink, daemon: DaemonParts, now: float) -> dict
     """
     peer = relay.peer
     return {
-        "state": state_of(peer),
+        "state": state_of(peer, now),
         "peer": relay.config.peer,
         "public_key": encode_key(peer.settings.public_key),
         "addresses": [str(written) for written in relay.config.addresses],

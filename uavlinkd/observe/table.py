@@ -46,15 +46,14 @@ class Row(NamedTuple):
 
 _TWO_MACHINES: Final = (
     "two machines use {facts}; a card was copied, or the key is stolen",
-    "run `uavlinkd pubkey` on both machines. If both print one key, run `uavlinkd keygen` on one; rotate the key"
-    " only if a second machine has it: an attacker that holds handshakes back until a restart, or a captured"
-    " peer, can also cause this",
+    "run `uavlinkd pubkey` on both machines. If both print one key, {renew}; rotate the key only if a second machine"
+    " has it: an attacker that holds handshakes back until a restart, or a captured peer, can also cause this",
 )
 OF_DAEMON: Final = (
     Row(
         *("own_key_elsewhere", SECURITY, signs.own_key_elsewhere),
         "a sender at {at} uses this daemon's private key, or an attacker replays an old recording",
-        "if a card was copied, run `uavlinkd keygen` on one machine; else the key may be stolen: replace it",
+        "if a card was copied, {renew}; else the key may be stolen: replace it",
         code=11,
     ),
     Row(
@@ -65,7 +64,7 @@ OF_DAEMON: Final = (
     Row(
         *("listen_address_missing", FAULT, signs.listen_address_missing),
         "no interface has {addresses}, which is in listen",
-        "write an address of this machine (`ip -brief address`) or {wildcard}; or wait for the network",
+        "write an address of this machine (`ip -brief address` here) or {wildcard}; or wait for the network",
         code=7,
     ),
     Row(
@@ -86,7 +85,7 @@ OF_DAEMON: Final = (
     Row(
         *("configuration_refused", WARNING, signs.configuration_refused),
         "the last reload was refused, and the configuration before is in force: {problems}",
-        "correct what `uavlinkd check --config {file}` prints, and run `uavlinkd reload`",
+        "correct what `uavlinkd check --config {file}` here prints, and run `uavlinkd reload` here",
     ),
     Row(
         *("frames_in_circle", WARNING, signs.frames_in_circle),
@@ -140,11 +139,15 @@ OF_DAEMON: Final = (
     Row(
         *("relay_not_answering", FAULT, signs.relay_silent),
         "the {relay} does not answer at {addresses}: {why}",
-        "{advice}run `uavlinkd status` at {name}: it names the cause if datagrams arrive there; else start it,"
-        " compare its address, and open its firewall. `uavlinkd pubkey` there must print the public_key of the"
-        " [[relay]] here, and this daemon must be a member there",
+        "{advice}",
         Exit.FAILED,
         frozenset({"own_certificate_revoked"}),
+    ),
+    Row(
+        *("no_datagram", FAULT, signs.no_datagram),
+        "no datagram has reached UDP port {ports} since the start, {waited_s:.0f} s ago",
+        "open it in the firewalls of this machine and of its provider, unless all members are off",
+        Exit.FAILED,
     ),
     Row(
         *("line_noise", WARNING, signs.line_noise),
@@ -175,12 +178,12 @@ OF_PEER: Final = (
     ),
     Row(
         *("problems_there", WARNING, traffic_signs.problems_there),
-        *("it says about itself: {meanings}", "run `uavlinkd status` there"),
+        *("it says about itself: {meanings}", "{advice}"),
     ),
     Row(
         *("revoked_but_pinned", WARNING, signs.revoked_but_pinned),
         "the bulletin revokes its certificate (serial {serial}), but its [[peer]] in this file lets it in",
-        "if it was captured, delete that section and run `uavlinkd reload`",
+        "if it was captured, delete that section and run `uavlinkd reload` here",
     ),
 )
 """Any peer."""
@@ -198,7 +201,7 @@ _REFUSED: Final = (
     Row(
         *("all_refused", FAULT, traffic_signs.all_refused),
         "{rule} refuses every frame {which}: {reasons}",
-        "`uavlinkd check --verbose` prints what passes: write the role of the other end, or allow what it needs",
+        "`uavlinkd check --verbose` here prints what passes: write the role of the other end, or allow what it needs",
         Exit.FAILED,
         frozenset({"roles_exchanged"}),
         code=1,
@@ -252,12 +255,12 @@ OF_PEER_DOWN: Final = (
     _down(
         *("name_not_resolved", FAULT, signs.name_not_resolved),
         "{names} has no address now",
-        "see `getent hosts {first}`, or write an IP address; the daemon tries again each second",
+        "see `getent hosts {first}` here, or write an IP address; the daemon tries again each second",
     ),
     _down(
         *("firewall_here", FAULT, signs.firewall_here),
         "this machine refuses to send to {at} (EPERM)",
-        "allow outgoing UDP from the daemon's port: see `sudo nft list ruleset`",
+        "allow outgoing UDP from the daemon's port: see `sudo nft list ruleset` here",
     ),
     _down(
         *("no_route", FAULT, signs.no_route),
@@ -265,9 +268,8 @@ OF_PEER_DOWN: Final = (
     ),
     _down(
         *("not_bound", FAULT, signs.not_bound),
-        "{who} is not bound at the {relay}: it is off, cannot reach the relay (UDP blocked there), is not a member,"
-        " does not use it, or keys differ",
-        "start {who}; `uavlinkd status` there and at the relay names the cause; {advice}",
+        "{who} is not bound at the {relay}: it is off, or cannot reach the relay (UDP blocked there)",
+        "{advice}",
     ),
     _down(
         *("wrong_key_here", FAULT, signs.wrong_key_here),
@@ -320,10 +322,7 @@ OF_PEER_SILENT: Final = (
     ),
     _down(
         *("no_answer", FAULT, signs.no_answer),
-        "no answer from {places}: it is off or out of range, a firewall drops UDP here, there or between, or"
-        " addresses, keys, PSKs or protocol versions differ{more}",
-        "run `uavlinkd status` at {who}: it names the cause if datagrams arrive there; else open its firewall; of a"
-        " serial radio, compare the baud rate, NETID and air speed of both modems, and set MAVLINK=0",
+        *("no answer from {places}: {causes}", "{advice}"),
         unless=frozenset({"closed_by_peer"}),
     ),
     _down(
@@ -347,13 +346,12 @@ OF_ENDPOINT: Final = (
     ),
     Row(
         *("client_silent", WARNING, traffic_signs.is_silent_by("client_silent")),
-        "the client {clients} has sent no MAVLink for {silent_s:.0f} s",
-        "check that it runs, speaks MAVLink here and sends, not only listens; then power, wiring and baud rate",
+        *("{what}", "open or start it; it must send here, not only listen; if serial, look at wiring and baud rate"),
         code=4,
     ),
     Row(
         *("device_unavailable", FAULT, traffic_signs.is_silent_by("device_unavailable")),
-        *("{url} cannot be opened{error}", "{meaning}"),
+        *("the device of {url} cannot be opened{error}", "{meaning}"),
         Exit.EVERYWHERE,
         code=5,
     ),
@@ -389,14 +387,8 @@ OF_ENDPOINT: Final = (
         " action=allow protocol=icmpv4:8,any remoteip={address}",
     ),
     Row(
-        *("station_absent", WARNING, traffic_signs.is_silent_by("station_absent")),
-        "{who} has no session: its tunnel is off, or has another key or address of this daemon",
-        "switch its tunnel on; else `uavlinkd station remove {who}` and `station add {who}` make a new code",
-        Exit.EVERYWHERE,
-    ),
-    Row(
         *("client_unreachable", WARNING, traffic_signs.is_silent_by("client_unreachable")),
-        *("{url} cannot be reached: {why}", "{meaning}"),
+        *("the client at {url} cannot be reached: {why}", "{meaning}"),
         Exit.EVERYWHERE,
         code=3,
     ),

@@ -8,9 +8,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
+from uavlinkd.daemon.peer_link import PeerLink
 from uavlinkd.io.udp import UdpClient
 from uavlinkd.io.url import EndpointKind
-from uavlinkd.mavlink.dialect import command_name, name_of
+from uavlinkd.mavlink.dialect import SYSTEM_ID, command_name, name_of
 from uavlinkd.mavlink.egress.lanes import EgressDrop
 from uavlinkd.mavlink.policy.gate import ANY_OTHER, REFUSALS, Refusal
 from uavlinkd.observe.facts import (
@@ -174,7 +175,7 @@ def _refused_kind(claim: Claim, now: float) -> str:
 
 
 PROBLEMS: Final = {
-    1: ("all_refused", "its policy refuses all frames of a client"),
+    1: ("all_refused", "its policy refuses all frames of a client, such as an autopilot with another system id"),
     2: ("cut_off", "no endpoint has a client"),
     3: ("no_client", "an endpoint has no client"),
     4: ("client_silent", "a client sends no MAVLink"),
@@ -187,7 +188,8 @@ PROBLEMS: Final = {
 }
 """The codes of problem reports with their names and meanings, the most important first."""
 CUT_OFF: Final = 2
-_STOPS_FRAMES: Final = frozenset({1, CUT_OFF})
+_REFUSED: Final = 1
+_OF_CLIENTS: Final = frozenset(range(CUT_OFF, 7))
 
 
 def codes_there(peer: Peer, now: float) -> tuple[int, ...]:
@@ -196,9 +198,14 @@ def codes_there(peer: Peer, now: float) -> tuple[int, ...]:
     return claim.codes if peer.is_up and now - claim.received_at <= c.PROBLEMS_LAST_S else ()
 
 
-def stops_frames(peer: Peer, now: float) -> bool:
-    """Whether a peer says that frames stop there."""
-    return not _STOPS_FRAMES.isdisjoint(codes_there(peer, now))
+def stops_frames(link: PeerLink, now: float) -> bool:
+    """Whether a peer says that frames stop there, and no telemetry contradicts it. An operator whose ground control
+    software is closed stops no other one.
+    """
+    stopping = {_REFUSED} if link.config.policy.get("role") == "operator" else {_REFUSED, CUT_OFF}
+    if stopping.isdisjoint(codes_there(link.peer, now)):
+        return False
+    return all(vehicle["heartbeat_s"] >= SILENT_S for vehicle in link.vehicles.status(now))
 
 
 def name_of_problem(code: int) -> str:
@@ -209,8 +216,20 @@ def name_of_problem(code: int) -> str:
 def problems_there(peer: PeerFacts) -> Signs:
     if codes := codes_there(peer.link.peer, peer.now):
         meanings = [PROBLEMS[code][1] if code in PROBLEMS else f"problem {code}" for code in codes]
-        is_severe = stops_frames(peer.link.peer, peer.now)
-        yield {"meanings": "; ".join(meanings), **({"severity": "fault"} if is_severe else {})}
+        severity = {"severity": "fault"} if stops_frames(peer.link, peer.now) else {}
+        yield {"meanings": "; ".join(meanings), "advice": _advice_there(peer, codes), **severity}
+
+
+def _advice_there(peer: PeerFacts, codes: tuple[int, ...]) -> str:
+    """What helps without a login there, which a vehicle behind LTE does not have."""
+    client, number = "autopilot", SYSTEM_ID
+    if peer.rules.get("role") == "operator":
+        client, number = "ground control software", "the system id"
+    if _REFUSED in codes and isinstance(ids := peer.rules.get("system_ids"), list | tuple):
+        return f"set {number} of its {client} to {listed(map(str, ids))}"
+    if _OF_CLIENTS.isdisjoint(codes):
+        return "run `uavlinkd status` there"
+    return f"look whether its {client} is on and sends, and at its wiring and baud rate"
 
 
 # Local endpoints.

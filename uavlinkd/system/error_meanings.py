@@ -41,15 +41,15 @@ WEB_ERRORS: Final[Mapping[str, str]] = {
 
 ERROR_MEANINGS: Final[Mapping[str, str]] = {
     # The network.
-    "EPERM": "this machine's firewall, or the service's unit, does not permit it: see `sudo nft list ruleset`",
+    "EPERM": "this machine's firewall, or the service's unit, does not permit it: see `sudo nft list ruleset` here",
     "ENETUNREACH": "this machine has no route to the address: bring the network up, and see `ip route get ADDRESS`",
     "EHOSTUNREACH": "no machine answers at the address: it is off, or its address is wrong; or a firewall rejects",
-    "ENETDOWN": "the network interface is down: see `ip -brief link`",
+    "ENETDOWN": "the network interface is down: see `ip -brief link` here",
     "ECONNREFUSED": "no process listens there now: start it, or correct the port",
     "ECONNRESET": "the other end closed the connection",
     "EPIPE": "the other end closed the connection",
     "ETIMEDOUT": "the other end does not answer",
-    "EADDRNOTAVAIL": "this machine does not have the address: see `ip -brief address`",
+    "EADDRNOTAVAIL": "this machine does not have the address: see `ip -brief address` here",
     "EADDRINUSE": "another process has the port: end it (`ss -lntup` names it), or write another port",
     "EAFNOSUPPORT": "this machine cannot use addresses of this family (IPv4 or IPv6)",
     "EINVAL": "the address cannot be used from here: a link-local address (fe80::) needs its interface, as in %wlan0,"

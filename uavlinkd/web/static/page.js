@@ -159,8 +159,8 @@ function quoted(text) { // what is between backticks is for a terminal or a file
   return text.split("`").map((part, i, all) => (i % 2 && i < all.length - 1 ? el("code", {}, part) : part));
 }
 
-function commands(text) { // a name with other signs could be more than it seems to be
-  return text.split("`").filter((part, i, all) => i % 2 && i < all.length - 1 && /^[ -~]+ [ -~]+$/.test(part));
+function commands(text) { // that run here; a name with other signs could be more than it seems to be
+  return text.split("`").filter((part, i, all) => i % 2 && /^[ -~]+ [ -~]+$/.test(part) && /^ here\b/.test(all[i + 1]));
 }
 
 function copier(command) {
