@@ -121,9 +121,7 @@ class DatagramEndpoint(Endpoint):
                 if isinstance(sender, UdpPort):
                     port = sender if not sender.is_closed else self._admitted(sender.address, now)
                 else:
-                    port = (
-                        self._admitted(sender, now) if self.signing is None or self.signing.admits(frames) else None
-                    )
+                    port = self._admitted(sender, now) if self._has_genuine(frames) else None
                 if port is not None:
                     if self._silent:
                         self._wake(port)
