@@ -218,16 +218,16 @@ async def test_what_keeps_an_autopilot_from_a_key() -> None:
         await refused("is armed")
         autopilot.is_armed = False
         second = Autopilot(system=2)
-        beating = asyncio.create_task(_beat(pair.cable, second))
+        beating = asyncio.create_task(_beat(pair.cable.send, second))
         await refused("systems 1 and 2")
         beating.cancel()
         pair.cable.close()
         await refused("no autopilot was heard")
 
 
-async def _beat(cable: Cable, autopilot: Autopilot) -> None:
+async def _beat(send: Callable[[bytes], object], autopilot: Autopilot) -> None:
     while True:
-        cable.send(autopilot.heartbeat())
+        send(autopilot.heartbeat())
         await asyncio.sleep(HEARTBEAT_S)
 
 
@@ -279,6 +279,28 @@ async def test_clear_after_a_setup_that_was_not_confirmed() -> None:
         autopilot.is_mended = True
         assert (await pair.ask("clear", None))["is_changed"]
         assert not autopilot.has_key
+
+
+class Withheld(Autopilot):
+    """It never gets the message that removes its key."""
+
+    def receive(self, data: bytes) -> list[bytes]:
+        if self.has_key and int.from_bytes(data[7:10], "little") == mavlink.MAVLINK_MSG_ID_SETUP_SIGNING:
+            return []
+        return super().receive(data)
+
+
+async def test_a_stranger_does_not_confirm_that_a_key_was_removed() -> None:
+    """The command deletes the only copy of the key then."""
+    autopilot = Withheld()
+    async with flying("udpin", autopilot) as pair:
+        assert (await pair.ask("setup"))["is_changed"]
+        with socket.socket(type=socket.SOCK_DGRAM) as stranger:
+            stranger.connect(pair.endpoint._sock.getsockname())  # type: ignore[attr-defined]
+            beating = asyncio.create_task(_beat(stranger.send, Autopilot()))
+            assert (await pair.ask("clear", None))["is_changed"] is None
+            beating.cancel()
+        assert pair.endpoint.failures["unsigned"]
 
 
 async def test_a_key_reaches_one_client_only() -> None:

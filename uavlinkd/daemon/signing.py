@@ -151,15 +151,10 @@ class AutopilotSigning:
         return await _done(signing) if signing.signer is newest and signing.is_proven else _UNKNOWN
 
     async def _clear(self, endpoint: Endpoint, signing: EndpointSigning, system: int) -> dict[str, object]:
-        began_at = monotonic()
-
-        def is_cleared() -> bool:
-            return signing.unsigned_at > began_at
-
         if signing.is_proven:
             signing.may_lack_key = True
-            await _repeat(lambda: signing.set_up(None, system), is_cleared)
-            if not is_cleared():
+            await _repeat(lambda: signing.set_up(None, system), lambda: _lacks_key(signing), HEARD_S + CONFIRMED_S)
+            if not _lacks_key(signing):
                 return _UNKNOWN
         self._remove(endpoint)
         return {"problem": "", "is_changed": True, "system": system, "accepts_unsigned": True}
@@ -178,14 +173,18 @@ def _heard(signing: EndpointSigning) -> dict[int, bool]:
     return {one["system"]: one["is_armed"] for one in vehicles if one["heartbeat_s"] < HEARD_S}
 
 
+def _lacks_key(signing: EndpointSigning) -> bool:
+    """Whether HEARTBEATs come without a signature, and no frame with one: a stranger can send the former."""
+    return monotonic() - signing.unsigned_at < HEARD_S <= monotonic() - signing.verified_at
+
+
 def _problem(signing: EndpointSigning, heard: Mapping[int, bool]) -> str | None:
     """Why the autopilot cannot get a key now."""
-    lacks_key = monotonic() - signing.unsigned_at < HEARD_S <= monotonic() - signing.verified_at
     if not signing.is_proven and signing.has_foreign_key:
         return OTHER_KEY
     if not heard:
         return f"no autopilot was heard for {HEARD_S:g} s: is it on, and does `uavlinkd status` show its frames?"
-    if not (signing.is_proven or lacks_key):
+    if not (signing.is_proven or _lacks_key(signing)):
         return _NOT_PROVEN
     if len(heard) > 1:
         systems = " and ".join(map(str, sorted(heard)))
