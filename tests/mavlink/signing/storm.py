@@ -102,7 +102,7 @@ class Storm:
         self._since = 0.0  # when the last restart or jump was, of either end
         self._is_new_life = False  # the autopilot was restarted, and no question reached it since
         self._signed = self._made = self._first_of_life = 0
-        self._caught: set[bytes] = set()  # senders of which it accepted a replay, and nothing new since
+        self._caught: set[bytes] = set()  # senders of which it accepted, since its start, only frames from before
         self._records: dict[bool, list[Sent]] = {True: [], False: []}  # by: goes to the daemon
         self._recent: dict[bool, deque[Sent]] = {True: deque(maxlen=50), False: deque(maxlen=50)}
         self._withheld: list[tuple[bool, Sent]] = []
@@ -181,7 +181,6 @@ class Storm:
         is_late = sent.number <= last or bool(self._taken_ever[sent.number])
         if is_taken and is_late:
             if self._is_new_life or sender in self._caught:
-                self._caught.add(sender)
                 self.counts["autopilot: replays accepted, begun between its start and the first question"] += 1
             else:
                 self.faults["the autopilot accepts a replay"] += 1
@@ -192,8 +191,8 @@ class Storm:
         if is_taken:
             self.counts["autopilot: accepted"] += 1
             self._taken[sender] = max(last, sent.number)
-            if not is_late:
-                self._caught.discard(sender)
+            change = self._caught.add if sent.number < self._first_of_life else self._caught.discard
+            change(sender)
             self._taken_ever[sent.number] = 1
             if verdict.message == ID["TIMESYNC"]:
                 self._is_new_life = self._is_new_life and sent.number < self._first_of_life
