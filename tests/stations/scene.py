@@ -158,4 +158,4 @@ UAVLINKD: Final = (sys.executable, "-m", "uavlinkd")
 
 def text_in(printed: str) -> str:
     """The text for the app in what ``station add`` printed."""
-    return printed[printed.index("[Interface]") : printed.index("\nRestart the daemon")]
+    return printed[printed.index("[Interface]") : printed.index("\nSet the system id")]
