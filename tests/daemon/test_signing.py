@@ -9,6 +9,7 @@ import socket
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -112,7 +113,7 @@ class Pair:
 
 
 @asynccontextmanager
-async def flying(kind: str, autopilot: Autopilot, *keys: Secret) -> AsyncIterator[Pair]:
+async def flying(kind: str, autopilot: Autopilot, *keys: Secret, state: Path | None = None) -> AsyncIterator[Pair]:
     """Linked daemons; the vehicle's has a serial, UDP or TCP endpoint."""
     closing: list[Callable[[], object]] = []
     listener = socket.socket()
@@ -129,7 +130,8 @@ async def flying(kind: str, autopilot: Autopilot, *keys: Secret) -> AsyncIterato
         url = NetworkUrl(EndpointKind.UDPIN, ANY_PORT)
     of_vehicle = config("left", url)
     signs = replace(of_vehicle.endpoints[0].signing, keys=keys)
-    vehicle = Daemon(replace(of_vehicle, endpoints=(replace(of_vehicle.endpoints[0], signing=signs),)))
+    endpoint = replace(of_vehicle.endpoints[0], signing=signs)
+    vehicle = Daemon(replace(of_vehicle, signing_state=state, endpoints=(endpoint,)))
     await vehicle.start()
     address = tuple(vehicle.parts.peer_sockets.addresses)
     ground = Daemon(config("right", NetworkUrl(EndpointKind.UDPIN, ANY_PORT), address))
@@ -389,4 +391,30 @@ async def test_timestamps_that_the_autopilot_remembers() -> None:
         await pair.commands_pass()
         assert (await pair.ask("clear", None))["is_changed"]
         assert (await pair.ask("setup", OTHER))["is_changed"]
+        await pair.commands_pass()
+
+
+async def test_both_ends_without_power(tmp_path: Path) -> None:
+    """What was recorded in an earlier flight is old, also if the autopilot begins again with its key's timestamp."""
+    autopilot, state = Autopilot("px4"), tmp_path / "left.signing-state"
+    autopilot.receive(pack(mavlink.MAVLink_setup_signing_message(1, 1, list(KEY.reveal()), 5)))
+    async with flying("udpin", autopilot, KEY, state=state) as pair:
+        autopilot.set_time(2**45)
+        await until(lambda: state.exists() and int(state.read_text()) > 2**45)
+        recorded = autopilot.heartbeat()
+    autopilot.restart()
+    async with flying("udpin", autopilot, KEY, state=state) as pair:
+        await pair.commands_pass()
+        before = pair.endpoint.failures["replayed"]
+        pair.cable.send(recorded)
+        await until(lambda: pair.endpoint.failures["replayed"] > before)
+
+
+async def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
+    """Frames pass without the file."""
+    autopilot = Autopilot()
+    autopilot.receive(pack(mavlink.MAVLink_setup_signing_message(1, 1, list(KEY.reveal()), 5)))
+    async with flying("udpin", autopilot, KEY, state=tmp_path / "no" / "state") as pair:
+        await pair.commands_pass()
+        await until(lambda: pair.vehicle.parts.signing.has_failed)
         await pair.commands_pass()

@@ -87,6 +87,7 @@ def build(file: File, states: Path) -> Config:
         relays=tuple(_relay(file, relay, fleet) for relay in file.used_relays),
         fleet=fleet,
         stations=_stations(file, states) if file["station"] else None,
+        signing_state=states / f"{top.get('name')}.signing-state",
     )
 
 

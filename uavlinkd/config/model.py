@@ -298,6 +298,8 @@ class Config:
     relays: tuple[RelayConfig, ...] = ()
     fleet: FleetConfig | None = None
     stations: StationsConfig | None = None
+    signing_state: Path | None = None
+    """The file with a timestamp behind those of all signatures; None: it is not kept."""
     warnings: tuple[str, ...] = ()
 
     @property

@@ -167,7 +167,9 @@ class DaemonParts:
         """The signatures between this daemon and its autopilots: made when an endpoint or a person wants them."""
         from uavlinkd.daemon.signing import AutopilotSigning  # noqa: PLC0415
 
-        return AutopilotSigning(self.local, self._keep_signing)
+        signing = AutopilotSigning(self.local, self._keep_signing, self.config.signing_state)
+        self.features.append(signing)
+        return signing
 
     def _keep_signing(self, name: str, signing: SigningConfig) -> None:
         """The keys of an endpoint have changed, and those in the file too: a reload compares the two."""

@@ -11,17 +11,25 @@ import json
 import os
 from collections.abc import Callable, Mapping
 from itertools import count
+from pathlib import Path
 from typing import Final
+
+import structlog
 
 from uavlinkd.config.keys import decode_key
 from uavlinkd.config.model import EndpointConfig, SigningConfig
+from uavlinkd.daemon.features import Feature
 from uavlinkd.daemon.local_endpoints import LocalEndpoints
 from uavlinkd.io.ports import Endpoint, LocalPort
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.mavlink.policy.delivery import Source
-from uavlinkd.mavlink.signing.endpoint_signing import EndpointSigning
+from uavlinkd.mavlink.signing.endpoint_signing import LEAP, EndpointSigning
+from uavlinkd.mavlink.signing.signature import LAST_TIMESTAMP
 from uavlinkd.protocol.crypto import Secret
 from uavlinkd.system.clock import monotonic
+from uavlinkd.system.folders import replace_file
+from uavlinkd.system.guard import report
+from uavlinkd.system.tasks import Threads
 
 HEARD_S: Final = 3.0
 """An autopilot whose last HEARTBEAT is older is not there. They send one a second."""
@@ -33,7 +41,10 @@ REPEAT_S: Final = 0.5
 """Between two SETUP_SIGNING."""
 FIRST_JUMP: Final = 40
 """The second SETUP_SIGNING begins with this power of two as its timestamp. The next ones double it."""
+RESERVE: Final = 5 * LEAP
+"""How far the written timestamp is ahead of the used ones: it is written rarely."""
 _LOOK_S: Final = 0.02
+_THREAD: Final = Threads(1, "signing state")
 
 OTHER_KEY: Final = (
     "the autopilot signs with a key that this daemon does not have: give the key's file, or remove the key there"
@@ -51,11 +62,21 @@ _UNKNOWN: Final[dict[str, object]] = {
 }
 
 
-class AutopilotSigning:
-    """The signing at the endpoints of one daemon: each has an :class:`.EndpointSigning`, or none."""
+class AutopilotSigning(Feature):
+    """The signing at the endpoints of one daemon: each has an :class:`.EndpointSigning`, or none.
 
-    def __init__(self, local: LocalEndpoints, keep: Callable[[str, SigningConfig], object]) -> None:
-        self._local = local
+    ``path``: of the file with a timestamp that is greater than all used. Without it frames pass as well, but an
+    autopilot that forgot its own number accepts what was recorded in its earlier flights.
+    """
+
+    def __init__(
+        self, local: LocalEndpoints, keep: Callable[[str, SigningConfig], object], path: Path | None
+    ) -> None:
+        self._local, self._path = local, path
+        self._stored = 0 if path is None else _stored(path)
+        self._writing: asyncio.Task[None] | None = None
+        self.has_failed = False
+        """Whether the file could not be written."""
         self._keep = keep  # in the running configuration: the file has it too
         self._is_changing = False
 
@@ -65,6 +86,7 @@ class AutopilotSigning:
 
     def _install(self, endpoint: Endpoint, config: SigningConfig, *, is_open: bool = False) -> EndpointSigning:
         signing = EndpointSigning(config.keys, config.link_id, os.urandom, endpoint.failures, is_open=is_open)
+        signing.timestamp = self._stored
         signing.send = lambda raw: self._local.send_own(endpoint, raw, monotonic())
         deliver = endpoint.handler.on_frames
 
@@ -82,6 +104,26 @@ class AutopilotSigning:
     def _remove(self, endpoint: Endpoint) -> None:
         endpoint.signing, endpoint.on_frames = None, endpoint.handler.on_frames
         endpoint.delivered.set_sign(None)
+
+    def do_housekeeping(self, now: float) -> None:
+        """Write a later timestamp, in a thread, when the written one is reached."""
+        used = max((one.signing.timestamp for one in self._local.endpoints if one.signing is not None), default=0)
+        if used > self._stored and self._writing is None and self._path is not None:
+            self._writing = asyncio.get_running_loop().create_task(self._write(self._path, used + RESERVE))
+
+    async def _write(self, path: Path, timestamp: int) -> None:
+        try:
+            await _THREAD.run(replace_file, path, b"%d\n" % timestamp)
+            self._stored = timestamp
+        except OSError as error:
+            if not self.has_failed:
+                reason = f"{error.strerror}: after a power cut, recorded frames may pass at the autopilot's cable"
+                structlog.get_logger().warning("signing_state_not_written", file=str(path), reason=reason)
+            self.has_failed = True
+        except Exception as error:
+            report(error)
+        finally:
+            self._writing = None
 
     # Changes.
 
@@ -158,6 +200,15 @@ class AutopilotSigning:
                 return _UNKNOWN
         self._remove(endpoint)
         return {"problem": "", "is_changed": True, "system": system, "accepts_unsigned": True}
+
+
+def _stored(path: Path) -> int:
+    """The timestamp in the file of an earlier start; 0 if there is none."""
+    try:
+        timestamp = int(path.read_bytes()[:20])
+    except (OSError, ValueError):
+        return 0
+    return timestamp if 0 < timestamp < LAST_TIMESTAMP else 0
 
 
 async def _answers(signing: EndpointSigning) -> bool:

@@ -1,7 +1,7 @@
 """The signatures of one endpoint: frames to its autopilot get one, frames from it count only with one.
 
-Nothing is remembered over a restart, and no clock is read: a disk can be read only or rolled back, and PX4 itself
-remembers no later timestamp than that of its key. So this end *asks*: a TIMESYNC request with a random number, which
+No clock is read, and no stored timestamp proves anything: a disk can be read only or rolled back, and PX4 itself
+remembers none but that of its key. So this end *asks*: a TIMESYNC request with a random number, which
 every autopilot answers. A signed echo of it is new, and proves the key, and the timestamp from which on frames are
 new. Until then nothing passes, in either direction. A signed frame with an old timestamp (a replay, or an autopilot
 that was restarted and forgot) is dropped and makes this end ask again: the question's timestamp is greater than all
