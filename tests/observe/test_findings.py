@@ -30,7 +30,7 @@ from uavlinkd.mavlink.frames import SplitCounters, split_payload
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import Refusal
 from uavlinkd.mavlink.routing import Router
-from uavlinkd.observe.facts import ICMP_S, SECURITY_S, is_contested, is_reached
+from uavlinkd.observe.facts import ANSWERED_FRAMES, ICMP_S, SECURITY_S, is_contested, is_reached
 from uavlinkd.observe.finding import Finding, Severity, Subject
 from uavlinkd.observe.findings import find, has_no_client, own_codes, stop_frames
 from uavlinkd.observe.history import HIDDEN_LEAST, History
@@ -187,7 +187,7 @@ def test_idle_link_without_a_path_is_not_up(daemon: Daemon) -> None:
         (PathCondition.SUSPECT, c.LOST_AFTER_S, True),
     ):
         state.condition = condition
-        assert is_reached(link.peer, NOW + silent_s) is is_up
+        assert is_reached(daemon.parts, link.peer, NOW + silent_s) is is_up
         assert ("no_answer" in daemon.findings(NOW + silent_s)) is not is_up
 
 
@@ -482,7 +482,7 @@ def test_ground_control_software_speaks_after_a_vehicle(daemon: Daemon) -> None:
     ground.ports = [SimpleNamespace(name="127.0.0.1:14550")]
     daemon.set_up(role="vehicle", system_ids="all")
     assert daemon.findings(52.0) == {}
-    ground.frames_sent = 1
+    ground.frames_sent = ANSWERED_FRAMES
     assert daemon.findings(52.0)["client_silent"][4:] == (
         "no ground control software or other client answers on 127.0.0.1:14550",
         "open or start it; it must send here, not only listen; if serial, look at wiring and baud rate",
@@ -500,7 +500,7 @@ def test_a_peer_says_what_its_problems_are(daemon: Daemon) -> None:
         assert daemon.findings()["problems_there"].severity is severity
     text = daemon.findings()["problems_there"].text
     assert text == "it says about itself: an endpoint has no client; problem 200"
-    assert daemon.findings()["problems_there"].remedy.startswith("look whether its autopilot is on")
+    assert daemon.findings()["problems_there"].remedy.startswith("look at the power")
     peer.claims.problems = ProblemClaim((200,), NOW)
     assert daemon.findings()["problems_there"].remedy == "run `uavlinkd status` there"
     assert "problems_there" not in daemon.findings(NOW + c.PROBLEMS_LAST_S + 1)
@@ -512,10 +512,10 @@ def test_a_peer_says_what_its_problems_are(daemon: Daemon) -> None:
     ("role", "codes", "telemetry", "severity", "remedy"),
     [
         ("vehicle", (1,), [], Severity.FAULT, "set MAV_SYSID (ArduPilot"),
-        ("vehicle", (2,), [], Severity.FAULT, "look whether its autopilot"),
-        ("vehicle", (2,), [heartbeat(7)], Severity.WARNING, "look whether its autopilot"),
+        ("vehicle", (2,), [], Severity.FAULT, "look at the power"),
+        ("vehicle", (2,), [heartbeat(7)], Severity.WARNING, "look at the power"),
         ("operator", (1,), [], Severity.FAULT, "set the system id of its ground control software to 7"),
-        ("operator", (2,), [], Severity.WARNING, "look whether its ground control software is on"),
+        ("operator", (2,), [], Severity.WARNING, "open its ground control software"),
     ],
 )
 def test_what_a_peer_says_is_mended_without_a_login_there(

@@ -17,7 +17,7 @@ from uavlinkd.io.url import EndpointKind
 from uavlinkd.observe.history import History
 from uavlinkd.ops.log import shown
 from uavlinkd.protocol.drops import Detail, DropReason
-from uavlinkd.protocol.path import Path, SocketAddress
+from uavlinkd.protocol.path import Path, SocketAddress, relay_name
 from uavlinkd.protocol.path_state import PathCondition
 from uavlinkd.protocol.peer import Peer
 from uavlinkd.protocol.sessions import Twin
@@ -42,6 +42,8 @@ UNROUTED: Final = ("ENETUNREACH", "EHOSTUNREACH", "ENETDOWN", "EADDRNOTAVAIL", "
 SILENT_S: Final = 5.0
 """An endpoint without frames for this time is reported: MAVLink clients send a heartbeat every second. Its errors
 count for the same time. It is opened again more often."""
+ANSWERED_FRAMES: Final = 20
+"""Ground control software speaks only after a vehicle does. It answers before it has received so many frames."""
 NOT_LISTENING: Final = "ECONNREFUSED"
 KERNEL_ERRORS: Final = frozenset(errno.errorcode.values())
 
@@ -58,7 +60,7 @@ class Moment:
             "here": daemon.config.name,
             "renew": "run `uavlinkd keygen` on one" if daemon.fleet is None else of_fleet,
         }
-        self.down = [link for link in daemon.links.values() if not is_reached(link.peer, now)]
+        self.down = [link for link in daemon.links.values() if not is_reached(daemon, link.peer, now)]
         """The peers that frames do not reach."""
         self.has_sole_waiting = sum(not link.config.addresses for link in self.down) == 1
         """Whether one peer without addresses is not up: a sender at an unknown address may be this one."""
@@ -97,7 +99,7 @@ class Moment:
         return [
             relay
             for relay in self.daemon.relay_links.values()
-            if not is_reached(relay.peer, self.now) and self.now - relay.silent_since >= NOT_ANSWERING_S
+            if not is_reached(self.daemon, relay.peer, self.now) and self.now - relay.silent_since >= NOT_ANSWERING_S
         ]
 
 
@@ -131,7 +133,7 @@ class PeerFacts(PartFacts):
         self.is_certified = link.config.settings.is_certified
         self.addresses = listed(map(str, link.config.addresses))
         """Addresses of the peer in the file, as a text."""
-        self.is_up = is_reached(link.peer, self.now)
+        self.is_up = is_reached(self.daemon, link.peer, self.now)
         self.is_overdue = not self.is_up and self.now - link.silent_since >= NOT_ANSWERING_S
         """Whether to report that the peer is silent."""
 
@@ -164,7 +166,8 @@ class PeerFacts(PartFacts):
     @cached_property
     def is_bound(self) -> bool:
         """Whether a relay forwards to the peer."""
-        return any(is_reached(one.peer, self.now) and one.state_for(self.link) == "bound" for one in self.relays)
+        bound = [relay for relay in self.relays if relay.state_for(self.link) == "bound"]
+        return any(is_reached(self.daemon, relay.peer, self.now) for relay in bound)
 
 
 class EndpointFacts(PartFacts):
@@ -195,9 +198,9 @@ class EndpointFacts(PartFacts):
             clients = listed(port.name for port in ports)
             if url.kind is not EndpointKind.UDPOUT:
                 return "client_silent", {"what": f"the client {clients} has sent no MAVLink for {silent_s:.0f} s"}
-            # Ground control software speaks only after a vehicle does.
-            what = f"no ground control software or other client answers on {clients}"
-            return ("client_silent", {"what": what}) if self.endpoint.frames_sent else ("", {})
+            if self.endpoint.frames_sent < ANSWERED_FRAMES:
+                return "", {}
+            return "client_silent", {"what": f"no ground control software or other client answers on {clients}"}
         if url.kind is EndpointKind.SERIAL:
             error = next(iter(failures), "")
             meaning = meaning_of(error) or "plug the device in"
@@ -240,11 +243,13 @@ def listed(names: Iterable[str], most: int = 4) -> str:
     return ", ".join(first[:most]) + (f" and {len(first) - most} more" if len(first) > most else "")
 
 
-def is_reached(peer: Peer, now: float) -> bool:
-    """Whether frames reach a peer: an idle link notices only after some seconds that no path answers any more."""
-    is_silent = peer.received_at is not None and now - peer.received_at >= peer.lost_after_s
-    states = peer.paths.states
-    return peer.is_up and not (is_silent and states and all(one.condition is PathCondition.DOWN for one in states))
+def is_reached(daemon: DaemonParts, peer: Peer, now: float) -> bool:
+    """Whether frames reach a peer. The core of an idle link asks only every 10 s whether its paths still answer."""
+    states, lost = peer.paths.states, {name for name, relay in daemon.relay_links.items() if not relay.peer.is_up}
+    if not states or peer.received_at is None or now - peer.received_at < peer.lost_after_s:
+        return peer.is_up
+    works = (one.condition is not PathCondition.DOWN and relay_name(one.path.address) not in lost for one in states)
+    return peer.is_up and any(works)
 
 
 def has_twin(peer: Peer, twin: Twin, now: float, within_s: float = SECURITY_S) -> bool:

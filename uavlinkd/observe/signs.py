@@ -289,7 +289,7 @@ def not_bound(peer: PeerFacts) -> Signs:
     if not peer.is_overdue or peer.link.is_closed or peer.is_bound:
         return
     for relay in peer.relays:
-        if not is_reached(relay.peer, peer.now) or relay.state_for(peer.link) != "waiting":
+        if not is_reached(peer.daemon, relay.peer, peer.now) or relay.state_for(peer.link) != "waiting":
             continue
         name, advice = relay.config.name, COMES_BACK
         if not peer.is_certified:

@@ -82,7 +82,7 @@ def _status(
     is_cut_off = has_no_client(findings, daemon.local.endpoints)
     contested = [name for name, link in daemon.links.items() if is_contested(link.peer, now)]
     all_up = (bool(daemon.links) or daemon.config.is_only_relay) and all(
-        is_reached(link.peer, now) for link in daemon.links.values()
+        is_reached(daemon, link.peer, now) for link in daemon.links.values()
     )
     return {
         "schema": STATUS_SCHEMA,
@@ -96,7 +96,7 @@ def _status(
         "stopped_there": [name for name, link in daemon.links.items() if stops_frames(link, now)],
         "findings": [finding.as_json() for finding in findings],
         "peers": {
-            name: (peer_status if name in detailed else _few_facts)(link, now, daemon.peer_sockets.way_of)
+            name: (peer_status if name in detailed else _few_facts)(link, daemon, now)
             for name, link in daemon.links.items()
         },
         "relays": {name: used_relay_status(relay, daemon, now) for name, relay in daemon.relay_links.items()},
@@ -155,15 +155,17 @@ def fleet_status(fleet: FleetMembers, links: Mapping[str, PeerLink], now: float)
     }
 
 
-def _few_facts(link: PeerLink, now: float, way_of: WayOf) -> dict[str, object]:
+def _few_facts(link: PeerLink, daemon: DaemonParts, now: float) -> dict[str, object]:
     """What a table of peers shows."""
-    return _peer_now(link, now) | {"paths": [_path_now(link, state, way_of, now) for state in _best_first(link)]}
+    way_of = daemon.peer_sockets.way_of
+    paths = [_path_now(link, state, way_of, now) for state in _best_first(link)]
+    return _peer_now(link, daemon, now) | {"paths": paths}
 
 
-def _peer_now(link: PeerLink, now: float) -> dict[str, object]:
+def _peer_now(link: PeerLink, daemon: DaemonParts, now: float) -> dict[str, object]:
     peer, figures, (bytes_in_s, bytes_out_s) = link.peer, link.figures, link.rates.of(link.peer)
     return {
-        "state": state_of(peer, now),
+        "state": state_of(daemon, peer, now),
         "path": None if peer.path is None else shown(peer.path.address),
         "last_received_s": _age(peer.received_at, now),
         "freshness_unverified_s": _age(peer.unverified_since, now),
@@ -178,15 +180,15 @@ def _peer_now(link: PeerLink, now: float) -> dict[str, object]:
     }
 
 
-def peer_status(link: PeerLink, now: float, way_of: WayOf) -> dict[str, object]:
+def peer_status(link: PeerLink, daemon: DaemonParts, now: float) -> dict[str, object]:
     """The status of a peer."""
     peer = link.peer
     session = peer.sessions.current
     traffic, totals = peer.traffic, peer.paths.totals
-    return _peer_now(link, now) | {
+    return _peer_now(link, daemon, now) | {
         "public_key": encode_key(peer.settings.public_key),
         "handshake_s": _age(peer.established_at, now),
-        "paths": paths_status(link, way_of, now),
+        "paths": paths_status(link, daemon.peer_sockets.way_of, now),
         "session": None
         if session is None
         else {
@@ -240,9 +242,9 @@ def _claims(link: PeerLink, now: float) -> list[dict[str, object]]:
     ]
 
 
-def state_of(peer: Peer, now: float) -> str:
+def state_of(daemon: DaemonParts, peer: Peer, now: float) -> str:
     """``up``, ``lost`` (was up) or ``waiting`` (was never up)."""
-    return "up" if is_reached(peer, now) else "lost" if peer.received_at is not None else "waiting"
+    return "up" if is_reached(daemon, peer, now) else "lost" if peer.received_at is not None else "waiting"
 
 
 def used_relay_status(relay: RelayLink, daemon: DaemonParts, now: float) -> dict[str, object]:
@@ -252,7 +254,7 @@ def used_relay_status(relay: RelayLink, daemon: DaemonParts, now: float) -> dict
     """
     peer = relay.peer
     return {
-        "state": state_of(peer, now),
+        "state": state_of(daemon, peer, now),
         "peer": relay.config.peer,
         "public_key": encode_key(peer.settings.public_key),
         "addresses": [str(written) for written in relay.config.addresses],

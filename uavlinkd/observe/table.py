@@ -228,11 +228,6 @@ OF_PEER_UP: Final = (
         "look for a bad radio, a full network or a rate limit in this direction",
     ),
     Row(
-        *("long_datagrams_dropped", WARNING, traffic_signs.long_datagrams_dropped),
-        "the path to {path} drops datagrams of {dropped:,} bytes: frames share shorter ones, up to {limit:,} bytes",
-        "nothing is lost by that; if the path should carry more, look for a tunnel with a small MTU",
-    ),
-    Row(
         *("frames_unsent", WARNING, traffic_signs.frames_unsent),
         "{count:,} frames to it waited here for room on its network, and were dropped: clients here send more than"
         " the network, the connection by TLS or budget_bits_s carries",

@@ -25,7 +25,6 @@ from uavlinkd.observe.facts import (
     listed,
 )
 from uavlinkd.observe.signs import Signs
-from uavlinkd.ops.log import shown
 from uavlinkd.protocol import constants as c
 from uavlinkd.protocol.drops import DropReason
 from uavlinkd.protocol.peer import Peer
@@ -71,14 +70,6 @@ def high_loss(peer: PeerFacts) -> Signs:
     ]
     if shares:
         yield {"losses": " and ".join(shares)}
-
-
-def long_datagrams_dropped(peer: PeerFacts) -> Signs:
-    """Along one path after the other: frames share shorter envelopes there."""
-    for state in peer.link.peer.paths.states:
-        limit = state.envelope_limit
-        if state.works and limit.dropped:
-            yield {"path": shown(state.path.address), "dropped": limit.dropped, "limit": limit.limit}
 
 
 def frames_unsent(peer: PeerFacts) -> Signs:
@@ -222,14 +213,12 @@ def problems_there(peer: PeerFacts) -> Signs:
 
 def _advice_there(peer: PeerFacts, codes: tuple[int, ...]) -> str:
     """What helps without a login there, which a vehicle behind LTE does not have."""
-    client, number = "autopilot", SYSTEM_ID
+    number, look = f"{SYSTEM_ID} of its autopilot", "look at the power, wiring and baud rate of its autopilot"
     if peer.rules.get("role") == "operator":
-        client, number = "ground control software", "the system id"
+        number, look = "the system id of its ground control software", "open its ground control software"
     if _REFUSED in codes and isinstance(ids := peer.rules.get("system_ids"), list | tuple):
-        return f"set {number} of its {client} to {listed(map(str, ids))}"
-    if _OF_CLIENTS.isdisjoint(codes):
-        return "run `uavlinkd status` there"
-    return f"look whether its {client} is on and sends, and at its wiring and baud rate"
+        return f"set {number} to {listed(map(str, ids))}"
+    return "run `uavlinkd status` there" if _OF_CLIENTS.isdisjoint(codes) else look
 
 
 # Local endpoints.

@@ -48,4 +48,4 @@ def report(answer: Answer) -> Iterator[str]:
         yield f"TLS          {url}{through}: {problem}"
     yield from (f"seen as      {seen} by {name}" for name, relay in relays.items() for seen in relay["seen_as"])
     if not is_complete:
-        yield "`uavlinkd status` here and at the relay names the cause"
+        yield "open the UDP port in the relay's firewall and its provider's; `uavlinkd status` at both says more"
