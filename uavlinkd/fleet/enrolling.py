@@ -117,7 +117,7 @@ def finish(line: str, config: Path | None, folder: Path | None, url: str | None,
     start = f"uavlinkd {'relay' if daemon.is_only_relay else 'run'} --config {place.config}"
     return [
         f"{name} is a member of fleet {fingerprint_of(reply.authority)}.",
-        f"{place.config}: {certificate.role.name.lower()}, contacts {contacts or 'none'}",
+        f"{place.config}: {certificate.role.name.lower()}" + (f", contacts {contacts}" if contacts else ""),
         *([f"Set {what} to {'one of the system ids' if '-' in ids else 'system id'} {ids}."] if ids else []),
         *([f"Then: {start}; if it runs already, restart it."] if folder is None else []),
         *([f"The former key, {place.key(former)}, was deleted."] if is_replaced else []),
