@@ -97,7 +97,7 @@ LINK_ROWS = (
     Mistake("54", scenes.killed, command=r"start it \(`uavlinkd run"),
     Mistake("74", scenes.withheld, signs=_here("commands_withheld", r"write another role, or allow the command")),
     Mistake("75", scenes.garbage, signs=_here("garbage", r"baud rate")),
-    Mistake("77", scenes.listener, signs=_here("client_silent", r"not only listen")),
+    Mistake("77", scenes.listener, signs=_here("client_silent", r"must not only listen")),
     Mistake("78", scenes.no_client, signs=_here("no_client", r"send there")),
     Mistake("93", scenes.revoked_card, signs=_here("certificate_revoked", r"sign it again")),
 )

@@ -196,11 +196,13 @@ class EndpointFacts(PartFacts):
             return "garbage", {}
         if ports and not (url.kind is EndpointKind.UDPOUT and error):
             clients = listed(port.name for port in ports)
-            if url.kind is not EndpointKind.UDPOUT:
-                return "client_silent", {"what": f"the client {clients} has sent no MAVLink for {silent_s:.0f} s"}
-            if self.endpoint.frames_sent < ANSWERED_FRAMES:
-                return "", {}
-            return "client_silent", {"what": f"no ground control software or other client answers on {clients}"}
+            what, advice = f"the client {clients} has sent no MAVLink for {silent_s:.0f} s", "look whether it runs"
+            if url.kind is EndpointKind.UDPOUT:
+                if self.endpoint.frames_sent < ANSWERED_FRAMES:
+                    return "", {}
+                what, advice = f"no ground control software or other client answers on {clients}", "open it"
+            of_kind = "look at wiring and baud rate" if url.kind is EndpointKind.SERIAL else "it must not only listen"
+            return "client_silent", {"what": what, "advice": f"{advice}; {of_kind}"}
         if url.kind is EndpointKind.SERIAL:
             error = next(iter(failures), "")
             meaning = meaning_of(error) or "plug the device in"

@@ -341,7 +341,7 @@ OF_ENDPOINT: Final = (
     ),
     Row(
         *("client_silent", WARNING, traffic_signs.is_silent_by("client_silent")),
-        *("{what}", "open or start it; it must send here, not only listen; if serial, look at wiring and baud rate"),
+        *("{what}", "{advice}"),
         code=4,
     ),
     Row(
