@@ -24,6 +24,7 @@ from tests.mavlink.signing.autopilot import ALWAYS_UNSIGNED
 from tests.mavlink.signing.c_library import OK, SIGNATURES, VERIFIED, CAutopilot
 from tests.samples import ID, build, pack, read
 from uavlinkd.config.model import LINK_ID
+from uavlinkd.daemon.signing import RESERVE
 from uavlinkd.mavlink.dialect import MESSAGES
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.mavlink.signing.endpoint_signing import EndpointSigning
@@ -288,7 +289,9 @@ class Storm:
 
     def restart_daemon(self) -> None:
         self.counts["restarts of the daemon"] += 1
+        stored = self._signing.timestamp + RESERVE
         self._start_daemon()
+        self._signing.timestamp = stored
 
     def restart_autopilot(self) -> None:
         self.counts["restarts of the autopilot"] += 1
@@ -319,11 +322,10 @@ def run(
     *,
     is_ordered: bool,
     restarts: int = 100,
-    power_offs: Sequence[str] = ("ardupilot",),
 ) -> Storm:
     """A run of so many frames, with so many restarts of each end, and jumps of the clock between them.
 
-    ``power_offs``: the kinds of autopilot for which each third restart is one of both ends.
+    Each third restart is one of both ends.
     """
     storm = Storm(kind, seed, is_ordered=is_ordered)
     every = max(frames // (restarts + 1), int(2 * SETTLED_S / STEP_S))
@@ -333,7 +335,7 @@ def run(
         if part == every // 2:
             storm.restart_daemon()
         elif part == every - 1:
-            if kind in power_offs and number // every % 3 == 2:
+            if number // every % 3 == 2:
                 storm.power_off()
             else:
                 storm.restart_autopilot()
