@@ -33,8 +33,8 @@ MAVLINK_PORT: Final = 14550
 """The port of the daemon's inner address: ground stations answer there, and a client may begin there."""
 ANSWERS_PER_S: Final = 10
 """Ping requests of one station that are answered."""
-MOST_AT_ONCE: Final = 32
-"""Datagrams of one read, of which each may be a stranger's: less than 1 ms, then the sockets of peers have a turn."""
+MOST_AT_ONCE: Final = 8
+"""Datagrams of one read, of which each may be a stranger's: then the sockets of peers have a turn."""
 _SOCKET: Final = -1  # the number of the socket in paths: none of the daemon's own
 
 
