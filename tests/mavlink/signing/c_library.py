@@ -18,6 +18,7 @@ OK: Final = 1
 BAD_CRC: Final = 2
 """Of MAVLINK_FRAMING: also an unknown message."""
 VERIFIED: Final = 1
+OLD: Final = 5
 """Of MAVLINK_SIGNING_STATUS."""
 SIGNATURES: Final = ("unsigned", "ok", "bad signature", "no streams", "too many streams", "old timestamp", "replay")
 """MAVLINK_SIGNING_STATUS by number."""

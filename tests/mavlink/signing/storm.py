@@ -21,7 +21,7 @@ from typing import Final, NamedTuple
 from pymavlink.dialects.v20 import all as mavlink
 
 from tests.mavlink.signing.autopilot import ALWAYS_UNSIGNED
-from tests.mavlink.signing.c_library import OK, SIGNATURES, VERIFIED, CAutopilot
+from tests.mavlink.signing.c_library import OK, OLD, SIGNATURES, VERIFIED, CAutopilot
 from tests.samples import ID, build, pack, read
 from uavlinkd.config.model import LINK_ID
 from uavlinkd.daemon.signing import RESERVE
@@ -186,7 +186,9 @@ class Storm:
             else:
                 self.faults["the autopilot accepts a replay"] += 1
         elif not is_taken and not is_late and sent.sender == _DAEMON:
-            if sent.event == self._event:
+            if last < 0 and not self._is_ordered and verdict.signature == OLD:
+                self.counts["autopilot: rejected, a new sender's frame that a question has overtaken"] += 1
+            elif sent.event == self._event:
                 self.faults[f"the autopilot rejects a frame in order: {SIGNATURES[verdict.signature]}"] += 1
             self.counts["autopilot: rejected, under way at a restart or jump of a clock"] += 1
         if is_taken:
