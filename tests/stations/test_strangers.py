@@ -71,7 +71,7 @@ class Talk:
 
 @asynccontextmanager
 async def strangers(kind: str, port: int, key: bytes) -> AsyncIterator[None]:
-    """So many a second at a port of this machine."""
+    """Datagrams of strangers, :data:`PER_S` a second, to a port of this machine."""
     command = (sys.executable, "-m", "tests.stations.strangers", str(port), b64encode(key).decode(), str(PER_S), kind)
     pipe = asyncio.subprocess.PIPE
     attacker = await asyncio.create_subprocess_exec(*end_with_parent(*command), stdin=pipe, stdout=pipe)

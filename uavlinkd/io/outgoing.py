@@ -44,10 +44,8 @@ class OutgoingFrames:
 
     def commit(self, frames: Sequence[Frame], source: Source, now: float) -> None:
         """Commit these frames without queueing. Call it only while the queue is empty."""
-        admit, sign = self._delivered.admit, self._delivered.sign
-        if sign is not None:
-            frames = [signed for frame in frames if (signed := sign(frame, source)) is not None]
-        parts = [data for frame in frames if (data := admit(frame, source, now))]
+        admit = self._delivered.admit
+        parts = [data for frame in self._delivered.signed(frames, source) if (data := admit(frame, source, now))]
         self._ends.extend(map(len, parts))
         self._committed += b"".join(parts)
 
@@ -60,18 +58,14 @@ class OutgoingFrames:
         parts = []
         while (popped := self.queue.pop(limit - held if held else inf, now)) is not None:
             opened_by = self._delivered.opened_by
-            frame, source = popped
-            if (sign := self._delivered.sign) is not None:
-                signed = sign(frame, source)
-                if signed is None:
-                    continue
-                frame = signed
-            if data := self._delivered.admit(frame, source, now):
-                if opened_by is not None and (added := len(data) - len(frame.raw)):
-                    self.queue.charge(opened_by, added)
-                parts.append(data)
-                self._ends.append(len(data))
-                held += len(data)
+            waiting, source = popped
+            for frame in self._delivered.signed([waiting], source):
+                if data := self._delivered.admit(frame, source, now):
+                    if opened_by is not None and (added := len(data) - len(frame.raw)):
+                        self.queue.charge(opened_by, added)
+                    parts.append(data)
+                    self._ends.append(len(data))
+                    held += len(data)
         self._committed += b"".join(parts)
 
     def mark_written(self, count: int) -> int:

@@ -43,8 +43,8 @@ class UdpPort(LocalPort):
         """Send frames to the client, together where they fit. The endpoint counts what the kernel refuses."""
         delivered, endpoint = self.delivered, self.endpoint
         batch, count = b"", 0
-        if (sign := delivered.sign) is not None:
-            frames = [signed for frame in frames if (signed := sign(frame, source)) is not None]
+        if delivered.sign is not None:
+            frames = delivered.signed(frames, source)
         for frame in frames:
             data = frame.raw
             # As admit() does, without a call where nothing is open and no frame can begin within this one.

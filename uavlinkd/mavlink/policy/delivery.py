@@ -21,7 +21,7 @@ messages pass.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final, final
 
 from uavlinkd.mavlink.dialect import MESSAGES, Lane
@@ -93,7 +93,7 @@ class DeliveredStream:
 
     def __init__(self, outgoing: Gate | None = None, sign: Sign | None = None) -> None:
         self.sign = sign
-        """Applied to each frame before :meth:`admit`, where its client wants signatures."""
+        """Signs a frame in :meth:`signed`; None where the client wants no signatures."""
         self.outgoing = outgoing
         """The rules for what goes to this client; None where nothing is withheld."""
         self.separators = 0  # how often bytes had to be put between frames of different sources
@@ -103,6 +103,12 @@ class DeliveredStream:
         self._has_mavlink2 = self._has_rare = False  # whether the tail has such frames: some receivers reject them
         self._due_at = 0  # the tail's length at which the first of them may be complete
         self._authors: list[tuple[int, Source | None]] = []  # up to where in it whose bytes go; None: a separator
+
+    def signed(self, frames: Sequence[Frame], source: Source) -> Sequence[Frame]:
+        """The frames for :meth:`admit`: with signatures, without those that get none, where the client wants them."""
+        if (sign := self.sign) is None:
+            return frames
+        return [signed for frame in frames if (signed := sign(frame, source)) is not None]
 
     @property
     def opened_by(self) -> Source | None:

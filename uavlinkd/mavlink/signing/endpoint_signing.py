@@ -39,9 +39,9 @@ MOST_SENDERS: Final = 14
 """Senders that get a signature. An autopilot keeps 16 until it is restarted and refuses all others
 (MAVLINK_MAX_SIGNING_STREAMS of the C library): two are for other links to it."""
 MOST_REPORTERS: Final = 4
-"""Of these, senders whose first frame asks for nothing: other vehicles must not displace a ground station."""
+"""Most senders with a signature whose first frame asks for nothing: other vehicles displace no ground station."""
 MOST_OF_SOURCE: Final = 8
-"""Of these, senders of one peer, station or endpoint: a captured one that invents senders leaves room for others."""
+"""Most senders with a signature of one peer, station or endpoint: a captured one that invents some leaves room."""
 MOST_STREAMS: Final = 64
 """Senders behind the endpoint whose timestamps are kept."""
 ASK_S: Final = 0.25
@@ -102,7 +102,7 @@ class EndpointSigning:
         self.has_foreign_key = False
         """Whether a signed frame came that none of the keys made."""
         self.accepts_unsigned = False
-        """Whether the autopilot answered :meth:`ask_unsigned`."""
+        """Whether the autopilot answered a question that had no signature."""
         self.vehicles = Vehicles()
         """The autopilots behind the endpoint; those without a signature only while they need none."""
         self.proven_at = self.verified_at = self.unsigned_at = -inf
@@ -171,7 +171,7 @@ class EndpointSigning:
         if any(is_signed(frame.raw) and self._signer_of(frame.raw) for frame in frames):
             return True
         for frame in frames:
-            self._drops[SigningDrop.BAD_SIGNATURE if is_signed(frame.raw) else SigningDrop.UNSIGNED] += 1
+            self._drop_unsigned(frame)
         return False
 
     def accept(self, frames: Sequence[Frame], now: float) -> list[Frame]:
@@ -232,7 +232,11 @@ class EndpointSigning:
         if self.is_open:
             passed.append(frame)
         else:
-            self._drops[SigningDrop.BAD_SIGNATURE if has_signature else SigningDrop.UNSIGNED] += 1
+            self._drop_unsigned(frame)
+
+    def _drop_unsigned(self, frame: Frame) -> None:
+        """Count a frame that none of the keys signed."""
+        self._drops[SigningDrop.BAD_SIGNATURE if is_signed(frame.raw) else SigningDrop.UNSIGNED] += 1
 
     # Questions.
 
