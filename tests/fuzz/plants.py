@@ -184,12 +184,20 @@ def _raises(error: Exception, of: Callable[[Any], bool]) -> Callable[[Any], Any]
     return wrong
 
 
+def _reads_any(_: Any) -> Any:
+    def read(_: Any, raw: bytes) -> tuple[bytes, int] | None:
+        stream = raw[5:7] + raw[-13:-12]
+        return (stream, int.from_bytes(raw[-12:-6], "little")) if signature.is_signed(raw) else None
+
+    return read
+
+
 def _always(result: object) -> Callable[[Any], Any]:
     return lambda _: lambda *arguments: result
 
 
 PLANTS: Final = {
-    "any signature is accepted": Plant("signing", signature.Signer, "verifies", _always(True)),
+    "any signature is accepted": Plant("signing", signature.Signer, "read", _reads_any),
     "a signature stays": Plant("signing", endpoint_signing, "without_signature", lambda right: lambda raw: raw),
     "any answer proves": Plant("signing", endpoint_signing.EndpointSigning, "_is_answer", _always(True)),
     "a bare MAVLink frame is answered": Plant("idle", receive.DatagramReceiver, "receive", _answers_strangers),

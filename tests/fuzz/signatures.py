@@ -19,10 +19,17 @@ from uavlinkd.config.model import LINK_ID
 from uavlinkd.mavlink.dialect import MESSAGES
 from uavlinkd.mavlink.frames import Frame, parse_frame
 from uavlinkd.mavlink.signing.endpoint_signing import MOST_SENDERS, EndpointSigning
-from uavlinkd.mavlink.signing.signature import Signer, is_signed, timestamp_of, without_signature
+from uavlinkd.mavlink.signing.signature import Signer, is_signed, without_signature
 
 MOST_RECORDED: Final = 64
 _HONEST: Final = Signer(KEY)
+_ASKER: Final = bytes((51, 240))
+"""System and component of the daemon's questions."""
+
+
+def timestamp_of(raw: bytes) -> int:
+    """The timestamp of a signed frame."""
+    return int.from_bytes(raw[-12:-6], "little")
 
 
 def _crc_is_right(raw: bytes) -> bool:
@@ -51,7 +58,7 @@ class Wire:
         self._start()
 
     def _start(self) -> None:
-        self._signing = EndpointSigning([KEY], LINK_ID, self._random, self._drops)
+        self._signing = EndpointSigning(KEY, LINK_ID, self._random, self._drops)
         self._signing.send = self._leave
         self._signed = 0  # it begins again, and follows the autopilot
 
@@ -65,12 +72,13 @@ class Wire:
         frame = parse_frame(raw)
         assert frame is not None
         was_proven, before = self._signing.is_proven, self._drops.total()
-        signed = self._signing.sign(frame, str(raw[5]))
-        if signed is None:
+        frames = self._signing.sign([frame], str(raw[5]))
+        if not frames:
             assert self._drops.total() == before + 1, "a frame is missing, and not counted"
             return
-        assert was_proven or frame.raw[5:7] == b"\x33\x44", "a frame leaves before an answer"
-        assert _HONEST.verifies(signed.raw), "the autopilot rejects the signature"
+        (signed,) = frames
+        assert was_proven or frame.raw[5:7] == _ASKER, "a frame leaves before an answer"
+        assert _HONEST.read(signed.raw) is not None, "the autopilot rejects the signature"
         assert _crc_is_right(signed.raw), "the autopilot rejects the checksum"
         assert signed.raw[-13] == LINK_ID
         assert timestamp_of(signed.raw) > self._signed, "a timestamp that does not grow"
@@ -152,7 +160,7 @@ class Wire:
 
     def check_bounds(self) -> None:
         """The autopilot has room for all senders of the last daemon."""
-        assert len({raw[5:7] for raw in self._sent if raw[5:7] != b"\x33\x44"}) <= 2 * MOST_SENDERS
+        assert len({raw[5:7] for raw in self._sent if raw[5:7] != _ASKER}) <= 2 * MOST_SENDERS
 
     def check_sequel(self) -> None:
         """The autopilot's next frame proves it, or the answer to the question that it causes."""

@@ -20,7 +20,7 @@ SIZE = len(A)
 
 def outgoing() -> tuple[OutgoingFrames, Counter[str]]:
     dropped: Counter[str] = Counter()
-    return OutgoingFrames(dropped, DeliveredStream()), dropped
+    return OutgoingFrames(dropped, DeliveredStream(), lambda frames, _: frames), dropped
 
 
 @pytest.mark.parametrize("written", [1, SIZE - 1, SIZE, SIZE + 1])

@@ -20,7 +20,7 @@ from tests.protocol.harness import PLAIN
 from tests.samples import blank
 from tests.test_readmes import ROOT
 from uavlinkd.config.keys import encode_key
-from uavlinkd.config.model import EndpointConfig, PeerConfig, SigningConfig
+from uavlinkd.config.model import EndpointConfig, PeerConfig
 from uavlinkd.daemon.evidence import EVIDENCE_S, REPORTED
 from uavlinkd.daemon.peer_link import PeerLink
 from uavlinkd.io.url import StationUrl, parse_url
@@ -38,7 +38,6 @@ from uavlinkd.observe.signs import UNREACHED_S
 from uavlinkd.observe.table import ROWS, Exit
 from uavlinkd.observe.traffic_signs import PROBLEMS
 from uavlinkd.protocol import constants as c
-from uavlinkd.protocol.crypto import Secret
 from uavlinkd.protocol.drops import DropReason
 from uavlinkd.protocol.outputs import Dropped
 from uavlinkd.protocol.path import Path
@@ -591,7 +590,7 @@ def test_autopilot_that_does_not_prove_its_key(
     """Once it lasts. What others send to an endpoint whose autopilot signs is only counted."""
     daemon.parts.config.endpoints.append(config := EndpointConfig("autopilot", parse_url("udpin:127.0.0.1:14550")))
     daemon.local.append(endpoint := made_up_endpoint(config))
-    endpoint.signing = SimpleNamespace(is_open=False, is_proven=is_proven, signers=[1], verified_at=-inf)
+    endpoint.signing = SimpleNamespace(is_proven=is_proven, verified_at=-inf)
     for _ in range(7):
         daemon.now += 1.0
         endpoint.counters.frames += 1
@@ -601,23 +600,16 @@ def test_autopilot_that_does_not_prove_its_key(
     finding = daemon.findings().get("autopilot_unverified")
     assert (finding is not None) == bool(says)
     assert finding is None or (says in finding.text and stop_frames([finding]))
-    endpoint.signing.is_open = True  # its first key is being set up
-    assert "autopilot_unverified" not in daemon.findings()
 
 
-def test_senders_and_keys_that_are_too_many(daemon: Daemon) -> None:
-    """Frames without a signature for 10 s; two keys in memory, or in the files that the next start reads."""
+def test_senders_that_are_too_many(daemon: Daemon) -> None:
+    """Frames without a signature, for 10 s."""
     config = EndpointConfig("autopilot", parse_url("udpin:127.0.0.1:14550"))
     daemon.parts.config.endpoints.append(config)
     daemon.local.append(endpoint := made_up_endpoint(config))
-    endpoint.signing = SimpleNamespace(is_open=False, is_proven=True, signers=[1, 2], verified_at=-inf)
+    endpoint.signing = SimpleNamespace(is_proven=True, verified_at=-inf)
     endpoint.failures["too_many_senders"] += 3
     daemon.sample()
-    findings = daemon.findings()
-    assert findings["too_many_senders"].text.startswith("3 frames to autopilot got no signature")
-    assert "run `uavlinkd signing setup` again" in findings["key_change_interrupted"].remedy
-    endpoint.signing.signers = [2]
-    assert not {"too_many_senders", "key_change_interrupted"} & set(daemon.findings(daemon.now + 11))
-    both = SigningConfig((Secret(bytes(32)), Secret(bytes(31) + b"1")))
-    daemon.parts.config.endpoints[:] = [replace(config, signing=both)]
-    assert "key_change_interrupted" in daemon.findings()
+    finding = daemon.findings()["too_many_senders"]
+    assert finding.text.startswith("3 frames to autopilot got no signature")
+    assert "too_many_senders" not in daemon.findings(daemon.now + 11)

@@ -20,6 +20,7 @@ from uavlinkd.config import keys
 from uavlinkd.config.load import load_config
 from uavlinkd.config.model import LINK_ID
 from uavlinkd.ops.control import ControlServer, ask
+from uavlinkd.protocol.crypto import Secret
 
 CONFIG = """name = "drone1"
 private_key_file = "drone1.key"  # a comment that stays
@@ -37,8 +38,9 @@ ATTITUDE = 10
 name = "gcs"
 url = "udpout:127.0.0.1:14551"
 """
-LINE = '  signing_key_file = "autopilot.key"\n'
-SIGNED = CONFIG.replace("  url = ", LINE + "  url = ")
+LINE = 'signing_key_file = "autopilot.key"\n'
+SIGNED = CONFIG.replace('  name = "autopilot"', LINE + '  name = "autopilot"')
+INLINE = CONFIG.partition("[[")[0] + 'endpoint = [{ name = "autopilot", url = "udpin:127.0.0.1:14550" }]\n'
 ARMED: dict[str, object] = {"problem": "the autopilot is armed: disarm it", "is_changed": False}
 UNKNOWN: dict[str, object] = {"problem": "the autopilot did not confirm it", "is_changed": None}
 
@@ -100,8 +102,8 @@ def run(action: str, path: Path, *more: str) -> int:
 
 
 def key_files(folder: Path) -> dict[str, str]:
-    """The content of each key file but the daemon's own."""
-    return {file.name: file.read_text().strip() for file in folder.glob("autopilot*")}
+    """The content of each key file but the daemon's own and the one before it."""
+    return {file.name: file.read_text().strip() for file in folder.glob("autopilot*") if file.suffix != ".old"}
 
 
 def test_key_is_set_up_changed_and_cleared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -122,6 +124,7 @@ def test_key_is_set_up_changed_and_cleared(tmp_path: Path, capsys: pytest.Captur
         assert key_files(tmp_path) == {"autopilot.key": second}
         assert run("clear", path) == 0
         assert (path.read_text(), key_files(tmp_path)) == (CONFIG, {})
+        assert keys.read_secret_file(tmp_path / "autopilot.key.old") == Secret(keys.decode_key(second))
         requests = seen()["requests"]
     assert [request["action"] for request in requests] == ["setup", "setup", "rotate", "clear"]
     assert all(request["endpoint"] == "autopilot" and request["link_id"] == LINK_ID for request in requests)
@@ -146,16 +149,6 @@ def test_refusal_changes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert (path.read_text(), key_files(tmp_path)) == before
     assert capsys.readouterr().err == "autopilot: the autopilot is armed: disarm it\n"
     assert bool(request["key"]) == (action != "clear")
-
-
-def test_key_is_kept_where_the_daemon_does_not_sign(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """It cannot say whether the autopilot still has it: after an interruption, or a line that it never read."""
-    keys.write_secret_file(tmp_path / "autopilot.key", key := keys.generate_psk())
-    path = write(tmp_path, SIGNED)
-    with made_up_daemon(tmp_path):
-        assert run("clear", path) == 1
-    assert (path.read_text(), key_files(tmp_path)) == (CONFIG, {"autopilot.key": key})
-    assert f"delete {tmp_path}/autopilot.key if the autopilot has no key" in capsys.readouterr().err
 
 
 def test_key_that_the_autopilot_may_have_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -202,7 +195,7 @@ def test_disk_that_refuses_is_named(
         ("rotate", CONFIG, (), "has no key"),
         ("clear", CONFIG, (), "has no key"),
         ("setup", CONFIG.replace("14551", "14550"), (), "has the port of"),
-        ("setup", CONFIG.replace('name = "autopilot"', 'name = """autopilot"""'), (), "a line of its own\n"),
+        ("setup", INLINE, (), "as a section of its own\n"),
         ("setup", CONFIG.replace('"autopilot"', '"drone1"'), ("--endpoint", "drone1"), "another key of this file"),
     ],
 )

@@ -138,12 +138,13 @@ def _signing(file: File) -> Found:
     others = [section.get(key) for section, key in (*of_sections, *((peer, "psk_file") for peer in file["peer"]))]
     before: list[Values] = []
     for endpoint in file["endpoint"]:
-        secrets = endpoint.get("signing_key_file") or ()
-        if any(secret in others for secret in secrets):
+        if (secret := endpoint.get("signing_key_file")) is None:
+            continue
+        if secret in others:
             text = "is another key of this file too, and the autopilot would get it: make one of its own with"
             yield endpoint.at("signing_key_file"), f"{text} `uavlinkd signing setup`"
         for other in before:
-            is_shared = any(secret in secrets for secret in other.get("signing_key_file") or ())
+            is_shared = other.get("signing_key_file") == secret
             if is_shared and other.get("signing_link_id") == endpoint.get("signing_link_id"):
                 text = f"is in use by {other.at()} with the same key: write another one, 16 to 255"
                 yield endpoint.at("signing_link_id"), text

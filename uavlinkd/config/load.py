@@ -19,12 +19,12 @@ from uavlinkd.config import checks
 from uavlinkd.config.advice import advice
 from uavlinkd.config.build import build
 from uavlinkd.config.file import File, example_of
-from uavlinkd.config.keys import CREDENTIALS, NEW_KEY, KeyFileError, find_secret_file, read_secret_file, reason_of
+from uavlinkd.config.keys import CREDENTIALS, KeyFileError, find_secret_file, read_secret_file, reason_of
 from uavlinkd.config.model import Config, ConfigError, Problem
 from uavlinkd.config.schema import TOP
 from uavlinkd.config.section import Values, read
 from uavlinkd.config.tls_files import TlsFileError, find_tls_files
-from uavlinkd.protocol.crypto import Secret, x25519_public_key
+from uavlinkd.protocol.crypto import x25519_public_key
 from uavlinkd.system.tasks import Threads
 
 STATES = "STATE_DIRECTORY"
@@ -50,7 +50,7 @@ def load_config(path: Path, environ: Mapping[str, str]) -> Config:
     for section, key in (*secrets, *((peer, "psk_file") for peer in file["peer"])):
         _read_secret(file, section, key, environ)
     for endpoint in file["endpoint"]:
-        _read_signing_keys(file, endpoint, environ)
+        _read_secret(file, endpoint, "signing_key_file", environ)
     if (private := file.top.get("private_key_file")) is not None:
         file.own_key = x25519_public_key(private.reveal())
     if (https := file.one("relay_server").get("https")) is not None:
@@ -151,20 +151,6 @@ def _read_secret(file: File, section: Values, key: str, environ: Mapping[str, st
         missing = "" if os.path.lexists(path) else _how_to_get(key, path, file.path)
         remedy = _FOR_A_SERVICE if is_of_service else missing
         file.add(section.at(key), f"{error}; {remedy}" if remedy else str(error))
-
-
-def _read_signing_keys(file: File, endpoint: Values, environ: Mapping[str, str]) -> None:
-    """Put an endpoint's keys in the place of their file's name: the key in force, then the new one of a change."""
-    key = "signing_key_file"
-    if (name := endpoint.valid.get(key)) is None:
-        return
-    has_new = os.path.lexists(find_secret_file(name + NEW_KEY, file.folder, environ)[0])
-    secrets = list[Secret]()
-    for written in (name, name + NEW_KEY) if has_new else (name,):
-        endpoint.valid[key] = written
-        _read_secret(file, endpoint, key, environ)
-        secrets += [endpoint.valid[key]] if key in endpoint.valid else []
-    endpoint.valid[key] = tuple(secrets)
 
 
 _FOR_A_SERVICE = (

@@ -56,11 +56,10 @@ class ConfigError(UsageError):
 class SigningConfig:
     """MAVLink message signing with the autopilot at an endpoint.
 
-    ``keys``: the key in force; none: frames pass unsigned. While a change of the key goes on, the new key follows it.
-    ``link_id``: the number of this daemon's stream in its signatures, 16 to 255.
+    ``link_id``: the number of this daemon's stream in its signatures: see ``FIRST_LINK_ID`` of its room.
     """
 
-    keys: tuple[Secret, ...] = ()
+    key: Secret
     link_id: int = LINK_ID
 
 
@@ -77,7 +76,7 @@ class EndpointConfig:
     policy: PolicyData = field(default_factory=dict)
     radio_status: bool = False
     status_text: bool = False
-    signing: SigningConfig = field(default_factory=SigningConfig)
+    signing: SigningConfig | None = None
 
     @property
     def systems(self) -> frozenset[int]:

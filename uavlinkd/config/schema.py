@@ -20,6 +20,7 @@ from uavlinkd.config.section import Choice, Key, Keys, Kind, Number, anything, b
 from uavlinkd.io.url import parse_line, parse_url
 from uavlinkd.mavlink.egress.peer_egress import EgressSettings
 from uavlinkd.mavlink.policy.settings import KEYS as POLICY_KEYS
+from uavlinkd.mavlink.signing.signature import FIRST_LINK_ID
 from uavlinkd.protocol import constants as c
 from uavlinkd.protocol.crypto import AuthorityKey, is_usable_public_key
 from uavlinkd.protocol.drops import Drop
@@ -248,7 +249,7 @@ REPEATED: Final[dict[str, Keys]] = {
         "radio_status": Key(boolean, False),
         "status_text": Key(boolean, False),
         "signing_key_file": Key(_file_name, None, '"autopilot.key"'),
-        "signing_link_id": Key(integer(16, 255), LINK_ID),
+        "signing_link_id": Key(integer(FIRST_LINK_ID, 255), LINK_ID),
         **POLICY,
     },
     "peer": {

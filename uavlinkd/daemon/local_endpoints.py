@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Final, NamedTuple, TypeVar
 
-from uavlinkd.config.model import EndpointConfig
+from uavlinkd.config.model import EndpointConfig, SigningConfig
 from uavlinkd.daemon.journal import DaemonJournal
 from uavlinkd.daemon.peer_link import PeerLink, radio_figures
 from uavlinkd.daemon.switch import Switch
@@ -74,7 +74,7 @@ class LocalEndpoints:
         self.stall = stall
         self.open_station: Callable[[EndpointConfig, PortHandler], Endpoint]
         """Opens the endpoint of a station, if the file has any."""
-        self.sign: Callable[[Endpoint, EndpointConfig], object]
+        self.sign: Callable[[Endpoint, SigningConfig], object]
         """Makes an endpoint sign, if the file has a key for any."""
         self.on_frames: Callable[..., None]
         """Of :class:`uavlinkd.io.ports.PortHandler`: :meth:`.Line.forward`, without a call in between."""
@@ -98,8 +98,8 @@ class LocalEndpoints:
                 self.endpoints.append((self.open_station if is_station else open_endpoint)(config, self))
             except (BindError, OSError) as error:
                 raise BindError(f"endpoint.url ({config.name}): {error}") from None
-            if config.signing.keys:
-                self.sign(self.endpoints[-1], config)
+            if config.signing is not None:
+                self.sign(self.endpoints[-1], config.signing)
             self.policies[config.name] = config.make_policy()
             if config.radio_status:
                 self._radio[self.endpoints[-1]] = RadioStatusSource()

@@ -93,7 +93,7 @@ class DaemonParts:
         """The connections by TLS to relays."""
         self.stations = self._stations()
         """Who comes with WireGuard."""
-        if any(endpoint.signing.keys for endpoint in config.endpoints):
+        if any(endpoint.signing for endpoint in config.endpoints):
             self.local.sign = self.signing.install
 
     # Features. Each is imported only if it is configured: a daemon on UDP starts faster and stays smaller.
@@ -171,7 +171,7 @@ class DaemonParts:
         self.features.append(signing)
         return signing
 
-    def _keep_signing(self, name: str, signing: SigningConfig) -> None:
+    def _keep_signing(self, name: str, signing: SigningConfig | None) -> None:
         """The keys of an endpoint have changed, and those in the file too: a reload compares the two."""
         endpoints = self.config.endpoints
         changed = (replace(one, signing=signing) if one.name == name else one for one in endpoints)

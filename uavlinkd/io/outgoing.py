@@ -9,13 +9,16 @@ the frames in the order in which the client reads them.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import inf
 
 from uavlinkd.mavlink.egress.fair_queue import FairQueue
 from uavlinkd.mavlink.egress.lanes import EgressDrop
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.mavlink.policy.delivery import DeliveredStream, Source
+
+Signed = Callable[[Sequence[Frame], Source], Sequence[Frame]]
+"""Returns the frames as a client gets them: :meth:`uavlinkd.io.ports.Endpoint.signed`."""
 
 _REASONS = {EgressDrop.OVERFLOW: "outgoing_full", EgressDrop.CLOSED: "unsent"}
 
@@ -26,9 +29,10 @@ class OutgoingFrames:
     The source of a frame counts it if the delivered stream refuses it.
     """
 
-    def __init__(self, dropped: Counter[str], delivered: DeliveredStream) -> None:
+    def __init__(self, dropped: Counter[str], delivered: DeliveredStream, signed: Signed) -> None:
         self._dropped = dropped
         self._delivered = delivered
+        self._signed = signed
         self.queue = FairQueue(self._on_drop)  # the frames that are not committed
         self._committed = b""
         self._ends: deque[int] = deque()  # sizes of the committed frames; for the first, of its unwritten rest
@@ -45,7 +49,7 @@ class OutgoingFrames:
     def commit(self, frames: Sequence[Frame], source: Source, now: float) -> None:
         """Commit these frames without queueing. Call it only while the queue is empty."""
         admit = self._delivered.admit
-        parts = [data for frame in self._delivered.signed(frames, source) if (data := admit(frame, source, now))]
+        parts = [data for frame in self._signed(frames, source) if (data := admit(frame, source, now))]
         self._ends.extend(map(len, parts))
         self._committed += b"".join(parts)
 
@@ -59,7 +63,7 @@ class OutgoingFrames:
         while (popped := self.queue.pop(limit - held if held else inf, now)) is not None:
             opened_by = self._delivered.opened_by
             waiting, source = popped
-            for frame in self._delivered.signed([waiting], source):
+            for frame in self._signed([waiting], source):
                 if data := self._delivered.admit(frame, source, now):
                     if opened_by is not None and (added := len(data) - len(frame.raw)):
                         self.queue.charge(opened_by, added)

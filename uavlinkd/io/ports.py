@@ -81,6 +81,7 @@ class Endpoint(ABC):
         self.on_frames: Callable[..., None] = handler.on_frames
         """Receives what a client sent, as :meth:`PortHandler.on_frames`. Signing stands before the daemon here."""
         self.signing: EndpointSigning | None = None
+        """Signs what clients get: see :meth:`signed`."""
         self.counters = SplitCounters()  # frames and garbage in the received bytes
         self.failures: Counter[str] = Counter()
         """Errors by name: the kernel's (``ECONNREFUSED``), and the endpoint's own reasons."""
@@ -92,6 +93,10 @@ class Endpoint(ABC):
     @abstractmethod
     def ports(self) -> Sequence[LocalPort]:
         """The present clients."""
+
+    def signed(self, frames: Sequence[Frame], source: Source) -> Sequence[Frame]:
+        """The frames for clients: with signatures where the autopilot wants them, without those that get none."""
+        return frames if self.signing is None else self.signing.sign(frames, source.name)
 
     def gather(self, seconds: float) -> None:  # noqa: B027
         """From now on, frames may wait this long before they are read. The bytes of a stream gather anyway."""

@@ -43,8 +43,8 @@ class UdpPort(LocalPort):
         """Send frames to the client, together where they fit. The endpoint counts what the kernel refuses."""
         delivered, endpoint = self.delivered, self.endpoint
         batch, count = b"", 0
-        if delivered.sign is not None:
-            frames = delivered.signed(frames, source)
+        if endpoint.signing is not None:
+            frames = endpoint.signing.sign(frames, source.name)
         for frame in frames:
             data = frame.raw
             # As admit() does, without a call where nothing is open and no frame can begin within this one.
@@ -121,7 +121,7 @@ class DatagramEndpoint(Endpoint):
                 if isinstance(sender, UdpPort):
                     port = sender if not sender.is_closed else self._admitted(sender.address, now)
                 else:
-                    port = self._admitted(sender, now) if self._has_genuine(frames) else None
+                    port = self._admitted(sender, now)
                 if port is not None:
                     if self._silent:
                         self._wake(port)
@@ -129,10 +129,6 @@ class DatagramEndpoint(Endpoint):
                     self.on_frames(port, frames, now, STALE if stale and sender in stale else epoch, waited_s)
             except Exception as error:  # of this client
                 report(error)
-
-    def _has_genuine(self, frames: list[Frame]) -> bool:
-        """Whether a stranger that sent these may become a client."""
-        return self.signing is None or self.signing.admits(frames)
 
     def _feed(self, data: bytes, address: SocketAddress, frames: list[Frame], now: float, epoch: int) -> bool:
         """Add the frames that these bytes of a sender complete. Returns whether they began in this epoch."""
@@ -184,8 +180,7 @@ class DatagramEndpoint(Endpoint):
             frames = stream.give_up(now, epoch)
             if not stream.pending_bytes:
                 del self._streams[address]
-            is_client = frames and (address in self._ports or self._has_genuine(frames))
-            port = self._admitted(address, now) if is_client else None
+            port = self._admitted(address, now) if frames else None
             if port is not None:
                 self._wake(port)
                 port.received_at = now

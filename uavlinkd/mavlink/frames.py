@@ -77,7 +77,7 @@ class Frame(NamedTuple):
     header: Header
 
 
-_new_frame = tuple.__new__  # NamedTuple's own constructor is a Python function: 0.2 µs more for each frame
+new_frame = tuple.__new__  # NamedTuple's own constructor is a Python function: 0.2 µs more for each frame
 
 
 def payload_bytes(frame: Frame, at: int, length: int) -> bytes:
@@ -181,7 +181,7 @@ def parse_frames(
             counters.unknown += 1
         elif header is None:
             header = targeted_header(key, message, data[payload_at:checksum_at])
-        frames.append(_new_frame(Frame, (data[position:end], header)))
+        frames.append(new_frame(Frame, (data[position:end], header)))
         counters.frames += 1
         position = end
         is_expected = True

@@ -370,11 +370,6 @@ OF_ENDPOINT: Final = (
         " autopilot, which forget all senders",
     ),
     Row(
-        *("key_change_interrupted", WARNING, traffic_signs.key_change_interrupted),
-        "a change of its signing key did not end, and two keys are in force",
-        "run `uavlinkd signing setup` again: it uses the same new key",
-    ),
-    Row(
         *("station_unverified", FAULT, traffic_signs.station_unverified),
         "commands of {who} are dropped, because nothing shows that they are new: its firewall drops pings from"
         " {address}, or an attacker delays its datagrams. Reports pass",

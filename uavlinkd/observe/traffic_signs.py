@@ -242,27 +242,34 @@ def station_unverified(endpoint: EndpointFacts) -> Signs:
         yield {"address": stations.address if stations else ""}
 
 
+_UNVERIFIED: Final = (
+    (
+        *("bad_signature", "signs with another key"),
+        "if a change of the key was interrupted, run the same `uavlinkd signing` again; else write the file of that"
+        " key, or remove it there, over USB, and run `uavlinkd signing setup`",
+    ),
+    (
+        *("unsigned", "does not sign, or its frames are another sender's"),
+        "run `uavlinkd signing setup`, which hands it a new key",
+    ),
+    (
+        *("not_proven", "signs, and answers no question of this daemon: the direction to it is cut"),
+        "look at the wire from here to it, and at its baud rate",
+    ),
+)
+
+
 def autopilot_unverified(endpoint: EndpointFacts) -> Signs:
     """Frames come, and its autopilot does not prove the key: nothing passes."""
     signing, lasting = endpoint.endpoint.signing, endpoint.history.failures.lasting(endpoint.now)
-    if signing is None or signing.is_open:
+    is_signed = signing is not None and endpoint.now - signing.verified_at < SILENT_S
+    if signing is None or (is_signed and signing.is_proven):
         return
-    is_signed = endpoint.now - signing.verified_at < SILENT_S
-    if not is_signed and "bad_signature" in lasting:
-        yield {
-            "what": "signs with another key",
-            "advice": "write the file of that key; or remove it there, over USB, and run `uavlinkd signing setup`",
-        }
-    elif not is_signed and "unsigned" in lasting:
-        yield {
-            "what": "does not sign, or its frames are another sender's",
-            "advice": "run `uavlinkd signing setup`, which hands it a new key",
-        }
-    elif is_signed and not signing.is_proven and "not_proven" in lasting:
-        yield {
-            "what": "signs, and answers no question of this daemon: the direction to it is cut",
-            "advice": "look at the wire from here to it, and at its baud rate",
-        }
+    causes = ("not_proven",) if is_signed else ("bad_signature", "unsigned")
+    for cause, what, advice in _UNVERIFIED:
+        if cause in causes and cause in lasting:
+            yield {"what": what, "advice": advice}
+            return
 
 
 def too_many_senders(endpoint: EndpointFacts) -> Signs:
@@ -270,13 +277,6 @@ def too_many_senders(endpoint: EndpointFacts) -> Signs:
     drops = endpoint.history.failures.within(REFUSED_S, endpoint.now)
     if count := drops.get("too_many_senders", 0):
         yield {"count": count}
-
-
-def key_change_interrupted(endpoint: EndpointFacts) -> Signs:
-    """Two keys are in force: in memory, or in the files that the next start reads."""
-    signing = endpoint.endpoint.signing
-    if signing is not None and max(len(signing.signers), len(endpoint.config.signing.keys)) > 1:
-        yield {}
 
 
 def send_fails(endpoint: EndpointFacts) -> Signs:

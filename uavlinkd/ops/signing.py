@@ -10,14 +10,15 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import re
+import tomllib
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
 from uavlinkd.config import keys
 from uavlinkd.config.edit import environ_of, replace_valid, trial
-from uavlinkd.config.load import load_config, read_toml
-from uavlinkd.config.model import LINK_ID, Config
+from uavlinkd.config.load import load_config
+from uavlinkd.config.model import LINK_ID
 from uavlinkd.io.url import EndpointKind
 from uavlinkd.ops.commands import control_socket
 from uavlinkd.ops.control import ControlError, ask
@@ -27,14 +28,11 @@ from uavlinkd.system.terminal import OK, CommandError, UsageError, printable
 _TIMEOUT_S: Final = 60.0
 """Limit for the daemon's answer: the autopilot is asked several times."""
 _KEY: Final = "signing_key_file"
-_LINE: Final = re.compile(rf"^[ \t]*{_KEY}[ \t]*=.*\n", re.MULTILINE)
-_SECTION: Final = re.compile(r"[ \t]*\[\[[ \t]*endpoint[ \t]*\]\]")
 _ACTIONS: Final = {
     "setup": "give the autopilot a key, so that it takes signed frames only",
     "rotate": "give the autopilot another key",
     "clear": "take the key from the autopilot, so that it takes frames of anyone again",
 }
-_ANOTHER_FORM: Final = "the daemon's answer has another form than this version expects: restart the daemon"
 _OPEN: Final = (
     " It takes unsigned frames at this port too, as ArduPilot does on USB: a sender that reaches this port needs no"
     " key."
@@ -56,86 +54,67 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 class _Place:
-    """The endpoint of a command: its daemon, its section in the file, its key's file and the file of a new key."""
+    """The endpoint of a command: its daemon, its section in the file, and the files of its key."""
 
     def __init__(self, options: argparse.Namespace) -> None:
-        self.path, self._keys = options.config, options.keys
-        config = load_config(self.path, environ_of(self._keys))
-        self.endpoint = _endpoint(config, options.endpoint)
+        self.path, self.keys = options.config, options.keys
+        endpoints = load_config(self.path, environ_of(self.keys)).endpoints
+        names = [one.name for one in endpoints if one.url.kind is not EndpointKind.STATION]
+        self.endpoint = names[0] if len(names) == 1 and not options.endpoint else options.endpoint or "autopilot"
+        if self.endpoint not in names:
+            listed = ", ".join(names) or "none"
+            raise UsageError(f"{self.path}: which endpoint has the autopilot? Use --endpoint NAME, one of: {listed}")
         self.socket = control_socket(options)
-        self._table = read_toml(self.path)
+        self._table = tomllib.loads(self.path.read_text(encoding="utf-8"))
         self._section: dict[str, Any] = next(one for one in self._table["endpoint"] if one["name"] == self.endpoint)
         self.is_written = _KEY in self._section
         self.name: str = self._section.get(_KEY, f"{self.endpoint}.key")
-        folder = self.path.absolute().parent
-        if self._keys is not None and "/" not in self.name:
-            folder = self._keys
-        self.file, self.new = folder / self.name, folder / f"{self.name}{keys.NEW_KEY}"
+        folder = self.path.absolute().parent if self.keys is None or "/" in self.name else self.keys
+        self.file, self.new, self.old = (folder / f"{self.name}{which}" for which in ("", ".new", ".old"))
 
-    def check(self, name: str | None) -> None:
-        """Raises CommandError if the file would not be valid with the line of a key file, or without it."""
-        written = {key: value for key, value in self._section.items() if key != _KEY}
-        expected = written | ({} if name is None else {_KEY: name})
-        sections = [expected if one is self._section else one for one in self._table["endpoint"]]
-        with trial(self.path, self._text(name), self._keys) as (new, _):
-            if read_toml(new) != self._table | {"endpoint": sections}:
-                wish = f", or delete {_KEY} there yourself" if name is None else ""
-                raise CommandError(
-                    f"{self.path}: cannot be changed by this command, so nothing was changed: write each [[endpoint]]"
-                    f" as a section with its name on a line of its own{wish}"
-                )
-
-    def write(self, name: str | None) -> None:
-        replace_valid(self.path, self._text(name), self._keys)
-
-    def _text(self, name: str | None) -> str:
-        """The configuration with the line that names a key file, or without it."""
-        blocks = re.split(
-            r"^(?=[ \t]*\[)", self.path.read_text(encoding="utf-8").rstrip("\n") + "\n", flags=re.MULTILINE
-        )
-        here = re.compile(rf"""^([ \t]*)name[ \t]*=[ \t]*["']{re.escape(self.endpoint)}["'].*\n""", re.MULTILINE)
-        for number, block in enumerate(blocks):
-            if _SECTION.match(block) and (match := here.search(block)):
-                line = "" if name is None else f"{match[1]}{_KEY} = {json.dumps(name)}\n"
-                blocks[number] = _LINE.sub("", block[: match.end()]) + line + _LINE.sub("", block[match.end() :])
-        return "".join(blocks)
+    def text(self, name: str | None) -> str:
+        """The configuration with the line that names a key file, or without it. Raises CommandError."""
+        changed = {key: value for key, value in self._section.items() if key != _KEY}
+        changed |= {} if name is None else {_KEY: name}
+        sections = [changed if one is self._section else one for one in self._table["endpoint"]]
+        lines = self.path.read_text(encoding="utf-8").splitlines(keepends=True)
+        line = [] if name is None else [f"{_KEY} = {json.dumps(name)}\n"]
+        for at in range(len(lines)):
+            text = "".join((*lines[: at + len(line)], *line, *lines[at + 1 :]))
+            with suppress(tomllib.TOMLDecodeError):
+                if tomllib.loads(text) == self._table | {"endpoint": sections}:
+                    return text
+        wish = "delete this key" if name is None else "write each [[endpoint]] as a section of its own"
+        raise CommandError(f"{self.path}: {_KEY} of {self.endpoint}: no line can be changed, so nothing was: {wish}")
 
     def ask(self, action: str, key: str = "") -> dict[str, Any]:
         """The daemon's answer: an empty ``problem`` if it is done. Raises ControlError."""
         link_id = self._section.get("signing_link_id", LINK_ID)
         request = {"action": action, "endpoint": self.endpoint, "key": key, "link_id": link_id}
         try:
-            answer = ask(self.socket, f"signing {json.dumps(request)}", _TIMEOUT_S)
+            return ask(self.socket, f"signing {json.dumps(request)}", _TIMEOUT_S)
         except ControlError as error:
             raise ControlError(f"{error}. What the autopilot has is not known: run this command again") from None
-        return {"problem": _ANOTHER_FORM, "is_changed": None} | answer
 
-
-def _endpoint(config: Config, name: str | None) -> str:
-    names = [one.name for one in config.endpoints if one.url.kind is not EndpointKind.STATION]
-    if name is None:
-        name = names[0] if len(names) == 1 else "autopilot"
-    if name not in names:
-        listed = ", ".join(names) or "none"
-        raise UsageError(f"{config.path}: which endpoint has the autopilot? Write --endpoint NAME, one of: {listed}")
-    return name
+    def keep_old(self) -> None:
+        """Copy the key that is replaced or cleared: whoever deceived the daemon on the cable cost no visit then."""
+        if os.path.lexists(self.file):
+            self.old.unlink(missing_ok=True)
+            keys.write_secret_file(self.old, self.file.read_text())
 
 
 def _run(options: argparse.Namespace) -> int:
     place = _Place(options)
     try:
-        if options.action == "clear":
-            _clear(place)
-        else:
-            _give(place, is_rotation=options.action == "rotate")
+        print(printable(f"{place.endpoint}: {_clear(place) if options.action == 'clear' else _give(place, options)}"))
     except OSError as error:
         raise CommandError(f"{error.filename}: {error.strerror}: mend that, and run this command again") from None
     return OK
 
 
-def _give(place: _Place, *, is_rotation: bool) -> None:
+def _give(place: _Place, options: argparse.Namespace) -> str:
     ask(place.socket, "status")  # no file is made if no daemon answers
-    if is_rotation and not place.is_written:
+    if options.action == "rotate" and not place.is_written:
         raise UsageError(f"{place.path}: {place.endpoint} has no key: run `uavlinkd signing setup`")
     # A key in force is never sent again: an autopilot without it may be somebody else.
     is_made = not os.path.lexists(place.new) and (place.is_written or not os.path.lexists(place.file))
@@ -144,13 +123,14 @@ def _give(place: _Place, *, is_rotation: bool) -> None:
     used = place.new if os.path.lexists(place.new) else place.file
     try:
         if not place.is_written:
-            place.check(used.name)
+            with trial(place.path, place.text(used.name), place.keys):
+                pass
         key = keys.encode_key(keys.read_secret_file(used).reveal())
     except CommandError:
         if is_made:
             used.unlink()
         raise
-    answer = place.ask("rotate" if is_rotation else "setup", key)
+    answer = place.ask(options.action, key)
     if problem := answer["problem"]:
         if answer["is_changed"] is not False:
             problem = f"{problem}. The autopilot may have the key in {used}"
@@ -158,32 +138,25 @@ def _give(place: _Place, *, is_rotation: bool) -> None:
             used.unlink()
         raise CommandError(f"{place.endpoint}: {problem}")
     if used == place.new:
+        place.keep_old()
         used.replace(place.file)
         sync_folder(place.file.parent)
     if not place.is_written:
-        place.write(place.name)
-    text = f"{place.endpoint}: system {answer.get('system')} and the daemon sign, with the key in {place.file}."
-    print(printable(f"{text} No restart is needed.{_OPEN if answer.get('accepts_unsigned') else ''}"))
+        replace_valid(place.path, place.text(place.name), place.keys)
+    text = f"system {answer['system']} and the daemon sign, with the key in {place.file}. No restart is needed."
+    return f"{text}{_OPEN if answer['accepts_unsigned'] else ''}"
 
 
-def _clear(place: _Place) -> None:
-    files = [file for file in (place.file, place.new) if os.path.lexists(file)]
-    if not (place.is_written or files):
+def _clear(place: _Place) -> str:
+    if not place.is_written and not os.path.lexists(place.file):
         raise UsageError(f"{place.path}: {place.endpoint} has no key")
-    place.check(None)
-    status = ask(place.socket, "status").get("endpoints", {}).get(place.endpoint, {})
-    signs = status.get("signing") is not None
-    if signs and (problem := place.ask("clear")["problem"]):
+    text = place.text(None) if place.is_written else ""
+    if problem := place.ask("clear")["problem"]:
         raise CommandError(f"{place.endpoint}: {problem}")
     if place.is_written:
-        place.write(None)
-    if not signs:
-        listed = " and ".join(map(str, files))
-        raise CommandError(
-            f"{place.endpoint}: the daemon does not sign there, and no line names a key any more: delete {listed} if"
-            " the autopilot has no key; if it has, `uavlinkd signing setup` uses that key again"
-        )
-    for file in files:
-        file.unlink()
+        replace_valid(place.path, text, place.keys)
+    place.keep_old()
+    for file in (place.file, place.new):
+        file.unlink(missing_ok=True)
     sync_folder(place.file.parent)
-    print(printable(f"{place.endpoint}: the autopilot has no key, and takes frames of anyone who reaches it."))
+    return f"the autopilot has no key, and takes frames of anyone who reaches it. {place.old} has the last key."

@@ -43,8 +43,6 @@ ENDPOINT_FAILURES: Final[Mapping[str, str]] = {
     "not_proven": "frames before the autopilot proved its key",
     "mavlink1_not_signed": "MAVLink 1 frames, which have no signatures",
     "too_many_senders": "frames of more senders than an autopilot remembers",
-    "too_many_reporters": "reports of more senders than an autopilot remembers",
-    "no_timestamp": "frames behind the last timestamp that there is",
 }
 """Errors of an endpoint that the daemon names itself; the others are names of the kernel."""
 _NOT_USABLE: Final = {"unanswered": "no answer", "loss": "loss", "network": "no network"}

@@ -102,7 +102,7 @@ class Pair:
             await self._prove(right, self._ground, outgoing, with_key())
 
     def _config(self, plain: Config) -> Config:
-        keys = SigningConfig((KEY,)) if self._signs else SigningConfig()
+        keys = SigningConfig(KEY) if self._signs else None
         return replace(plain, endpoints=tuple(replace(one, signing=keys) for one in plain.endpoints))
 
     async def _prove(self, daemon: Daemon, sock: socket.socket, port: int, autopilot: Autopilot) -> None:

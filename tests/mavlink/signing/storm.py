@@ -117,13 +117,12 @@ class Storm:
     # Ends.
 
     def _start_daemon(self) -> None:
-        self._signing = EndpointSigning([KEY], LINK_ID, self._random.randbytes, self.drops)
+        self._signing = EndpointSigning(KEY, LINK_ID, self._random.randbytes, self.drops)
         self._signing.send = lambda raw: self._sign(read(raw), "daemon")
         self._settled, self._since = -1, self._now
 
     def _sign(self, frame: Frame, source: str) -> None:
-        signed = self._signing.sign(frame, source)
-        if signed is not None:
+        for signed in self._signing.sign([frame], source):
             self._signed += 1
             self._taken_ever.append(0)
             self._put(Sent(signed.raw, _DAEMON, self._signed - 1, self._settled), to_daemon=False)

@@ -77,17 +77,17 @@ class Rotations:
 
     def _attempt(self, new: Secret, interruption: str) -> None:
         wire, autopilot = self.wire, self.wire.autopilot
-        newest = wire.signing.add(new)
         if interruption == "the daemon is killed before SETUP_SIGNING":
-            wire.daemon_starts([self._key, new])
+            wire.daemon_starts(self._key)
         else:
+            newest = wire.signing.add(new)
             autopilot.is_deaf = interruption == "SETUP_SIGNING is lost"
             wire.signing.set_up(new, 1)
             autopilot.is_deaf = interruption in ("SETUP_SIGNING is lost", "the answer is lost")
             if "restarts" in interruption:
                 autopilot.restart()
             if "after" in interruption or "and the daemon is killed" in interruption:
-                wire.daemon_starts([self._key, new])
+                wire.daemon_starts(self._key)
             else:
                 wire.signing.ask(newest, wire.now)
             autopilot.is_deaf = False

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
 from random import Random
 
 from tests.mavlink.signing.autopilot import Autopilot
@@ -21,7 +20,7 @@ STATION = "gcs"
 class Wire:
     """Each frame that one end sends arrives at the other in the same order, unless a test takes it away."""
 
-    def __init__(self, autopilot: Autopilot, keys: Sequence[Secret] = (KEY,), *, is_open: bool = False) -> None:
+    def __init__(self, autopilot: Autopilot) -> None:
         self.autopilot = autopilot
         self.drops = Counter[str]()
         self.now = 0.0
@@ -32,24 +31,23 @@ class Wire:
         self.passed: list[Frame] = []
         """What the daemon accepted from the autopilot."""
         self._random = Random(1)
-        self.signing = self.daemon_starts(keys, is_open=is_open)
+        self.signing = self.daemon_starts()
 
-    def daemon_starts(self, keys: Sequence[Secret] = (KEY,), *, is_open: bool = False) -> EndpointSigning:
+    def daemon_starts(self, key: Secret = KEY) -> EndpointSigning:
         """A daemon that remembers nothing of the one before."""
-        signing = EndpointSigning(keys, LINK_ID, self._random.randbytes, self.drops, is_open=is_open)
+        signing = EndpointSigning(key, LINK_ID, self._random.randbytes, self.drops)
         signing.send = lambda raw: self.to_autopilot(raw, "daemon")
         self.signing = signing
         return signing
 
     def to_autopilot(self, raw: bytes, source: str = STATION) -> bool:
         """Send a frame. Returns whether it left."""
-        signed = self.signing.sign(read(raw), source)
-        if signed is None:
-            return False
-        self.sent.append(signed.raw)
-        for answer in self.autopilot.receive(signed.raw):
-            self.to_daemon(answer)
-        return True
+        for signed in self.signing.sign([read(raw)], source):
+            self.sent.append(signed.raw)
+            for answer in self.autopilot.receive(signed.raw):
+                self.to_daemon(answer)
+            return True
+        return False
 
     def to_daemon(self, raw: bytes) -> list[Frame]:
         """What passes of a frame at the daemon."""

@@ -21,7 +21,7 @@ messages pass.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Final, final
 
 from uavlinkd.mavlink.dialect import MESSAGES, Lane
@@ -40,9 +40,6 @@ MAX_STREAMS: Final = 64
 
 Report = Callable[[str, Header, Refusal, float], None]
 """Receives each refusal: the source's name, the header of the frame that was not delivered, why, and when."""
-
-Sign = Callable[[Frame, "Source"], Frame | None]
-"""Returns a frame with a signature, or None if it must not be delivered."""
 
 Forget = Callable[[bytes], None]
 """Receives the bytes of a frame that was not delivered: the same frame from another source is not its duplicate."""
@@ -79,21 +76,9 @@ class DeliveredStream:
     Call :meth:`admit` once for each frame, in the order of delivery, and deliver all of what it returns.
     """
 
-    __slots__ = (
-        "_authors",
-        "_due_at",
-        "_has_mavlink2",
-        "_has_rare",
-        "_tail",
-        "outgoing",
-        "separators",
-        "sign",
-        "starts",
-    )
+    __slots__ = ("_authors", "_due_at", "_has_mavlink2", "_has_rare", "_tail", "outgoing", "separators", "starts")
 
-    def __init__(self, outgoing: Gate | None = None, sign: Sign | None = None) -> None:
-        self.sign = sign
-        """Signs a frame in :meth:`signed`; None where the client wants no signatures."""
+    def __init__(self, outgoing: Gate | None = None) -> None:
         self.outgoing = outgoing
         """The rules for what goes to this client; None where nothing is withheld."""
         self.separators = 0  # how often bytes had to be put between frames of different sources
@@ -103,12 +88,6 @@ class DeliveredStream:
         self._has_mavlink2 = self._has_rare = False  # whether the tail has such frames: some receivers reject them
         self._due_at = 0  # the tail's length at which the first of them may be complete
         self._authors: list[tuple[int, Source | None]] = []  # up to where in it whose bytes go; None: a separator
-
-    def signed(self, frames: Sequence[Frame], source: Source) -> Sequence[Frame]:
-        """The frames for :meth:`admit`: with signatures, without those that get none, where the client wants them."""
-        if (sign := self.sign) is None:
-            return frames
-        return [signed for frame in frames if (signed := sign(frame, source)) is not None]
 
     @property
     def opened_by(self) -> Source | None:
@@ -238,17 +217,10 @@ class DeliveredStreams:
 
     def __init__(self) -> None:
         self._by_name: dict[str, DeliveredStream] = {}
-        self._sign: Sign | None = None
-
-    def set_sign(self, sign: Sign | None) -> None:
-        """From now on, frames to the clients are signed so."""
-        self._sign = sign
-        for stream in self._by_name.values():
-            stream.sign = sign
 
     def of(self, name: str) -> DeliveredStream:
         """The stream of the client of this name, which is opened now."""
-        stream = self._by_name.pop(name, None) or DeliveredStream(sign=self._sign)
+        stream = self._by_name.pop(name, None) or DeliveredStream()
         if len(self._by_name) >= MAX_STREAMS:
             del self._by_name[next(iter(self._by_name))]
         self._by_name[name] = stream

@@ -12,7 +12,7 @@ Times are monotonic seconds; the caller passes them and the source of random byt
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from enum import StrEnum
 from itertools import count
@@ -21,23 +21,15 @@ from struct import Struct
 from typing import Final
 
 from uavlinkd.mavlink.dialect import IDS
-from uavlinkd.mavlink.frames import MAVLINK2, SIGNATURE_BYTES, Frame, pack, payload_bytes
-from uavlinkd.mavlink.own_frames import RADIO_COMPONENT, RADIO_SYSTEM
-from uavlinkd.mavlink.payloads import HEARTBEAT, may_be_old
-from uavlinkd.mavlink.signing.signature import (
-    LAST_TIMESTAMP,
-    Signer,
-    is_signed,
-    stream_of,
-    timestamp_of,
-    without_signature,
-)
-from uavlinkd.mavlink.vehicles import Vehicles
+from uavlinkd.mavlink.frames import MAVLINK2, Frame, new_frame, pack, payload_bytes
+from uavlinkd.mavlink.own_frames import RADIO_SYSTEM
+from uavlinkd.mavlink.payloads import may_be_old
+from uavlinkd.mavlink.signing.signature import FIRST_LINK_ID, LAST_TIMESTAMP, Signer, is_signed, without_signature
 from uavlinkd.protocol.crypto import Secret
 
 MOST_SENDERS: Final = 14
 """Senders that get a signature. An autopilot keeps 16 until it is restarted and refuses all others
-(MAVLINK_MAX_SIGNING_STREAMS of the C library): two are for other links to it."""
+(MAVLINK_MAX_SIGNING_STREAMS of the C library): one is for questions, and one for another link to it."""
 MOST_REPORTERS: Final = 4
 """Most senders with a signature whose first frame asks for nothing: other vehicles displace no ground station."""
 MOST_OF_SOURCE: Final = 8
@@ -57,6 +49,9 @@ STEP: Final = 100_000
 TIMESYNC: Final = IDS["TIMESYNC"]
 SETUP_SIGNING: Final = IDS["SETUP_SIGNING"]
 _AUTOPILOT: Final = 1  # MAV_COMP_ID_AUTOPILOT1
+_ASKER: Final = 240
+"""MAV_COMP_ID_UDP_BRIDGE, the sender of questions and keys."""
+_OWN: Final = bytes((RADIO_SYSTEM, _ASKER))
 _TIMES: Final = Struct("<qq")  # tc1: 0 in a question; ts1: the number, which the answer repeats
 _SETUP: Final = Struct("<QBB32s")  # initial_timestamp, target_system, target_component, secret_key
 
@@ -71,43 +66,24 @@ class SigningDrop(StrEnum):
     NOT_PROVEN = "not_proven"  # this end asked, and no answer has come yet
     MAVLINK1 = "mavlink1_not_signed"
     TOO_MANY_SENDERS = "too_many_senders"
-    TOO_MANY_REPORTERS = "too_many_reporters"
-    NO_TIMESTAMP = "no_timestamp"  # the autopilot's is the last that there is
 
 
 class EndpointSigning:
     """The keys of one endpoint, its timestamps, and what its autopilot has proven.
 
-    ``keys``: the one in force, and perhaps a newer one that the autopilot may have already. ``is_open``: frames pass
-    unsigned until the autopilot proves a key. ``drops`` gets :class:`SigningDrop`.
+    ``drops`` gets :class:`SigningDrop`.
     """
 
-    def __init__(
-        self,
-        keys: Sequence[Secret],
-        link_id: int,
-        random: Callable[[int], bytes],
-        drops: Counter[str],
-        *,
-        is_open: bool = False,
-    ) -> None:
-        self.signers = [Signer(key) for key in keys]
-        """From the oldest to the newest. A newer one that was proven ends those before it."""
-        self.signer = self.signers[0]
+    def __init__(self, key: Secret, link_id: int, random: Callable[[int], bytes], drops: Counter[str]) -> None:
+        self.signer = Signer(key)
         """Signs; proven if :attr:`is_proven`."""
+        self.signers = [self.signer]
+        """From the oldest to the newest. A newer one that was proven ends those before it."""
         self.is_proven = False
-        self.is_open = is_open
-        self.may_lack_key = False
-        """Whether to hear HEARTBEATs without a signature: the autopilot was told to use no key, or has lost it."""
-        self.has_foreign_key = False
-        """Whether a signed frame came that none of the keys made."""
         self.accepts_unsigned = False
         """Whether the autopilot answered a question that had no signature."""
-        self.vehicles = Vehicles()
-        """The autopilots behind the endpoint; those without a signature only while they need none."""
-        self.proven_at = self.verified_at = self.unsigned_at = -inf
-        """When the last answer and the last frame with a valid signature came; and while none is needed, the last
-        HEARTBEAT without."""
+        self.proven_at = self.verified_at = -inf
+        """When the last answer and the last frame with a valid signature came."""
         self.timestamp = 0
         """The greatest of all verified frames and of this end."""
         self.link_id = link_id
@@ -119,126 +95,104 @@ class EndpointSigning:
         self._streams: dict[bytes, int] = {}
         self._senders: dict[bytes, tuple[str, bool]] = {}  # by system and component: from where, a reporter?
         self._questions: dict[int, Signer | None] = {}
-        self._own: dict[bytes, Signer | None] = {}  # frames of this end: who signs them, or nobody
+        self._own = deque[bytes](maxlen=QUESTIONS)  # frames of this end: signed already, or to be without a signature
         self._ask_at = 0.0
 
     # To the autopilot.
 
-    def sign(self, frame: Frame, source: str) -> Frame | None:
-        """The frame with the next timestamp; None if it may not leave. Call it in the order of writing.
+    def sign(self, frames: Sequence[Frame], source: str) -> list[Frame]:
+        """The frames with the next timestamps, without those that may not leave. Call it in the order of writing.
 
-        ``source``: the peer or endpoint that it comes from, as the configuration names it.
+        ``source``: the peer or endpoint that they come from, as the configuration names it.
         """
-        raw, header = frame
-        if self._own and raw in self._own:
-            signer = self._own[raw]
-            if signer is None:
-                return frame
-        elif not self.is_proven:
-            if not self.is_open:
-                self._drops[SigningDrop.NOT_PROVEN] += 1
-            return frame if self.is_open else None
-        elif reason := self._why_not(frame, source):
-            self._drops[reason] += 1
-            return None
-        else:
-            signer = self.signer
-        self.timestamp = min(self.timestamp + 1, LAST_TIMESTAMP)
-        return Frame(signer.sign(raw, self.link_id, self.timestamp), header)
+        signed: list[Frame] = []
+        for frame in frames:
+            raw, header = frame
+            sender = raw[5:7]
+            if sender == _OWN and raw in self._own:
+                signed.append(frame)
+                continue
+            is_usual = self.is_proven and sender in self._senders and raw[0] == MAVLINK2
+            if not is_usual and (reason := self._why_not(frame, source)):
+                self._drops[reason] += 1
+                continue
+            signed.append(new_frame(Frame, (self._sign(raw, self.signer), header)))
+        return signed
 
     def _why_not(self, frame: Frame, source: str) -> SigningDrop | None:
+        if not self.is_proven:
+            return SigningDrop.NOT_PROVEN
         if frame.raw[0] != MAVLINK2:
             return SigningDrop.MAVLINK1
-        if self.timestamp >= LAST_TIMESTAMP:
-            return SigningDrop.NO_TIMESTAMP
-        if frame.raw[5:7] in self._senders:
-            return None
         reports = may_be_old(frame)
         taken = self._senders.values()
-        if reports and sum(is_reporter for _, is_reporter in taken) >= MOST_REPORTERS:
-            return SigningDrop.TOO_MANY_REPORTERS
-        if len(taken) >= MOST_SENDERS or sum(one == source for one, _ in taken) >= MOST_OF_SOURCE:
+        of_source, reporters = sum(one == source for one, _ in taken), sum(one for _, one in taken)
+        if len(taken) >= MOST_SENDERS or of_source >= MOST_OF_SOURCE or (reports and reporters >= MOST_REPORTERS):
             return SigningDrop.TOO_MANY_SENDERS
         self._senders[frame.raw[5:7]] = source, reports
         return None
 
-    # From the autopilot.
+    def _sign(self, raw: bytes, signer: Signer) -> bytes:
+        self.timestamp = min(self.timestamp + 1, LAST_TIMESTAMP)
+        return signer.sign(raw, self.link_id, self.timestamp)
 
-    def admits(self, frames: Sequence[Frame]) -> bool:
-        """Whether a stranger that sent these may become a client."""
-        if self.is_open or self.may_lack_key:
-            return True
-        if any(is_signed(frame.raw) and self._signer_of(frame.raw) for frame in frames):
-            return True
-        for frame in frames:
-            self._drop_unsigned(frame)
-        return False
+    # From the autopilot.
 
     def accept(self, frames: Sequence[Frame], now: float) -> list[Frame]:
         """Those that are signed and new, without their signatures."""
         passed: list[Frame] = []
-        asks: Signer | None = None
         for frame in frames:
             raw, header = frame
-            signer = self._signer_of(raw) if is_signed(raw) else None
-            if signer is None:
-                self._pass_unsigned(frame, passed, now)
+            for signer in self.signers:
+                if (read := signer.read(raw)) is not None:
+                    break
+            else:
+                self._drops[SigningDrop.BAD_SIGNATURE if is_signed(raw) else SigningDrop.UNSIGNED] += 1
                 continue
-            timestamp, stream = timestamp_of(raw), stream_of(raw)
-            last = self._streams.get(stream)
-            is_current = self.is_proven and signer is self.signer
-            if raw[-SIGNATURE_BYTES] == self.link_id:  # this end's own, and somebody on the cable returned it
-                self._drops[SigningDrop.REFLECTED] += 1
+            stream, timestamp = read
+            is_usual = self.is_proven and signer is self.signer and header.msgid != TIMESYNC
+            is_next = self._streams.get(stream, LAST_TIMESTAMP) < timestamp <= self.timestamp + STEP
+            if not (is_usual and is_next) and not self._is_new(frame, signer, stream, timestamp, now):
                 continue
-            if is_current and timestamp <= (self._floor if last is None else last):
-                self._drops[SigningDrop.REPLAYED] += 1
-                asks = signer
-                continue
-            if is_current and timestamp > self.timestamp + STEP:
-                self.is_proven = is_current = False
-                self._questions.clear()
+            self._streams[stream] = timestamp
             self.timestamp = max(self.timestamp, timestamp)
             self.verified_at = now
-            if header.msgid == HEARTBEAT:
-                self.vehicles.note(frame, now)
-            if header.msgid == TIMESYNC and self._questions and self._is_answer(frame, signer):
-                self._prove(signer, stream, timestamp)
-                self.proven_at = now
-            elif not is_current:
-                self._drops[SigningDrop.NOT_PROVEN] += 1
-                asks = signer
-            elif last is None and len(self._streams) >= MOST_STREAMS:
-                self._drops[SigningDrop.TOO_MANY_SENDERS] += 1
-            else:
-                self._streams[stream] = timestamp
-                passed.append(Frame(without_signature(raw), header))
-        if asks is not None and now >= self._ask_at:
-            self.ask(asks, now)
+            passed.append(new_frame(Frame, (without_signature(raw), header)))
         return passed
 
-    def _signer_of(self, raw: bytes) -> Signer | None:
-        for signer in self.signers:
-            if signer.verifies(raw):
-                return signer
-        return None
-
-    def _pass_unsigned(self, frame: Frame, passed: list[Frame], now: float) -> None:
-        has_signature = is_signed(frame.raw)
-        self.has_foreign_key |= has_signature
-        if frame.header.msgid == HEARTBEAT and not has_signature and (self.is_open or self.may_lack_key):
-            self.vehicles.note(frame, now)
-            if frame.header.component == _AUTOPILOT:
-                self.unsigned_at = now
-        if self.is_open:
-            passed.append(frame)
-        else:
-            self._drop_unsigned(frame)
-
-    def _drop_unsigned(self, frame: Frame) -> None:
-        """Count a frame that none of the keys signed."""
-        self._drops[SigningDrop.BAD_SIGNATURE if is_signed(frame.raw) else SigningDrop.UNSIGNED] += 1
+    def _is_new(self, frame: Frame, signer: Signer, stream: bytes, timestamp: int, now: float) -> bool:
+        """Whether a frame with a valid signature counts. Another one may be an answer, or call for a question."""
+        if stream[2] >= FIRST_LINK_ID:  # a daemon's, of this end or another, and somebody brought it here
+            self._drops[SigningDrop.REFLECTED] += 1
+            return False
+        is_current = self.is_proven and signer is self.signer
+        if is_current and timestamp <= self._streams.get(stream, self._floor):
+            self._drops[SigningDrop.REPLAYED] += 1
+            self._ask_again(signer, now)
+            return False
+        if is_current and timestamp > self.timestamp + STEP:
+            self.is_proven = is_current = False
+            self._questions.clear()
+        self.timestamp = max(self.timestamp, timestamp)
+        self.verified_at = now
+        if self._questions and frame.header.msgid == TIMESYNC and self._is_answer(frame, signer):
+            self._prove(signer, stream, timestamp)
+            self.proven_at = now
+            return False
+        if not is_current:
+            self._drops[SigningDrop.NOT_PROVEN] += 1
+            self._ask_again(signer, now)
+            return False
+        if stream not in self._streams and len(self._streams) >= MOST_STREAMS:
+            self._drops[SigningDrop.TOO_MANY_SENDERS] += 1
+            return False
+        return True
 
     # Questions.
+
+    def _ask_again(self, signer: Signer, now: float) -> None:
+        if now >= self._ask_at:
+            self.ask(signer, now)
 
     def ask(self, signer: Signer | None, now: float) -> None:
         """Ask the autopilot to prove that it has this key; None: whether it accepts what is unsigned."""
@@ -258,11 +212,9 @@ class EndpointSigning:
         self._send(SETUP_SIGNING, _SETUP.pack(first, system, _AUTOPILOT, secret), signer)
 
     def _send(self, message: int, payload: bytes, signer: Signer | None) -> None:
-        raw = pack(message, payload, next(self._sequence), RADIO_SYSTEM, RADIO_COMPONENT)
-        if len(self._own) >= QUESTIONS:
-            del self._own[next(iter(self._own))]
-        self._own[raw] = signer
-        self.send(raw)
+        raw = pack(message, payload, next(self._sequence), *_OWN)
+        self._own.append(raw if signer is None else self._sign(raw, signer))
+        self.send(self._own[-1])
 
     def _is_answer(self, frame: Frame, signer: Signer) -> bool:
         times = payload_bytes(frame, 0, _TIMES.size).ljust(_TIMES.size, b"\0")
@@ -275,12 +227,11 @@ class EndpointSigning:
 
     def _prove(self, signer: Signer, stream: bytes, timestamp: int) -> None:
         """The autopilot has this key, and all of its frames from now on have greater timestamps."""
-        self.signer, self.is_proven, self.is_open = signer, True, False
+        self.signer, self.is_proven = signer, True
         self.signers = self.signers[self.signers.index(signer) :]
         later = {one: last for one, last in self._streams.items() if last > timestamp}
         self._floor, self._streams = timestamp, later | {stream: timestamp}
         self._questions.clear()
-        self._own.clear()
 
     def add(self, key: Secret) -> Signer:
         """A newer key that the autopilot may have from now on."""

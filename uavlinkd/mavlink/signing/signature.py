@@ -23,6 +23,8 @@ from uavlinkd.mavlink.frames import MAVLINK2, SIGNATURE_BYTES
 from uavlinkd.protocol.crypto import Secret
 
 LAST_TIMESTAMP: Final = 2**48 - 1
+FIRST_LINK_ID: Final = 16
+"""Link ids from here on are those of daemons: autopilots have the numbers of their ports, from 0."""
 _DIGEST_BYTES: Final = 6
 _SIGNED: Final = 1  # in incompat_flags
 _REST: Final = 8
@@ -36,19 +38,10 @@ def is_signed(raw: bytes) -> bool:
     return raw[0] == MAVLINK2 and raw[2] == _SIGNED
 
 
-def stream_of(raw: bytes) -> bytes:
-    """The system, component and link id of a signed frame: its timestamps grow."""
-    return raw[5:7] + raw[-SIGNATURE_BYTES : 1 - SIGNATURE_BYTES]
-
-
-def timestamp_of(raw: bytes) -> int:
-    return int.from_bytes(raw[-12:-_DIGEST_BYTES], "little")
-
-
 def without_signature(raw: bytes) -> bytes:
     """The frame that was signed."""
     end = len(raw) - SIGNATURE_BYTES - 2
-    checksum = _FLIP[raw[1]] ^ int.from_bytes(raw[end : end + 2], "little")
+    checksum = _FLIP[raw[1]] ^ (raw[end] | raw[end + 1] << 8)
     return raw[:2] + b"\0" + raw[3:end] + checksum.to_bytes(2, "little")
 
 
@@ -64,17 +57,28 @@ class Signer:
     def sign(self, raw: bytes, link_id: int, timestamp: int) -> bytes:
         """A MAVLink 2 frame with this signature; one that it had is replaced."""
         if raw[2] == _SIGNED:
-            head = raw[:-SIGNATURE_BYTES]
+            signed = bytearray(raw[:-SIGNATURE_BYTES])
         else:
-            checksum = _FLIP[raw[1]] ^ int.from_bytes(raw[-2:], "little")
-            head = raw[:2] + b"\1" + raw[3:-2] + checksum.to_bytes(2, "little")
-        signed = head + bytes((link_id,)) + timestamp.to_bytes(6, "little")
+            signed = bytearray(raw)
+            signed[2] = _SIGNED
+            flip = _FLIP[raw[1]]
+            signed[-2] ^= flip & 0xFF
+            signed[-1] ^= flip >> 8
+        signed += (timestamp << 8 | link_id).to_bytes(7, "little")
         digest = self._keyed.copy()
         digest.update(signed)
-        return signed + digest.digest()[:_DIGEST_BYTES]
+        signed += digest.digest()[:_DIGEST_BYTES]
+        return bytes(signed)
 
-    def verifies(self, raw: bytes) -> bool:
-        """Whether a signed frame has the signature of this key."""
+    def read(self, raw: bytes) -> tuple[bytes, int] | None:
+        """The stream of a frame that this key signed, and its timestamp; None for any other frame.
+
+        A stream is a system, a component and a link id, a byte each: its timestamps grow.
+        """
+        if raw[0] != MAVLINK2 or raw[2] != _SIGNED:
+            return None
         digest = self._keyed.copy()
         digest.update(raw[:-_DIGEST_BYTES])
-        return compare_digest(digest.digest()[:_DIGEST_BYTES], raw[-_DIGEST_BYTES:])
+        if not compare_digest(digest.digest()[:_DIGEST_BYTES], raw[-_DIGEST_BYTES:]):
+            return None
+        return raw[5:7] + raw[-SIGNATURE_BYTES : 1 - SIGNATURE_BYTES], int.from_bytes(raw[-12:-6], "little")
