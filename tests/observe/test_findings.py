@@ -581,6 +581,7 @@ def test_send_error_that_lasts_is_named_while_the_client_sends(daemon: Daemon, u
         ("unsigned", False, True, "does not sign"),
         ("bad_signature", False, False, "signs with another key"),
         ("not_proven", True, False, "answers no question"),
+        ("replayed", False, True, "answers no question"),  # it forgot its timestamp, and does not hear that
         ("unsigned", True, True, ""),  # those of another client
     ],
 )

@@ -244,16 +244,16 @@ def station_unverified(endpoint: EndpointFacts) -> Signs:
 
 _UNVERIFIED: Final = (
     (
-        *("bad_signature", "signs with another key"),
+        *(("bad_signature",), "signs with another key"),
         "if a change of the key was interrupted, run the same `uavlinkd signing` again; else write the file of that"
         " key, or remove it there, over USB, and run `uavlinkd signing setup`",
     ),
     (
-        *("unsigned", "does not sign, or its frames are another sender's"),
+        *(("unsigned",), "does not sign, or its frames are another sender's"),
         "run `uavlinkd signing setup`, which hands it a new key",
     ),
     (
-        *("not_proven", "signs, and answers no question of this daemon: the direction to it is cut"),
+        *(("not_proven", "replayed"), "signs, and answers no question of this daemon: the direction to it is cut"),
         "look at the wire from here to it, and at its baud rate",
     ),
 )
@@ -265,9 +265,9 @@ def autopilot_unverified(endpoint: EndpointFacts) -> Signs:
     is_signed = signing is not None and endpoint.now - signing.verified_at < SILENT_S
     if signing is None or (is_signed and signing.is_proven):
         return
-    causes = ("not_proven",) if is_signed else ("bad_signature", "unsigned")
-    for cause, what, advice in _UNVERIFIED:
-        if cause in causes and cause in lasting:
+    causes = {"not_proven"} if is_signed else {"bad_signature", "unsigned", "replayed"}
+    for drops, what, advice in _UNVERIFIED:
+        if not causes.intersection(lasting).isdisjoint(drops):
             yield {"what": what, "advice": advice}
             return
 
