@@ -79,11 +79,7 @@ class Pair:
 
     def heard(self) -> list[bytes]:
         """The datagrams that reached the ground station since the last call."""
-        datagrams = []
-        with suppress(BlockingIOError):
-            while True:
-                datagrams.append(self.station.recv(4096))
-        return datagrams
+        return _all(self.station)
 
     def command(self) -> int:
         """Send a numbered command."""
@@ -319,14 +315,67 @@ async def test_a_key_reaches_one_client_only() -> None:
         assert not autopilot.has_key
 
 
+async def test_a_client_that_comes_during_a_change_gets_no_key() -> None:
+    """A program on this machine sees the command, and becomes a client while the autopilot's proof is awaited."""
+    autopilot = Autopilot()
+    autopilot.receive(pack(mavlink.MAVLink_setup_signing_message(1, 1, list(KEY.reveal()), 5)))
+    async with flying("udpin", autopilot, KEY) as pair:
+        await pair.commands_pass()
+        autopilot.is_deaf = True
+        with socket.socket(type=socket.SOCK_DGRAM) as other:
+            other.setblocking(False)
+            changing = asyncio.create_task(pair.ask("rotate", OTHER))
+            assert pair.endpoint.signing is not None
+            await until(lambda: len(pair.endpoint.signing.signers) == 2)  # type: ignore[union-attr]
+            other.sendto(pack(mavlink.MAVLink_system_time_message(1, 1)), pair.endpoint._sock.getsockname())  # type: ignore[attr-defined]
+            await until(lambda: len(pair.endpoint.ports) == 2)
+            autopilot.is_deaf = False
+            assert (await changing)["is_changed"] is None
+            await pair.commands_pass()
+            assert autopilot.key == KEY.reveal()
+            assert OTHER.reveal() not in b"".join(_all(other))
+
+
+async def test_a_stranger_gets_nothing_signed_but_questions() -> None:
+    """A signature of its own for each client: with copies it would repeat a HEARTBEAT when the station is lost."""
+    autopilot = Autopilot()
+    autopilot.receive(pack(mavlink.MAVLink_setup_signing_message(1, 1, list(KEY.reveal()), 5)))
+    async with flying("udpin", autopilot, KEY) as pair:
+        await pair.commands_pass()
+        with socket.socket(type=socket.SOCK_DGRAM) as stranger:
+            stranger.setblocking(False)
+            stranger.sendto(pack(mavlink.MAVLink_system_time_message(1, 1)), pair.endpoint._sock.getsockname())  # type: ignore[attr-defined]
+            await until(lambda: len(pair.endpoint.ports) == 2)
+            (endpoint,) = pair.ground.parts.local.endpoints
+            heartbeat = pack(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3), 255, 190)
+            pair.station.sendto(heartbeat, endpoint._sock.getsockname())  # type: ignore[attr-defined]
+            await until(lambda: any(one.get_type() == "HEARTBEAT" for one in autopilot.accepted))
+            autopilot.accepted.clear()
+            autopilot.restart()
+            await pair.commands_pass()
+            assert {data[7] for data in _all(stranger)} <= {mavlink.MAVLINK_MSG_ID_TIMESYNC}
+
+
+def _all(sock: socket.socket) -> list[bytes]:
+    """The datagrams that wait at a socket."""
+    datagrams = []
+    with suppress(BlockingIOError):
+        while True:
+            datagrams.append(sock.recv(4096))
+    return datagrams
+
+
 async def test_another_key_is_only_for_the_autopilot_that_proves_this_one() -> None:
     """Somebody that sends HEARTBEATs without signatures must not get the place of an autopilot that is off."""
     autopilot = Autopilot()
     async with flying("udpin", autopilot, KEY) as pair:
-        answer = await pair.ask("rotate", OTHER)
-        assert answer["is_changed"] is False
-        assert "has not proven" in answer["problem"]
+        for byte in (b"3", b"4", b"5"):
+            answer = await pair.ask("rotate", Secret(byte * 32))
+            assert answer["is_changed"] is False
+            assert "has not proven" in answer["problem"]
         assert not autopilot.has_key
+        assert pair.endpoint.signing is not None
+        assert [one.secret for one in pair.endpoint.signing.signers] == [KEY, Secret(b"5" * 32)]
 
 
 async def test_all_clients_of_a_station_are_one_source() -> None:
@@ -336,10 +385,11 @@ async def test_all_clients_of_a_station_are_one_source() -> None:
     async with flying("serial", autopilot, KEY) as pair:
         await pair.commands_pass()
         gate = pair.vehicle.parts.local.policies["client"].incoming
+        (port,) = pair.endpoint.ports
         signed = 0
         for component in range(1, 50):
             raw = pack(mavlink.MAVLink_command_long_message(1, 1, 400, 0, 1, 1, 0, 0, 0, 0, 0), 200, component)
-            signed += len(pair.endpoint.signed([read(raw)], Source("captured", gate)))
+            signed += len(port.signed([read(raw)], Source("captured", gate)))
         assert signed == MOST_OF_SOURCE
 
 

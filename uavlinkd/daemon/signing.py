@@ -91,6 +91,7 @@ class AutopilotSigning(Feature):
 
         def on_frames(port: LocalPort, frames: list[Frame], now: float, epoch: int, waited_s: float = 0.0) -> None:
             if passed := signing.accept(frames, now):
+                port.is_genuine = True
                 deliver(port, passed, now, epoch, waited_s)
 
         endpoint.signing, endpoint.on_frames = signing, on_frames
@@ -156,19 +157,16 @@ class AutopilotSigning(Feature):
         if len(endpoint.ports) > 1:
             raise _RefusalError(_SEVERAL_CLIENTS)
         signing = before or self.install(endpoint, config)
-        known = list(signing.signers)
         newest = signing.add(config.key)  # the autopilot has it after a change that was interrupted
         answer: dict[str, object] = {"is_changed": False}
         try:
             began_at = monotonic()
             if (signs or action == "rotate") and not await _proves(signing, began_at):
                 raise _RefusalError(OTHER_KEY if signs and signing.verified_at < 0 else _NOT_PROVEN)
-            answer = await _give(signing, newest, system, began_at)
+            answer = await _give(endpoint, signing, newest, system, began_at)
         finally:
             if before is None and not answer["is_changed"]:
                 self._remove(endpoint)
-            elif answer["is_changed"] is False:
-                signing.signers = known
         return answer
 
     async def _clear(self, endpoint: Endpoint, system: int, *, signs: bool) -> dict[str, object]:
@@ -233,12 +231,15 @@ async def _proves(signing: EndpointSigning, began_at: float) -> bool:
     return await _repeat(lambda: signing.ask(next(signers), monotonic()), lambda: signing.proven_at >= began_at)
 
 
-async def _give(signing: EndpointSigning, newest: Signer, system: int, began_at: float) -> dict[str, object]:
+async def _give(
+    endpoint: Endpoint, signing: EndpointSigning, newest: Signer, system: int, began_at: float
+) -> dict[str, object]:
     def has_it() -> bool:
         return signing.signer is newest and signing.is_proven and signing.proven_at >= began_at
 
     def hand_over() -> None:
-        signing.set_up(newest.secret, system)
+        if len(endpoint.ports) == 1:  # another one may have come since
+            signing.set_up(newest.secret, system)
         signing.ask(newest, monotonic())
 
     if not await _repeat(hand_over, has_it):

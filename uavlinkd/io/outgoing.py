@@ -18,7 +18,7 @@ from uavlinkd.mavlink.frames import Frame
 from uavlinkd.mavlink.policy.delivery import DeliveredStream, Source
 
 Signed = Callable[[Sequence[Frame], Source], Sequence[Frame]]
-"""Returns the frames as a client gets them: :meth:`uavlinkd.io.ports.Endpoint.signed`."""
+"""Returns the frames as a client gets them: :meth:`uavlinkd.io.ports.LocalPort.signed`."""
 
 _REASONS = {EgressDrop.OVERFLOW: "outgoing_full", EgressDrop.CLOSED: "unsent"}
 

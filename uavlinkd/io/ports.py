@@ -29,6 +29,9 @@ silent for this long. ``udpin`` sends such a client no broadcast frames of other
 class LocalPort:
     """One client of an endpoint. Compared by identity."""
 
+    is_genuine = False
+    """Whether a frame with a valid signature came from it, where the endpoint signs: anybody may be a client."""
+
     def __init__(self, endpoint: Endpoint, name: str, received_at: float | None) -> None:
         self.endpoint = endpoint
         self.name = name  # its address, for people: `127.0.0.1:14550`, `/dev/ttyACM0`
@@ -36,6 +39,11 @@ class LocalPort:
         """When its last frame was received, in monotonic seconds; None before the first frame."""
         self.delivered = endpoint.delivered.of(name)
         """The byte stream that it reads. It decides which bytes a frame becomes, in the order of delivery."""
+
+    def signed(self, frames: Sequence[Frame], source: Source) -> Sequence[Frame]:
+        """The frames for it: with signatures where the autopilot wants them, without those that get none."""
+        signing = self.endpoint.signing
+        return frames if signing is None else signing.sign(frames, source.name, is_genuine=self.is_genuine)
 
     def send(self, frames: Sequence[Frame], source: Source, now: float, waited_s: float) -> None:
         """Send frames that arrived together, all from one source, to the client, or drop and count them.
@@ -81,7 +89,7 @@ class Endpoint(ABC):
         self.on_frames: Callable[..., None] = handler.on_frames
         """Receives what a client sent, as :meth:`PortHandler.on_frames`. Signing stands before the daemon here."""
         self.signing: EndpointSigning | None = None
-        """Signs what clients get: see :meth:`signed`."""
+        """Signs what clients get: see :meth:`LocalPort.signed`."""
         self.counters = SplitCounters()  # frames and garbage in the received bytes
         self.failures: Counter[str] = Counter()
         """Errors by name: the kernel's (``ECONNREFUSED``), and the endpoint's own reasons."""
@@ -93,10 +101,6 @@ class Endpoint(ABC):
     @abstractmethod
     def ports(self) -> Sequence[LocalPort]:
         """The present clients."""
-
-    def signed(self, frames: Sequence[Frame], source: Source) -> Sequence[Frame]:
-        """The frames for clients: with signatures where the autopilot wants them, without those that get none."""
-        return frames if self.signing is None else self.signing.sign(frames, source.name)
 
     def gather(self, seconds: float) -> None:  # noqa: B027
         """From now on, frames may wait this long before they are read. The bytes of a stream gather anyway."""

@@ -81,7 +81,7 @@ class Connection(LocalPort):
         super().__init__(endpoint, name, None)
         self.channel = channel
         self.opened_at = opened_at
-        self.outgoing = OutgoingFrames(endpoint.failures, self.delivered, endpoint.signed)
+        self.outgoing = OutgoingFrames(endpoint.failures, self.delivered, self.signed)
         self.lost = asyncio.Event()  # set when the port has been reported as closed
         self._splitter = StreamSplitter(endpoint.counters, endpoint.max_gap_s, endpoint.max_hold_s)
         self._loop = asyncio.get_running_loop()

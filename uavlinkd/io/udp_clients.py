@@ -44,7 +44,7 @@ class UdpPort(LocalPort):
         delivered, endpoint = self.delivered, self.endpoint
         batch, count = b"", 0
         if endpoint.signing is not None:
-            frames = endpoint.signing.sign(frames, source.name)
+            frames = endpoint.signing.sign(frames, source.name, is_genuine=self.is_genuine)
         for frame in frames:
             data = frame.raw
             # As admit() does, without a call where nothing is open and no frame can begin within this one.

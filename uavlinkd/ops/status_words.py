@@ -40,7 +40,7 @@ ENDPOINT_FAILURES: Final[Mapping[str, str]] = {
     "bad_signature": "frames with a wrong signature",
     "replayed": "signed frames with an old timestamp",
     "reflected": "own frames that came back",
-    "not_proven": "frames before the autopilot proved its key",
+    "not_proven": "frames before the key was proved",
     "mavlink1_not_signed": "MAVLink 1 frames, which have no signatures",
     "too_many_senders": "frames of more senders than an autopilot remembers",
 }

@@ -63,7 +63,7 @@ class SigningDrop(StrEnum):
     BAD_SIGNATURE = "bad_signature"
     REPLAYED = "replayed"
     REFLECTED = "reflected"
-    NOT_PROVEN = "not_proven"  # this end asked, and no answer has come yet
+    NOT_PROVEN = "not_proven"  # this end asked, and no answer has come yet; or the client has signed nothing
     MAVLINK1 = "mavlink1_not_signed"
     TOO_MANY_SENDERS = "too_many_senders"
 
@@ -78,7 +78,7 @@ class EndpointSigning:
         self.signer = Signer(key)
         """Signs; proven if :attr:`is_proven`."""
         self.signers = [self.signer]
-        """From the oldest to the newest. A newer one that was proven ends those before it."""
+        """The one in force, and perhaps a newer one, which ends the other when it is proven."""
         self.is_proven = False
         self.accepts_unsigned = False
         """Whether the autopilot answered a question that had no signature."""
@@ -100,11 +100,13 @@ class EndpointSigning:
 
     # To the autopilot.
 
-    def sign(self, frames: Sequence[Frame], source: str) -> list[Frame]:
+    def sign(self, frames: Sequence[Frame], source: str, *, is_genuine: bool = True) -> list[Frame]:
         """The frames with the next timestamps, without those that may not leave. Call it in the order of writing.
 
-        ``source``: the peer or endpoint that they come from, as the configuration names it.
+        ``source``: the peer or endpoint that they come from, as the configuration names it. ``is_genuine``: whether
+        the client ever sent a signed frame. Another one gets questions alone: it could repeat its copies of others.
         """
+        may_leave = self.is_proven and is_genuine
         signed: list[Frame] = []
         for frame in frames:
             raw, header = frame
@@ -112,16 +114,14 @@ class EndpointSigning:
             if sender == _OWN and raw in self._own:
                 signed.append(frame)
                 continue
-            is_usual = self.is_proven and sender in self._senders and raw[0] == MAVLINK2
-            if not is_usual and (reason := self._why_not(frame, source)):
+            is_usual = may_leave and sender in self._senders and raw[0] == MAVLINK2
+            if not is_usual and (reason := self._why_not(frame, source) if may_leave else SigningDrop.NOT_PROVEN):
                 self._drops[reason] += 1
                 continue
             signed.append(new_frame(Frame, (self._sign(raw, self.signer), header)))
         return signed
 
     def _why_not(self, frame: Frame, source: str) -> SigningDrop | None:
-        if not self.is_proven:
-            return SigningDrop.NOT_PROVEN
         if frame.raw[0] != MAVLINK2:
             return SigningDrop.MAVLINK1
         reports = may_be_old(frame)
@@ -238,5 +238,5 @@ class EndpointSigning:
         for signer in self.signers:
             if signer.secret == key:
                 return signer
-        self.signers.append(Signer(key))
+        self.signers = [self.signer, Signer(key)]
         return self.signers[-1]
