@@ -168,6 +168,21 @@ def test_key_that_the_autopilot_may_have_is_kept(tmp_path: Path, capsys: pytest.
     assert key_files(tmp_path) == {"autopilot.key": kept}
 
 
+def test_clear_keeps_a_key_that_the_autopilot_may_have(tmp_path: Path) -> None:
+    """Who forges a HEARTBEAT while the autopilot is off makes it look cleared."""
+    path = write(tmp_path)
+    with made_up_daemon(tmp_path):
+        assert run("setup", path) == 0
+    before = (tmp_path / "autopilot.key").read_text()
+    with made_up_daemon(tmp_path, UNKNOWN) as seen:
+        assert run("rotate", path) == 1
+        kept = seen()["requests"][0]["key"]
+    with made_up_daemon(tmp_path):
+        assert run("clear", path) == 0
+    assert key_files(tmp_path) == {"autopilot.key.new": kept}
+    assert (tmp_path / "autopilot.key.old").read_text() == before
+
+
 def test_disk_that_refuses_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

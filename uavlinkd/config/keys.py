@@ -21,7 +21,6 @@ from uavlinkd.system.terminal import CommandError
 KEY_TEXT_LENGTH = 44
 CREDENTIALS = "CREDENTIALS_DIRECTORY"
 """The environment variable in which systemd names the folder with a service's keys."""
-"""What follows the name of a key file in the name of the file with its successor, while a key is changed."""
 _READ_LIMIT = 256  # bytes read of a key file: enough to detect that it contains more than a key
 _HAS_OWNERS = hasattr(os, "geteuid")
 """Files have owners and modes, and folders can be synced. Windows has none of this, and no flags for these files."""

@@ -156,7 +156,6 @@ def _clear(place: _Place) -> str:
     if place.is_written:
         replace_valid(place.path, text, place.keys)
     place.keep_old()
-    for file in (place.file, place.new):
-        file.unlink(missing_ok=True)
+    place.file.unlink(missing_ok=True)
     sync_folder(place.file.parent)
     return f"the autopilot has no key, and takes frames of anyone who reaches it. {place.old} has the last key."
