@@ -34,7 +34,7 @@ def test_key_and_link_id(tmp_path: Path) -> None:
 
 def test_file_that_cannot_be_used_is_refused(tmp_path: Path) -> None:
     """Another length, another mode, none: the message names the file and what to do."""
-    assert "`uavlinkd signing setup` beside the autopilot" in refused(tmp_path, SIGNED)[_AT]
+    assert "`uavlinkd signing setup` beside an autopilot without a key" in refused(tmp_path, SIGNED)[_AT]
     path = tmp_path / "autopilot.key"
     _write(tmp_path, path.name, 1)
     path.chmod(0o640)

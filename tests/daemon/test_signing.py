@@ -27,6 +27,7 @@ from uavlinkd.daemon.daemon import Daemon
 from uavlinkd.io.url import EndpointKind, NetworkUrl, SerialUrl
 from uavlinkd.mavlink.policy.delivery import Source
 from uavlinkd.mavlink.signing.endpoint_signing import MOST_OF_SOURCE
+from uavlinkd.observe import status
 from uavlinkd.protocol.crypto import Secret
 
 HEARTBEAT_S = 0.1
@@ -419,6 +420,23 @@ async def test_an_autopilot_that_lost_its_key() -> None:
         assert (await pair.ask("clear", None))["is_changed"]
         await pair.commands_pass()
         assert pair.endpoint.signing is None
+
+
+async def test_status_of_an_autopilot_that_lost_its_key(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It proved the key, and does not prove it now."""
+    autopilot = Autopilot()
+
+    async def proves() -> bool:
+        answer: Any = await pair.vehicle.answer("status")
+        return bool(answer["endpoints"]["client"]["signing"]["is_verified"])
+
+    async with flying("udpin", autopilot) as pair:
+        assert (await pair.ask("setup"))["is_changed"]
+        assert await proves()
+        monkeypatch.setattr(status, "SILENT_S", 2 * HEARTBEAT_S)
+        autopilot.erase()
+        await until(lambda: pair.endpoint.failures["unsigned"] > 4)
+        assert not await proves()
 
 
 async def test_a_reload_knows_the_key() -> None:

@@ -62,6 +62,20 @@ async def test_unknown_request_is_an_error(server: ControlServer, path: Path) ->
         await asyncio.to_thread(ask, path, "dance")
 
 
+@pytest.mark.parametrize("begun", [b"", b'{"name": '])
+async def test_daemon_that_ends_before_it_answered_is_named(path: Path, begun: bytes) -> None:
+    """An answer that was begun is none."""
+
+    async def end(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.readline()
+        writer.write(begun)
+        writer.close()
+
+    async with await asyncio.start_unix_server(end, path):
+        with pytest.raises(ControlError, match=r"the daemon at control\.sock ended, .* before it answered"):
+            await asyncio.to_thread(ask, path, "status")
+
+
 async def test_server_limits_the_request_exactly(path: Path) -> None:
     """The client reports why a longer request was refused, and does not repeat the request."""
     server = ControlServer(path, lambda request: {"length": len(request)})

@@ -19,6 +19,7 @@ from uavlinkd.cli import main
 from uavlinkd.config import keys
 from uavlinkd.config.load import load_config
 from uavlinkd.config.model import LINK_ID
+from uavlinkd.ops import signing as ops_signing
 from uavlinkd.ops.control import ControlServer, ask
 from uavlinkd.protocol.crypto import Secret
 
@@ -157,8 +158,10 @@ def test_key_that_the_autopilot_may_have_is_kept(tmp_path: Path, capsys: pytest.
     with made_up_daemon(tmp_path, UNKNOWN) as seen:
         assert run("setup", path) == 1
         kept = seen()["requests"][0]["key"]
+        assert f"may have the key in {tmp_path}/autopilot.key.new" in capsys.readouterr().err
+        assert run("clear", path) != 0
+        assert "`uavlinkd signing setup` was interrupted, run it again" in capsys.readouterr().err
     assert key_files(tmp_path) == {"autopilot.key.new": kept}
-    assert f"may have the key in {tmp_path}/autopilot.key.new" in capsys.readouterr().err
     with made_up_daemon(tmp_path, ARMED):
         assert run("setup", path) == 1
     assert key_files(tmp_path) == {"autopilot.key.new": kept}
@@ -183,6 +186,25 @@ def test_clear_keeps_a_key_that_the_autopilot_may_have(tmp_path: Path) -> None:
     assert (tmp_path / "autopilot.key.old").read_text() == before
 
 
+def test_interrupted_command_says_what_to_do(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The daemon goes on after Ctrl-C."""
+    path = write(tmp_path)
+
+    def interrupt(socket: Path, request: str, *more: float) -> dict[str, Any]:
+        if request != "status":
+            raise KeyboardInterrupt
+        return ask(socket, request, *more)
+
+    with made_up_daemon(tmp_path):
+        with monkeypatch.context() as patch:
+            patch.setattr(ops_signing, "ask", interrupt)
+            assert run("setup", path) == 1
+        assert "may go on. What the autopilot has is not known: run this command again" in capsys.readouterr().err
+        assert run("setup", path) == 0
+
+
 def test_disk_that_refuses_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -205,6 +227,7 @@ def test_disk_that_refuses_is_named(
     ("action", "text", "more", "says"),
     [
         ("setup", CONFIG, (), "no daemon answers"),
+        ("clear", SIGNED, (), "no daemon answers"),
         ("setup", CONFIG, ("--endpoint", "other"), "one of: autopilot, gcs"),
         ("setup", CONFIG.replace("autopilot", "fc"), (), "one of: fc, gcs"),
         ("rotate", CONFIG, (), "has no key"),
@@ -219,6 +242,8 @@ def test_what_cannot_be_done_changes_nothing(
 ) -> None:
     """The daemon is not asked."""
     path = write(tmp_path, text)
+    if text == SIGNED:
+        keys.write_secret_file(tmp_path / "autopilot.key", keys.generate_psk())
     before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
     with ExitStack() as stack:
         seen = None if "answers" in says else stack.enter_context(made_up_daemon(tmp_path))
@@ -226,7 +251,9 @@ def test_what_cannot_be_done_changes_nothing(
         assert seen is None or seen()["requests"] == []
         before |= {} if seen is None else {"c.sock": b""}
         after = {file.name: file.read_bytes() if file.is_file() else b"" for file in tmp_path.iterdir()}
-    assert says in capsys.readouterr().err
+    err = capsys.readouterr().err
+    assert says in err
+    assert "is not known" not in err
     assert after == before
 
 

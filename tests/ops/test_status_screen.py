@@ -234,7 +234,7 @@ def test_relay_shows_its_members_those_that_are_down_first() -> None:
     assert "endpoint" not in text
 
 
-@pytest.mark.parametrize(("is_verified", "says"), [(True, "proved"), (False, "has not proved")])
+@pytest.mark.parametrize(("is_verified", "says"), [(True, "proves"), (False, "does not prove")])
 def test_an_endpoint_that_signs_has_a_line(is_verified: bool, says: str) -> None:
     """An endpoint without a key has none."""
     plain: dict[str, Any] = {"clients": {}, "frames_received": 0, "frames_sent": 0, "signing": None}

@@ -167,6 +167,6 @@ def _how_to_get(key: str, path: Path, config: Path) -> str:
     if key == "psk_file":
         return f"copy it from the peer, or make it on one of the two with `uavlinkd psk --out {where}`"
     if key == "signing_key_file":
-        return "delete this line, and run `uavlinkd signing setup` beside the autopilot: it makes the file"
+        return "put it there, or delete this line, and run `uavlinkd signing setup` beside an autopilot without a key"
     remedy = f"make it with `uavlinkd keygen --out {where}`"
     return f"{remedy}, or name the folder of a service's keys with `uavlinkd check --keys DIR`"

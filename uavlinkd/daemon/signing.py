@@ -45,7 +45,7 @@ _THREAD: Final = Threads(1, "signing state")
 
 OTHER_KEY: Final = (
     "the autopilot signs with a key that this daemon does not have: if a command was interrupted, run that one again;"
-    " else give the key's file, or remove the key there (ArduPilot: over USB; PX4: delete"
+    " else put the key (its file, .new or .old) in its place, or remove it there (ArduPilot: over USB; PX4: delete"
     " mavlink/mavlink-signing-key.bin on its card, and restart it)"
 )
 _NOT_PROVEN: Final = "the autopilot has not proven that it has this endpoint's key: see `uavlinkd status`"
@@ -54,8 +54,8 @@ _SEVERAL_CLIENTS: Final = (
     " (a client is forgotten after a minute of silence)"
 )
 _UNKNOWN: Final[dict[str, object]] = {
-    "problem": f"the autopilot did not confirm it within {CONFIRMED_S:g} s, and may have done it or not: restart the"
-    " autopilot, and run the same command again",
+    "problem": "the autopilot did not confirm it, and may have done it or not: run the same command again, and if"
+    " that fails too, once more after a restart of the autopilot",
     "is_changed": None,
 }
 

@@ -245,12 +245,12 @@ def station_unverified(endpoint: EndpointFacts) -> Signs:
 _UNVERIFIED: Final = (
     (
         *(("bad_signature",), "signs with another key"),
-        "if a change of the key was interrupted, run the same `uavlinkd signing` again; else write the file of that"
-        " key, or remove it there, over USB, and run `uavlinkd signing setup`",
+        "if a change of the key was interrupted, run the same `uavlinkd signing` again; else put that key, perhaps"
+        " the .old one, in the place of the file, or remove it there, and run `uavlinkd signing setup`",
     ),
     (
         *(("unsigned",), "does not sign, or its frames are another sender's"),
-        "run `uavlinkd signing setup`, which hands it a new key",
+        "run `uavlinkd signing setup`, which hands it a new key, or `clear`, if that was interrupted",
     ),
     (
         *(("not_proven", "replayed"), "signs, and answers no question of this daemon: the direction to it is cut"),

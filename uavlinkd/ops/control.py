@@ -146,7 +146,10 @@ def ask(
             sock.settimeout(timeout_s)
             sock.connect(str(path))
             sock.sendall(request.encode() + b"\n")
-            answer = json.loads(_read_answer(sock))
+            text = _read_answer(sock)
+            if not text.endswith(b"\n"):
+                raise ControlError(f"the daemon at {path} ended, or refused the connection, before it answered")
+            answer = json.loads(text)
             if for_terminal:
                 answer = _without_controls(answer)
     except PermissionError:

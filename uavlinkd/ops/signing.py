@@ -93,8 +93,9 @@ class _Place:
         request = {"action": action, "endpoint": self.endpoint, "key": key, "link_id": link_id}
         try:
             return ask(self.socket, f"signing {json.dumps(request)}", _TIMEOUT_S)
-        except ControlError as error:
-            raise ControlError(f"{error}. What the autopilot has is not known: run this command again") from None
+        except (ControlError, KeyboardInterrupt) as error:
+            reason = str(error) or "the daemon was not stopped, and may go on"
+            raise ControlError(f"{reason}. What the autopilot has is not known: run this command again") from None
 
     def keep_old(self) -> None:
         """Copy the key that is replaced or cleared: whoever deceived the daemon on the cable cost no visit then."""
@@ -105,6 +106,7 @@ class _Place:
 
 def _run(options: argparse.Namespace) -> int:
     place = _Place(options)
+    ask(place.socket, "status")  # no file is made if no daemon answers
     try:
         print(printable(f"{place.endpoint}: {_clear(place) if options.action == 'clear' else _give(place, options)}"))
     except OSError as error:
@@ -113,7 +115,6 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _give(place: _Place, options: argparse.Namespace) -> str:
-    ask(place.socket, "status")  # no file is made if no daemon answers
     if options.action == "rotate" and not place.is_written:
         raise UsageError(f"{place.path}: {place.endpoint} has no key: run `uavlinkd signing setup`")
     # A key in force is never sent again: an autopilot without it may be somebody else.
@@ -149,7 +150,8 @@ def _give(place: _Place, options: argparse.Namespace) -> str:
 
 def _clear(place: _Place) -> str:
     if not place.is_written and not os.path.lexists(place.file):
-        raise UsageError(f"{place.path}: {place.endpoint} has no key")
+        advice = "if `uavlinkd signing setup` was interrupted, run it again"
+        raise UsageError(f"{place.path}: {place.endpoint} has no key: {advice}")
     text = place.text(None) if place.is_written else ""
     if problem := place.ask("clear")["problem"]:
         raise CommandError(f"{place.endpoint}: {problem}")

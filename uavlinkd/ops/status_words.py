@@ -269,13 +269,12 @@ def endpoint_drops(endpoint: Status) -> list[Count]:
 
 
 def signing_lines(status: Status) -> Iterator[Phrase]:
-    """Each endpoint that signs, and whether its autopilot proved the key."""
+    """Each endpoint that signs, and whether its autopilot proves the key."""
     for name, endpoint in status["endpoints"].items():
         if (signing := endpoint["signing"]) is not None:
-            result = (
-                "the autopilot proved the key" if signing["is_verified"] else "the autopilot has not proved the key"
-            )
-            yield Phrase(f"{name} signing: {result}, link id {signing['link_id']}", signing["is_verified"])
+            is_verified, link_id = signing["is_verified"], signing["link_id"]
+            result = "proves" if is_verified else "does not prove"
+            yield Phrase(f"{name} signing: the autopilot {result} the key, link id {link_id}", is_verified)
 
 
 def _refused(part: Status) -> list[Count]:
