@@ -379,6 +379,19 @@ async def test_another_key_is_only_for_the_autopilot_that_proves_this_one() -> N
         assert [one.secret for one in pair.endpoint.signing.signers] == [KEY, Secret(b"5" * 32)]
 
 
+async def test_one_change_at_a_time_and_for_an_autopilot_that_answers() -> None:
+    """The other one is refused; so is clear where the direction to the autopilot is cut."""
+    autopilot = Autopilot()
+    autopilot.receive(pack(mavlink.MAVLink_setup_signing_message(1, 1, list(KEY.reveal()), 5)))
+    async with flying("udpin", autopilot, KEY) as pair:
+        await pair.commands_pass()
+        autopilot.is_deaf = True
+        answers = await asyncio.gather(pair.ask("clear", None), pair.ask("clear", None))
+        assert [answer["is_changed"] for answer in answers] == [False, False]
+        assert "has not proven" in answers[0]["problem"]
+        assert "another change" in answers[1]["problem"]
+
+
 async def test_all_clients_of_a_station_are_one_source() -> None:
     """A captured station opens new clients: each would have places at the autopilot of its own."""
     autopilot = Autopilot()

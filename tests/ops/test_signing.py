@@ -118,10 +118,12 @@ def test_key_is_set_up_changed_and_cleared(tmp_path: Path, capsys: pytest.Captur
         assert (tmp_path / "autopilot.key").stat().st_mode & 0o777 == 0o600
         assert "unsigned frames at this port too" in capsys.readouterr().out
         assert run("setup", path) == 0  # an autopilot that was reset, or a sender that claims to be one
-        assert seen()["key"] not in (first, "")
+        again = seen()["key"]
+        assert again not in (first, "")
         assert run("rotate", path) == 0
         second = seen()["key"]
         assert second != first
+        assert (tmp_path / "autopilot.key.old").read_text().strip() == again
         assert key_files(tmp_path) == {"autopilot.key": second}
         assert run("clear", path) == 0
         assert (path.read_text(), key_files(tmp_path)) == (CONFIG, {})

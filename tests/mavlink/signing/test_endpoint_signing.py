@@ -10,9 +10,12 @@ from tests.mavlink.signing.wire import KEY, OTHER, STATION, Wire
 from tests.samples import pack
 from uavlinkd.config.model import LINK_ID
 from uavlinkd.mavlink.signing.endpoint_signing import (
+    ASK_S,
     MOST_OF_SOURCE,
     MOST_REPORTERS,
     MOST_SENDERS,
+    MOST_STREAMS,
+    QUESTIONS,
     SigningDrop,
 )
 from uavlinkd.mavlink.signing.signature import LAST_TIMESTAMP
@@ -185,6 +188,42 @@ def test_an_answer_that_somebody_kept(judge: type[Autopilot]) -> None:
     assert not any(wire.to_daemon(raw) for raw in later)
 
 
+def test_an_answer_that_somebody_kept_proves_no_later_step(judge: type[Autopilot]) -> None:
+    """The autopilot went back to an earlier time, and somebody recorded the later one."""
+    wire = Wire(with_key(judge))
+    wire.second()
+    asked: list[bytes] = []
+    wire.signing.send = asked.append
+    wire.now += 1
+    wire.to_daemon(wire.recorded[0])
+    (kept,) = wire.autopilot.receive(asked[0])
+    recorded = [wire.signing.signer.sign(report(1), 3, 2**40 + number) for number in range(3)]
+    assert not wire.to_daemon(recorded[0])
+    wire.to_daemon(kept)
+    assert not any(wire.to_daemon(raw) for raw in recorded[1:])
+
+
+def test_bounds(judge: type[Autopilot]) -> None:
+    """Whoever replays frames causes few questions, old ones count no more, and few senders are remembered."""
+    wire = Wire(with_key(judge))
+    wire.second()
+    asked: list[bytes] = []
+    wire.signing.send = asked.append
+    for _ in range(320):
+        wire.now += ASK_S / 8
+        wire.to_daemon(wire.recorded[0])
+    assert len(asked) == 40
+    wire.signing.is_proven = False
+    wire.to_daemon(wire.autopilot.receive(asked[-1 - QUESTIONS])[0])
+    before = wire.signing.is_proven
+    wire.to_daemon(wire.autopilot.receive(asked[-1])[0])
+    assert (before, wire.signing.is_proven) == (False, True)
+    signer, first = wire.signing.signer, wire.signing.timestamp
+    passed = [wire.to_daemon(signer.sign(report(1, number), 3, first + number)) for number in range(2, 200)]
+    assert sum(map(bool, passed)) == MOST_STREAMS - 1
+    assert wire.drops[SigningDrop.TOO_MANY_SENDERS] == 198 - (MOST_STREAMS - 1)
+
+
 @KINDS
 def test_an_autopilot_that_was_restarted_accepts_no_old_frame(judge: type[Autopilot], kind: str) -> None:
     """It knows no sender then, and accepts what is less than a minute old: a question leaps over that."""
@@ -200,6 +239,39 @@ def test_an_autopilot_that_was_restarted_accepts_no_old_frame(judge: type[Autopi
     assert len(wire.autopilot.accepted) == 1
     assert wire.to_autopilot(command())
     assert len(wire.autopilot.accepted) == 2
+
+
+@KINDS
+def test_frames_after_a_question_that_was_lost(judge: type[Autopilot], kind: str) -> None:
+    """The next question leaps over them too."""
+    wire = Wire(with_key(judge, kind))
+    wire.second()
+    send, wire.signing.send = wire.signing.send, lambda _: None
+    wire.now += 1
+    wire.to_daemon(wire.recorded[0])
+    wire.signing.send = send
+    assert wire.to_autopilot(command())
+    old = wire.sent[-1]
+    wire.autopilot.restart()
+    wire.second()
+    wire.autopilot.receive(old)
+    assert len(wire.autopilot.accepted) == 1
+
+
+def test_both_ends_are_restarted(judge: type[Autopilot]) -> None:
+    """The first question of a daemon leaps over what ArduPilot signed since it stored its timestamp."""
+    wire = Wire(with_key(judge))
+    wire.second()
+    wire.autopilot.save()
+    wire.autopilot.set_time(wire.signing.timestamp + 50_000)
+    wire.second()
+    assert wire.to_autopilot(command())
+    old = wire.sent[-1]
+    wire.autopilot.restart()
+    wire.daemon_starts()
+    wire.second()
+    wire.autopilot.receive(old)
+    assert len(wire.autopilot.accepted) == 1
 
 
 def test_the_last_timestamp(judge: type[Autopilot]) -> None:
@@ -227,11 +299,13 @@ def test_a_station_cannot_move_the_timestamp(judge: type[Autopilot]) -> None:
 
 
 def test_mavlink_1(judge: type[Autopilot]) -> None:
-    """A MAVLink 1 frame cannot be signed."""
+    """A MAVLink 1 frame cannot be signed, also where its bytes look like those of a sender that may."""
     wire = Wire(with_key(judge))
     wire.second()
+    assert wire.to_autopilot(command(mavlink.MAVLINK_MSG_ID_SET_MODE, 190))
+    assert not wire.to_autopilot(pack(mavlink.MAVLink_set_mode_message(1, 0, 190), 255, 190, version=1))
     assert not wire.to_autopilot(pack(mavlink.MAVLink_param_request_list_message(1, 1), 255, 190, version=1))
-    assert wire.drops[SigningDrop.MAVLINK1] == 1
+    assert wire.drops[SigningDrop.MAVLINK1] == 2
 
 
 def test_places(judge: type[Autopilot]) -> None:
