@@ -419,6 +419,17 @@ async def test_a_daemon_with_a_key() -> None:
             await pair.commands_pass()
 
 
+async def test_commands_pass_behind_the_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They need not wait for the autopilot's next HEARTBEAT: here there is one, and then the answer."""
+    monkeypatch.setattr("tests.daemon.test_signing.HEARTBEAT_S", 3600.0)
+    autopilot = Autopilot()
+    autopilot.receive(pack(mavlink.MAVLink_setup_signing_message(1, 1, list(KEY.reveal()), 5)))
+    async with flying("udpin", autopilot, KEY) as pair:
+        async with asyncio.timeout(10.0):
+            await pair.commands_pass()
+        assert pair.endpoint.counters.frames == 2
+
+
 async def test_an_autopilot_that_lost_its_key() -> None:
     """It was erased, or replaced: setup hands the same key over again, and clear ends what it began."""
     autopilot = Autopilot()

@@ -90,8 +90,11 @@ class AutopilotSigning(Feature):
         deliver = endpoint.handler.on_frames
 
         def on_frames(port: LocalPort, frames: list[Frame], now: float, epoch: int, waited_s: float = 0.0) -> None:
-            if passed := signing.accept(frames, now):
+            before = signing.proven_at
+            passed = signing.accept(frames, now)
+            if passed or signing.proven_at != before:
                 port.is_genuine = True
+            if passed:
                 deliver(port, passed, now, epoch, waited_s)
 
         endpoint.signing, endpoint.on_frames = signing, on_frames
