@@ -62,13 +62,11 @@ async def test_unknown_request_is_an_error(server: ControlServer, path: Path) ->
         await asyncio.to_thread(ask, path, "dance")
 
 
-@pytest.mark.parametrize("begun", [b"", b'{"name": '])
-async def test_daemon_that_ends_before_it_answered_is_named(path: Path, begun: bytes) -> None:
-    """An answer that was begun is none."""
+async def test_daemon_that_ends_before_it_answered_is_named(path: Path) -> None:
+    """It was killed, or had no place for another connection."""
 
     async def end(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         await reader.readline()
-        writer.write(begun)
         writer.close()
 
     async with await asyncio.start_unix_server(end, path):

@@ -130,8 +130,9 @@ class Events:
 
     async def until(self, condition: Callable[[Facts], bool]) -> Facts:
         """The first of the events ``now`` that fulfils a condition."""
-        while not condition(facts := await self.next()):
-            pass
+        async with asyncio.timeout(PATIENCE_S):
+            while not condition(facts := await self.next()):
+                pass
         return facts
 
     async def _read(self) -> None:

@@ -146,8 +146,7 @@ def ask(
             sock.settimeout(timeout_s)
             sock.connect(str(path))
             sock.sendall(request.encode() + b"\n")
-            text = _read_answer(sock)
-            if not text.endswith(b"\n"):
+            if not (text := _read_answer(sock)):
                 raise ControlError(f"the daemon at {path} ended, or refused the connection, before it answered")
             answer = json.loads(text)
             if for_terminal:
