@@ -10,6 +10,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 import pytest
@@ -221,6 +222,8 @@ async def test_what_keeps_an_autopilot_from_a_key() -> None:
         await refused("systems 1 and 2")
         beating.cancel()
         pair.cable.close()
+        (port,) = pair.endpoint.ports
+        await until(lambda: monotonic() - (port.received_at or 0.0) > HEARTBEAT_S)  # the last ones are read
         await refused("no autopilot was heard")
 
 
