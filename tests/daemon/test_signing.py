@@ -18,7 +18,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from tests.daemon_pair import ANY_PORT, are_linked, config
 from tests.mavlink.signing.autopilot import Autopilot
-from tests.mavlink.signing.wire import KEY, OTHER
+from tests.mavlink.signing.wire import KEY, OTHER, keyed
 from tests.samples import pack, read
 from tests.waiting import until
 from uavlinkd.config.keys import encode_key
@@ -28,7 +28,7 @@ from uavlinkd.daemon.daemon import Daemon
 from uavlinkd.io.url import EndpointKind, NetworkUrl, SerialUrl
 from uavlinkd.mavlink.policy.delivery import Source
 from uavlinkd.mavlink.signing.endpoint_signing import MOST_OF_SOURCE
-from uavlinkd.observe import status
+from uavlinkd.observe import facts
 from uavlinkd.protocol.crypto import Secret
 
 HEARTBEAT_S = 0.1
@@ -235,8 +235,7 @@ async def _beat(send: Callable[[bytes], object], autopilot: Autopilot) -> None:
 
 async def test_an_autopilot_with_another_key() -> None:
     """It keeps its key, and goes on as before."""
-    autopilot = Autopilot()
-    autopilot.receive(pack(mavlink.MAVLink_setup_signing_message(1, 1, list(OTHER.reveal()), 5)))
+    autopilot = keyed(Autopilot(), OTHER)
     async with flying("udpin", autopilot) as pair:
         answer = await pair.ask("setup")
         assert answer["is_changed"] is False
@@ -321,8 +320,7 @@ async def test_a_key_reaches_one_client_only() -> None:
 
 async def test_a_client_that_comes_during_a_change_gets_no_key() -> None:
     """A program on this machine sees the command, and becomes a client while the autopilot's proof is awaited."""
-    autopilot = Autopilot()
-    autopilot.receive(pack(mavlink.MAVLink_setup_signing_message(1, 1, list(KEY.reveal()), 5)))
+    autopilot = keyed(Autopilot())
     async with flying("udpin", autopilot, KEY) as pair:
         await pair.commands_pass()
         autopilot.is_deaf = True
@@ -342,8 +340,7 @@ async def test_a_client_that_comes_during_a_change_gets_no_key() -> None:
 
 async def test_a_stranger_gets_nothing_signed_but_questions() -> None:
     """A signature of its own for each client: with copies it would repeat a HEARTBEAT when the station is lost."""
-    autopilot = Autopilot()
-    autopilot.receive(pack(mavlink.MAVLink_setup_signing_message(1, 1, list(KEY.reveal()), 5)))
+    autopilot = keyed(Autopilot())
     async with flying("udpin", autopilot, KEY) as pair:
         await pair.commands_pass()
         with socket.socket(type=socket.SOCK_DGRAM) as stranger:
@@ -383,9 +380,8 @@ async def test_another_key_is_only_for_the_autopilot_that_proves_this_one() -> N
 
 
 async def test_one_change_at_a_time_and_for_an_autopilot_that_answers() -> None:
-    """The other one is refused; so is clear where the direction to the autopilot is cut."""
-    autopilot = Autopilot()
-    autopilot.receive(pack(mavlink.MAVLink_setup_signing_message(1, 1, list(KEY.reveal()), 5)))
+    """A change is refused while another goes on, and ``clear`` where the direction to the autopilot is cut."""
+    autopilot = keyed(Autopilot())
     async with flying("udpin", autopilot, KEY) as pair:
         await pair.commands_pass()
         autopilot.is_deaf = True
@@ -397,8 +393,7 @@ async def test_one_change_at_a_time_and_for_an_autopilot_that_answers() -> None:
 
 async def test_all_clients_of_a_station_are_one_source() -> None:
     """A captured station opens new clients: each would have places at the autopilot of its own."""
-    autopilot = Autopilot()
-    autopilot.receive(pack(mavlink.MAVLink_setup_signing_message(1, 1, list(KEY.reveal()), 5)))
+    autopilot = keyed(Autopilot())
     async with flying("serial", autopilot, KEY) as pair:
         await pair.commands_pass()
         gate = pair.vehicle.parts.local.policies["client"].incoming
@@ -412,8 +407,7 @@ async def test_all_clients_of_a_station_are_one_source() -> None:
 
 async def test_a_daemon_with_a_key() -> None:
     """A daemon that starts with a key hears only who has it, also at a port to which anybody can send."""
-    autopilot = Autopilot()
-    autopilot.receive(pack(mavlink.MAVLink_setup_signing_message(1, 1, list(KEY.reveal()), 5)))
+    autopilot = keyed(Autopilot())
     async with flying("udpin", autopilot, KEY) as pair:
         await pair.commands_pass()
         with socket.socket(type=socket.SOCK_DGRAM) as stranger:
@@ -425,8 +419,7 @@ async def test_a_daemon_with_a_key() -> None:
 async def test_commands_pass_behind_the_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     """They need not wait for the autopilot's next HEARTBEAT: here there is one, and then the answer."""
     monkeypatch.setattr("tests.daemon.test_signing.HEARTBEAT_S", 3600.0)
-    autopilot = Autopilot()
-    autopilot.receive(pack(mavlink.MAVLink_setup_signing_message(1, 1, list(KEY.reveal()), 5)))
+    autopilot = keyed(Autopilot())
     async with flying("udpin", autopilot, KEY) as pair:
         async with asyncio.timeout(10.0):
             await pair.commands_pass()
@@ -435,8 +428,7 @@ async def test_commands_pass_behind_the_answer(monkeypatch: pytest.MonkeyPatch) 
 
 async def test_an_autopilot_that_lost_its_key() -> None:
     """It was erased, or replaced: setup hands the same key over again, and clear ends what it began."""
-    autopilot = Autopilot()
-    autopilot.receive(pack(mavlink.MAVLink_setup_signing_message(1, 1, list(KEY.reveal()), 5)))
+    autopilot = keyed(Autopilot())
     async with flying("udpin", autopilot, KEY) as pair:
         await pair.commands_pass()
         autopilot.erase()
@@ -460,7 +452,7 @@ async def test_status_of_an_autopilot_that_lost_its_key(monkeypatch: pytest.Monk
     async with flying("udpin", autopilot) as pair:
         assert (await pair.ask("setup"))["is_changed"]
         assert await proves()
-        monkeypatch.setattr(status, "SILENT_S", 2 * HEARTBEAT_S)
+        monkeypatch.setattr(facts, "SILENT_S", 2 * HEARTBEAT_S)
         autopilot.erase()
         await until(lambda: pair.endpoint.failures["unsigned"] > 4)
         assert not await proves()
@@ -489,8 +481,7 @@ async def test_timestamps_that_the_autopilot_remembers() -> None:
 
 async def test_both_ends_without_power(tmp_path: Path) -> None:
     """What was recorded in an earlier flight is old, also if the autopilot begins again with its key's timestamp."""
-    autopilot, state = Autopilot("px4"), tmp_path / "left.signing-state"
-    autopilot.receive(pack(mavlink.MAVLink_setup_signing_message(1, 1, list(KEY.reveal()), 5)))
+    autopilot, state = keyed(Autopilot("px4")), tmp_path / "left.signing-state"
     async with flying("udpin", autopilot, KEY, state=state) as pair:
         autopilot.set_time(2**45)
         await until(lambda: state.exists() and int(state.read_text()) > 2**45)
@@ -505,8 +496,7 @@ async def test_both_ends_without_power(tmp_path: Path) -> None:
 
 async def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
     """Frames pass without the file."""
-    autopilot = Autopilot()
-    autopilot.receive(pack(mavlink.MAVLink_setup_signing_message(1, 1, list(KEY.reveal()), 5)))
+    autopilot = keyed(Autopilot())
     async with flying("udpin", autopilot, KEY, state=tmp_path / "no" / "state") as pair:
         await pair.commands_pass()
         await until(lambda: pair.vehicle.parts.signing.has_failed)

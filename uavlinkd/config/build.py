@@ -181,8 +181,8 @@ def _network(section: Values) -> NetworkConfig:
 
 def _endpoint(section: Values) -> EndpointConfig:
     own = ("name", "url", "radio_status", "status_text")
-    key = section.get("signing_key_file")
-    signing = None if key is None else SigningConfig(key, section.get("signing_link_id"))
+    secret = section.get("signing_key_file")
+    signing = None if secret is None else SigningConfig(secret, section.get("signing_link_id"))
     return EndpointConfig(**{key: section.get(key) for key in own}, policy=policy_data(section), signing=signing)
 
 

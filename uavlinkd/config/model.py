@@ -56,7 +56,7 @@ class ConfigError(UsageError):
 class SigningConfig:
     """MAVLink message signing with the autopilot at an endpoint.
 
-    ``link_id``: the number of this daemon's stream in its signatures: see ``FIRST_LINK_ID`` of its room.
+    ``link_id``: the number of this daemon's stream in its signatures, 16 to 255.
     """
 
     key: Secret

@@ -24,6 +24,7 @@ from uavlinkd.protocol.sessions import Twin
 from uavlinkd.system.error_meanings import meaning_of
 
 if TYPE_CHECKING:
+    from uavlinkd.mavlink.signing.endpoint_signing import EndpointSigning
     from uavlinkd.relay.client_link import RelayLink
 
 Fields = dict[str, Any]
@@ -243,6 +244,11 @@ def listed(names: Iterable[str], most: int = 4) -> str:
     """The first names of a list that an attacker may make long."""
     first = list(names)
     return ", ".join(first[:most]) + (f" and {len(first) - most} more" if len(first) > most else "")
+
+
+def proves_key(signing: EndpointSigning, now: float) -> bool:
+    """Whether frames with the signature of a proven key come from an endpoint's autopilot now."""
+    return signing.is_proven and now - signing.verified_at < SILENT_S
 
 
 def is_reached(daemon: DaemonParts, peer: Peer, now: float) -> bool:

@@ -18,7 +18,7 @@ from uavlinkd.io.ports import Endpoint
 from uavlinkd.mavlink.dialect import command_name, name_of
 from uavlinkd.mavlink.policy.compilation import Policy
 from uavlinkd.mavlink.policy.gate import ANY_OTHER, REFUSALS, Refusal
-from uavlinkd.observe.facts import SILENT_S, is_contested, is_reached
+from uavlinkd.observe.facts import is_contested, is_reached, proves_key
 from uavlinkd.observe.finding import Finding
 from uavlinkd.observe.findings import find, has_no_client, stop_frames
 from uavlinkd.observe.observer import Observer
@@ -289,10 +289,7 @@ def endpoint_status(endpoint: Endpoint, policy: Policy, now: float) -> dict[str,
         "failures": dict(endpoint.failures),
         "signing": None
         if (signing := endpoint.signing) is None
-        else {
-            "is_verified": signing.is_proven and now - signing.verified_at < SILENT_S,
-            "link_id": signing.link_id,
-        },
+        else {"is_verified": proves_key(signing, now), "link_id": signing.link_id},
         **_refusals(policy),
     }
 

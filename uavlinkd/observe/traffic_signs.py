@@ -23,6 +23,7 @@ from uavlinkd.observe.facts import (
     PartFacts,
     PeerFacts,
     listed,
+    proves_key,
 )
 from uavlinkd.observe.signs import Signs
 from uavlinkd.protocol import constants as c
@@ -262,9 +263,9 @@ _UNVERIFIED: Final = (
 def autopilot_unverified(endpoint: EndpointFacts) -> Signs:
     """Frames come, and its autopilot does not prove the key: nothing passes."""
     signing, lasting = endpoint.endpoint.signing, endpoint.history.failures.lasting(endpoint.now)
-    is_signed = signing is not None and endpoint.now - signing.verified_at < SILENT_S
-    if signing is None or (is_signed and signing.is_proven):
+    if signing is None or proves_key(signing, endpoint.now):
         return
+    is_signed = endpoint.now - signing.verified_at < SILENT_S
     causes = {"not_proven"} if is_signed else {"bad_signature", "unsigned", "replayed"}
     for drops, what, advice in _UNVERIFIED:
         if not causes.intersection(lasting).isdisjoint(drops):

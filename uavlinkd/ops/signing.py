@@ -17,7 +17,7 @@ from typing import Any, Final
 
 from uavlinkd.config import keys
 from uavlinkd.config.edit import environ_of, replace_valid, trial
-from uavlinkd.config.load import load_config
+from uavlinkd.config.load import load_config, read_toml
 from uavlinkd.config.model import LINK_ID
 from uavlinkd.io.url import EndpointKind
 from uavlinkd.ops.commands import control_socket
@@ -65,7 +65,7 @@ class _Place:
             listed = ", ".join(names) or "none"
             raise UsageError(f"{self.path}: which endpoint has the autopilot? Use --endpoint NAME, one of: {listed}")
         self.socket = control_socket(options)
-        self._table = tomllib.loads(self.path.read_text(encoding="utf-8"))
+        self._table = read_toml(self.path)
         self._section: dict[str, Any] = next(one for one in self._table["endpoint"] if one["name"] == self.endpoint)
         self.is_written = _KEY in self._section
         self.name: str = self._section.get(_KEY, f"{self.endpoint}.key")
@@ -77,12 +77,13 @@ class _Place:
         changed = {key: value for key, value in self._section.items() if key != _KEY}
         changed |= {} if name is None else {_KEY: name}
         sections = [changed if one is self._section else one for one in self._table["endpoint"]]
+        expected = self._table | {"endpoint": sections}
         lines = self.path.read_text(encoding="utf-8").splitlines(keepends=True)
         line = [] if name is None else [f"{_KEY} = {json.dumps(name)}\n"]
         for at in range(len(lines)):
             text = "".join((*lines[: at + len(line)], *line, *lines[at + 1 :]))
             with suppress(tomllib.TOMLDecodeError):
-                if tomllib.loads(text) == self._table | {"endpoint": sections}:
+                if tomllib.loads(text) == expected:
                     return text
         wish = "delete this key" if name is None else "write each [[endpoint]] as a section of its own"
         raise CommandError(f"{self.path}: {_KEY} of {self.endpoint}: no line can be changed, so nothing was: {wish}")

@@ -20,8 +20,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from tests.daemon_pair import ANY_PORT, are_linked, attitude, config
 from tests.mavlink.signing.autopilot import Autopilot
-from tests.mavlink.signing.wire import KEY
-from tests.samples import pack
+from tests.mavlink.signing.wire import KEY, keyed
 from tests.waiting import until
 from uavlinkd.config.model import Config, SigningConfig
 from uavlinkd.daemon.daemon import Daemon
@@ -66,19 +65,12 @@ def open_client() -> socket.socket:
     return sock
 
 
-def with_key() -> Autopilot:
-    """A client that signs."""
-    autopilot = Autopilot()
-    autopilot.receive(pack(mavlink.MAVLink_setup_signing_message(1, 1, list(KEY.reveal()), 5)))
-    return autopilot
-
-
 class Pair:
     """The daemons ``left`` and ``right``, and a client of each. ``signs``: both clients are autopilots with a key."""
 
     def __init__(self, loop: Loop, counting: Counting, *, signs: bool) -> None:
         self._loop, self._counting, self._signs = loop, counting, signs
-        self._signer = with_key()
+        self._signer = keyed(Autopilot())
         self._client, self._ground = open_client(), open_client()
         self._number = 0
 
@@ -99,7 +91,7 @@ class Pair:
         if self._signs:
             (outgoing,) = set(callbacks) - own - {self._client_port, called.port}
             await self._prove(left, self._client, self._client_port, self._signer)
-            await self._prove(right, self._ground, outgoing, with_key())
+            await self._prove(right, self._ground, outgoing, keyed(Autopilot()))
 
     def _config(self, plain: Config) -> Config:
         keys = SigningConfig(KEY) if self._signs else None

@@ -18,12 +18,10 @@ from statistics import median
 from time import monotonic, sleep
 from typing import Final
 
-from pymavlink.dialects.v20 import all as mavlink
-
 from tests.bench.daemons import configuration, daemon_command, peer, peers_up, rules
 from tests.mavlink.signing.autopilot import Autopilot
-from tests.mavlink.signing.wire import KEY
-from tests.samples import attitude, frames_of, pack
+from tests.mavlink.signing.wire import KEY, keyed
+from tests.samples import attitude, frames_of
 from uavlinkd.config import keys
 from uavlinkd.lab.sim.loopback_ports import free_ports
 from uavlinkd.mavlink.signing.signature import Signer
@@ -54,8 +52,7 @@ class Client:
         self.sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 8_000_000)
         self.sock.connect(("127.0.0.1", port))
         self.sock.setblocking(False)
-        self.autopilot = Autopilot()
-        self.autopilot.receive(pack(mavlink.MAVLink_setup_signing_message(1, 1, list(KEY.reveal()), 5)))
+        self.autopilot = keyed(Autopilot())
 
     def received(self) -> Iterator[bytes]:
         """The datagrams that came."""

@@ -22,6 +22,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from tests.mavlink.signing.autopilot import ALWAYS_UNSIGNED
 from tests.mavlink.signing.c_library import OK, OLD, SIGNATURES, VERIFIED, CAutopilot
+from tests.mavlink.signing.wire import keyed
 from tests.samples import ID, build, pack, read
 from uavlinkd.config.model import LINK_ID
 from uavlinkd.daemon.signing import RESERVE
@@ -110,8 +111,7 @@ class Storm:
         self._taken: dict[bytes, int] = {}  # at the autopilot, by sender: the number of the last frame
         self._taken_ever = bytearray()
         self._passed = -1
-        self.autopilot = CAutopilot(kind)
-        self.autopilot.receive(pack(mavlink.MAVLink_setup_signing_message(1, 1, list(KEY.reveal()), 5)))
+        self.autopilot = keyed(CAutopilot(kind), KEY)
         self._start_daemon()
 
     # Ends.

@@ -6,7 +6,7 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from tests.mavlink.signing.autopilot import Autopilot
-from tests.mavlink.signing.wire import KEY, OTHER, STATION, Wire
+from tests.mavlink.signing.wire import KEY, OTHER, STATION, Wire, keyed
 from tests.samples import pack
 from uavlinkd.config.model import LINK_ID
 from uavlinkd.mavlink.signing.endpoint_signing import (
@@ -25,9 +25,7 @@ KINDS = pytest.mark.parametrize("kind", ["ardupilot", "px4"])
 
 
 def with_key(judge: type[Autopilot], kind: str = "ardupilot", key: Secret = KEY) -> Autopilot:
-    autopilot = judge(kind)
-    autopilot.receive(pack(mavlink.MAVLink_setup_signing_message(1, 1, list(key.reveal()), 5)))
-    return autopilot
+    return keyed(judge(kind), key)
 
 
 def command(system: int = 255, component: int = 190, number: int = 0) -> bytes:

@@ -11,7 +11,7 @@ from tests.conftest import EXAMPLES
 from tests.mavlink.parsers.receivers import compiler
 from tests.mavlink.signing.autopilot import Autopilot
 from tests.mavlink.signing.c_library import CAutopilot
-from tests.mavlink.signing.wire import KEY, Wire
+from tests.mavlink.signing.wire import KEY, Wire, keyed
 from tests.samples import pack
 from uavlinkd.config.model import LINK_ID
 from uavlinkd.daemon.signing import REPEAT_S
@@ -98,8 +98,7 @@ class Rotations:
 @pytest.mark.parametrize("kind", ["ardupilot", "px4"])
 def test_rotations(kind: str) -> None:
     """The two ends agree again by themselves, frames pause for less than a second, the old key is void."""
-    autopilot = CAutopilot(kind)
-    autopilot.receive(pack(mavlink.MAVLink_setup_signing_message(1, 1, list(KEY.reveal()), 5)))
+    autopilot = keyed(CAutopilot(kind))
     rotations, random = Rotations(autopilot), Random(EXAMPLES)
     rotations.traffic(2.0)
     for number in range(2 * EXAMPLES):

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from random import Random
+from typing import TypeVar
+
+from pymavlink.dialects.v20 import all as mavlink
 
 from tests.mavlink.signing.autopilot import Autopilot
-from tests.samples import read
+from tests.samples import pack, read
 from uavlinkd.config.model import LINK_ID
 from uavlinkd.mavlink.frames import Frame
 from uavlinkd.mavlink.signing.endpoint_signing import EndpointSigning
@@ -15,6 +18,14 @@ from uavlinkd.protocol.crypto import Secret
 KEY, OTHER = Secret(b"1" * 32), Secret(b"2" * 32)
 STATION = "gcs"
 """A source of frames."""
+
+A = TypeVar("A", bound=Autopilot)
+
+
+def keyed(autopilot: A, key: Secret = KEY) -> A:
+    """The autopilot, after it got this key."""
+    autopilot.receive(pack(mavlink.MAVLink_setup_signing_message(1, 1, list(key.reveal()), 5)))
+    return autopilot
 
 
 class Wire:
